@@ -15,7 +15,6 @@ from collections import defaultdict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import cache
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -110,9 +109,7 @@ class Viewer:
         await self.wait_until(lambda: self.is_welcome)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         assert self._task is not None
         self._task.cancel()
         await asyncio.wait([self._task])
@@ -166,12 +163,10 @@ class Viewer:
             case "unadvertise":
                 for number in message["channelIds"]:
                     self.withdrawn.append(self.channels.pop(number)["topic"])
-                kept = {
-                    number: channel
-                    for number, channel in self.subscriptions.items()
-                    if channel["id"] in self.channels
+                kept = self.subscriptions.items()
+                self.subscriptions = {
+                    each: channel for each, channel in kept if channel["id"] in self.channels
                 }
-                self.subscriptions = kept
             case "status":
                 self.warnings.append(message["message"])
             case _:

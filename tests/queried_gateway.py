@@ -9,12 +9,7 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from gateway.config.settings import (
-    MetricsSettings,
-    ReconnectSettings,
-    SourceSettings,
-    SpoolSettings,
-)
+from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, SpoolSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
@@ -155,10 +150,7 @@ async def run_gateway(
     settings = make_settings(
         sources=(lab,),
         zenoh=ZenohSettings(
-            enabled=bool(listen or router),
-            config=keys,
-            tool_poses=tool_poses,
-            max_rate_hz=max_rate_hz or {},
+            enabled=bool(listen or router), config=keys, tool_poses=tool_poses, max_rate_hz=max_rate_hz or {}
         ),
         lcm=LcmSettings(
             enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url, tool_poses=tool_poses

@@ -21,8 +21,10 @@ from gateway.takes.event_log import Event
 from gateway.takes.reader import TakeReader
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 from gateway.worker_thread import WorkerThread, make_call
+from tests import settable_clock
 from tests.waiting import wait_until_async
 
+Clock = settable_clock.Clock
 _Result = TypeVar("_Result")
 
 
@@ -33,16 +35,6 @@ class NoThread(WorkerThread):
         done: Future[_Result] = Future()
         make_call(done, call)
         return done
-
-
-class Clock:
-    """A monotonic clock that the test sets."""
-
-    def __init__(self, now_s: float = 1000.0) -> None:
-        self.now_s = now_s
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 def still_host(monotonic: Callable[[], float]) -> Host:

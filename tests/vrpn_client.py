@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import socket
 import struct
-from types import TracebackType
 from typing import NamedTuple, Self
 
 COOKIE = b"vrpn: ver. 07.35  0" + bytes(5)
@@ -119,12 +118,7 @@ class VrpnClient:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
 

@@ -36,11 +36,7 @@ MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
 ANALOG = Topic("lab", ("analog",), "rtc3d.analog_t")
 PROBE = Topic("hall-2", ("6d", "Probe 1"), "rtc3d.tool_pose_t")
 
-LCM_CHANNELS = {
-    MARKERS: "MOCAP_LAB_3D",
-    ANALOG: "MOCAP_LAB_ANALOG",
-    PROBE: "MOCAP_HALL_2_6D_PROBE_1",
-}
+LCM_CHANNELS = {MARKERS: "MOCAP_LAB_3D", ANALOG: "MOCAP_LAB_ANALOG", PROBE: "MOCAP_HALL_2_6D_PROBE_1"}
 
 
 class Rig(Protocol):
@@ -102,11 +98,7 @@ class ZenohRig:
     remedies = ("start zenohd", "is the router running")
 
     def __init__(self) -> None:
-        self.names = {
-            MARKERS: "mocap/lab/3d",
-            ANALOG: "mocap/lab/analog",
-            PROBE: "mocap/hall-2/6d/Probe%201",
-        }
+        self.names = {MARKERS: "mocap/lab/3d", ANALOG: "mocap/lab/analog", PROBE: "mocap/hall-2/6d/Probe%201"}
         self._endpoint = free_endpoint()
         self._router = open_zenoh("router", listen=self._endpoint)
         self._session: zenoh.Session | None = None

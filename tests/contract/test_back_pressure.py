@@ -90,10 +90,7 @@ async def count_until_last(process: Process, publisher: Publisher) -> int:
 
 async def test_a_burst_waits_for_a_subscriber_that_is_late() -> None:
     """With Zenoh's own queue of 2 batches, most of this burst is dropped."""
-    async with (
-        open_output(SMALL_BUFFERS) as (output, endpoint),
-        subscriber(endpoint, SMALL_BUFFERS) as late,
-    ):
+    async with open_output(SMALL_BUFFERS) as (output, endpoint), subscriber(endpoint, SMALL_BUFFERS) as late:
         publisher = output.publisher(MARKERS)
         await wait_until_async(lambda: publisher.wanted)
         late.send_signal(signal.SIGSTOP)

@@ -9,13 +9,7 @@ import pytest
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from tests.contract.frame_lab import (
-    Lab,
-    converts,
-    every_rig,
-    lab,
-    returns,
-)
+from tests.contract.frame_lab import Lab, converts, every_rig, lab, returns
 from tests.contract.frame_rigs import (
     ALL,
     HALL,
@@ -34,7 +28,7 @@ from tests.waiting import wait_until_async
 
 __all__ = ["lab"]
 
-NUM_LABELS: Final = 5000
+NUM_LABELS: Final = 2000
 
 WEIRD_LABELS: Final = (
     *("", " ", "/", "//", "a/b", "..", "*", "$*", "#", "?", "@", "%2F", "{}", "~", "-", "0", "7th", "tf"),

@@ -21,13 +21,7 @@ from tests.contract.frame_lab import (
     names_remedy,
     returns,
 )
-from tests.contract.frame_rigs import (
-    LAB,
-    SOURCES,
-    FrameRig,
-    component,
-    frame_of,
-)
+from tests.contract.frame_rigs import LAB, SOURCES, FrameRig, component, frame_of
 from tests.waiting import wait_until_async
 
 __all__ = ["lab"]
@@ -64,17 +58,12 @@ async def start_without_a_network(lab: Lab) -> None:
 
 
 @can_be_cut
-async def test_without_a_network_starting_raises_nothing_and_health_names_the_remedy(lab: Lab) -> None:
+async def test_an_output_started_without_a_network_recovers_by_itself(lab: Lab) -> None:
+    """Until then, ``health`` names the remedy and what is lost is counted."""
     await start_without_a_network(lab)
     await wait_until_async(lambda: names_remedy(lab))
     lab.publish_next()
     assert set(lab.lost()) <= {"not open", "no router"}
-
-
-@can_be_cut
-async def test_an_output_started_without_a_network_recovers_by_itself(lab: Lab) -> None:
-    await start_without_a_network(lab)
-    await wait_until_async(lambda: names_remedy(lab))
     await asyncio.to_thread(lab.rig.restore)
     await wait_until_async(lambda: lab.output.health().connected)
     await lab.subscribe()

@@ -26,7 +26,9 @@ from gateway.simulator.scenario import load_scenario
 from tests.configurations import MODEL, load
 from tests.documents import ROOT, Block, all_blocks, blocks, documents
 from tests.fresh_clones import clone_into, files_in
+from tests.log_messages import message_patterns
 
+OPERATIONS = (ROOT / "docs/operations.md").read_text()
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()
 WHAT_IS_LOST = (ROOT / "docs/explanation/what-is-lost.md").read_text()
 PROGRAM = "rtc3d-gateway"
@@ -207,3 +209,16 @@ def test_the_design_names_every_module() -> None:
         path.parent.name for path in ROOT.glob("gateway/*/__init__.py")
     }
     assert modules - {"__init__", "__main__"} <= set(re.findall(r"`(\w+)`", layers))
+
+
+def test_the_page_about_operations_lists_every_message_of_level_warning_and_above_and_no_other() -> None:
+    """A row of its tables may have several."""
+    cells = re.findall(r"^\| (`.*?`) \| (?:WARNING|ERROR) \|", OPERATIONS, re.MULTILINE)
+    documented = [message for cell in cells for message in re.findall("`(.+?)`(?:; |$)", cell)]
+    logged = message_patterns(ROOT / "gateway")
+    known = {each: origin for each, origin in logged.items() if not origin.startswith("outputs/memory.py")}
+    missing = [known[each] for each in known if not any(re.search(each, text) for text in documented)]
+    assert not missing, "docs/operations.md does not have the messages logged there"
+    gone = [text for text in documented if not any(re.search(each, text) for each in known)]
+    assert not gone, "docs/operations.md has messages that gateway/ does not log"
+    assert min(len(known), len(documented)) > 40

@@ -1,4 +1,4 @@
-"""Type the commands of each how-to that can be tried without a server, and compare the output."""
+"""Type the commands of the tutorial and of each how-to that needs no server, and compare the output."""
 
 import socket
 import struct
@@ -9,8 +9,12 @@ from typing import Final
 import pytest
 import zenoh
 
+from gateway.takes.reader import TakeReader
 from tests.documents import ROOT
 from tests.terminals import Terminal, folder, follow, terminals
+from tests.unit.export.exported import read_ezc3d
+from tests.unit.export.read_mcap import read_mcap
+from tests.unit.export.test_trc import read_trc
 
 pytestmark = pytest.mark.netns
 
@@ -24,7 +28,7 @@ PAGES: Final = sorted(
 
 
 def test_pages_can_be_tried() -> None:
-    """Other tests run the commands of the pages record, use-takes, secure and service."""
+    """Other tests run the commands of the pages secure and service."""
     servers = {"first-principles", "wavefront", "several-servers"}
     outputs = {"lcm", "ros2", "rtc3d-clients", "vrpn", "lsl", "foxglove"}
     assert servers | outputs | {"router", "replay", "troubleshoot"} <= set(PAGES)
@@ -56,3 +60,54 @@ def test_searching_in_the_network_would_be_seen(scouts: socket.socket) -> None:
         scouts.setblocking(True)
         scouts.settimeout(10)
         assert scouts.recv(1)
+
+
+@pytest.mark.parametrize(("page", "count"), [("tutorial", 9), ("how-to/view", 3)])
+def test_every_command_of_the_tutorial_and_of_the_view_prints_the_output_on_the_page(
+    page: str, count: int, folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow(f"docs/{page}.md", folder, terminals) >= count
+
+
+def test_every_command_of_record_prints_the_output_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow("docs/how-to/record.md", folder, terminals) > 3
+    keys = {message.key for message in TakeReader(folder / "walk.lcmlog").messages()}
+    assert {"take", "parameters", "3d", "6d", "analog", "force", "event", "status", "clock"} <= keys
+
+
+def test_every_command_of_use_takes_prints_the_output_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow("docs/how-to/use-takes.md", folder, terminals) > 6
+    assert read_ezc3d(folder / "walk.c3d")["data"]["points"].shape[1] == 34
+    assert len(read_trc(folder / "walk.trc").labels) == 34
+    assert {"/lab/markers", "/lab/tools", "/lab/forces"} < read_mcap(folder / "walk.mcap").topics.keys()
+    components = sorted(path.name for path in folder.glob("walk-*.csv"))
+    assert components == [f"walk-{key}.csv" for key in ("3d", "6d", "analog", "event", "force")]
+
+
+FRAME_12: Final = "frame 12: 23 of 24 markers in view\nframe 13: 24 of 24 markers in view\n"
+
+
+@pytest.mark.parametrize(
+    ("page", "printed", "is_same"),
+    [
+        (["frame 1: 2 of 3 markers in view", "…"], FRAME_12, True),
+        (["frame 1: 2 of 3 tools in view"], FRAME_12, False),
+        (["frame 1: 2 of 3 markers in view"] * 3, FRAME_12, False),
+        (["walk: 8.4 s, 6.4 MB"], "walk: 1.2 s, 958.2 kB", True),
+        (["walk: 8.4 s, 6.4 MB"], "walk: 1 h 2 min 3.4 s, 12 bytes", True),
+        (["walk: 8.4 s, 6.4 MB"], "walk: 1.2 s, 958.2 kHz", False),
+        (["walk: 8.4 s, 6.4 MB"], "walk: 1.2 ms, 958.2 kB", False),
+        (["806 messages at -0.5 Hz"], "1,234,567 messages at 12 Hz", True),
+        (["4 s"], "4 sources", False),
+    ],
+)
+def test_lines_match_if_only_their_numbers_differ_and_units_of_size_and_time(
+    page: list[str], printed: str, is_same: bool
+) -> None:
+    terminal = Terminal(Path())
+    terminal.text = printed + "\n"
+    assert terminal.shows(page) is is_same

@@ -21,6 +21,14 @@ def healthy_server() -> Iterator[int]:
         yield port
 
 
+@pytest.fixture(scope="module")
+def dense_server() -> Iterator[int]:
+    """The port of a server that fills the buffers of a peer that does not read within a second."""
+    scene = ("--markers", "1000", "--tools", "100", "--rate", "200", "--analog-rate", "200")
+    with simulator(*scene) as (port, _):
+        yield port
+
+
 @pytest.fixture
 def gateway_under_attack(
     tmp_path: Path, healthy_server: int, request: pytest.FixtureRequest

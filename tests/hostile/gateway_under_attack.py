@@ -326,6 +326,26 @@ class RunningGateway:
                 await process.wait()
 
 
+@contextlib.asynccontextmanager
+async def python(*arguments: str, **options: Any) -> AsyncIterator[Process]:
+    """Run a Python program until the end of the block."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, *arguments, **{"stdin": PIPE, "stdout": PIPE, **options}
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+
+async def printed(process: Process) -> None:
+    """Wait until a program has printed a line."""
+    assert process.stdout is not None
+    assert await process.stdout.readline()
+
+
 GatewayUnderAttack = Callable[..., AbstractAsyncContextManager[RunningGateway]]
 """The fixture ``gateway_under_attack``: ``run_gateway`` without its first two arguments."""
 

@@ -12,7 +12,7 @@ Attack = Callable[[int], Awaitable[None]]
 @contextlib.asynccontextmanager
 async def attacking(attack: Attack, port: int) -> AsyncIterator[None]:
     """Attack a port during the block."""
-    task = asyncio.create_task(_repeat(attack, port))
+    task = asyncio.create_task(repeating(attack, port))
     try:
         yield
     finally:
@@ -21,11 +21,20 @@ async def attacking(attack: Attack, port: int) -> AsyncIterator[None]:
             await task
 
 
-async def _repeat(attack: Attack, port: int) -> None:
+async def repeating(attack: Attack, port: int) -> None:
     while True:
         with contextlib.suppress(OSError):
             await attack(port)
         await asyncio.sleep(0.01)
+
+
+def together(*attacks: Attack) -> Attack:
+    """Several attacks on one port at the same time, each again and again."""
+
+    async def attack(port: int) -> None:
+        await asyncio.gather(*(repeating(each, port) for each in attacks))
+
+    return attack
 
 
 def stalled(num_clients: int, sent: bytes) -> Attack:

@@ -6,10 +6,8 @@ import json
 import signal
 import socket
 import struct
-import sys
-from asyncio.subprocess import DEVNULL, PIPE, Process
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from asyncio.subprocess import DEVNULL, Process
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,8 +16,7 @@ import rtc3d
 
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
-from tests.gateway_process import simulator
-from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway
+from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway, printed, python
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
@@ -28,30 +25,12 @@ MAX_GROWTH_MIB = 40
 """How much memory an attack may leave behind; without limits, it was 160 to 300 MB."""
 
 
-@pytest.fixture(scope="module")
-def dense_server() -> Iterator[int]:
-    """The port of a server with 1000 markers at 200 Hz."""
-    with simulator("--markers", "1000", "--rate", "200", "--analog-rate", "200") as (port, _):
-        yield port
-
-
-@asynccontextmanager
-async def asker(
+def asker(
     gateway: RunningGateway, count: int, *selectors: str, num_bytes: int = 0
-) -> AsyncIterator[Process]:
+) -> AbstractAsyncContextManager[Process]:
     """Run tests/hostile/asker.py until the end of the block."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.hostile.asker", gateway.zenoh_endpoint, str(count), str(num_bytes)),
-        *selectors,
-        stdout=PIPE,
-        stderr=DEVNULL,  # Zenoh's log
-    )
-    try:
-        yield process
-    finally:
-        if process.returncode is None:
-            process.kill()
-        await process.wait()
+    facts = (gateway.zenoh_endpoint, str(count), str(num_bytes))
+    return python("-m", "tests.hostile.asker", *facts, *selectors, stderr=DEVNULL)  # Zenoh's log
 
 
 async def ask(gateway: RunningGateway, count: int, *selectors: str, num_bytes: int = 0) -> dict[str, int]:
@@ -112,8 +91,7 @@ async def test_askers_that_do_not_read_the_answers(
         async with asker(
             gateway, 1000, "mocap/lab/3d?format=json", "mocap/lab/c3d", "mocap/lab/**"
         ) as stalled:
-            assert stalled.stdout is not None
-            await stalled.stdout.readline()
+            await printed(stalled)
             stalled.send_signal(signal.SIGSTOP)
             await asyncio.sleep(6)
             # Answers to others wait for the stalled one, frames do not.

@@ -48,107 +48,87 @@ def files_of(gateway: RunningGateway, source: str) -> list[Path]:
     return sorted((gateway.folder / "spool").glob(f"{source}-????????T*.c3d"))
 
 
-def unfinished_in(gateway: RunningGateway) -> list[Path]:
-    return [*(gateway.folder / "spool").glob("*.part")]
+BLOCK: Final = bytes(range(256)) * (MIB // 256)
 
 
-async def test_large_files_at_full_speed(gateway_under_attack: GatewayUnderAttack) -> None:
-    block = bytes(range(256)) * (MIB // 256)
-
-    async def attack(client: Client) -> None:
-        client.send(header(LARGE_BYTES))
-        client.send(c3d_file(b"", MIB))
-        for _ in range(LARGE_BYTES // MIB - 1):
-            client.send(block)
-            await client.drain()
-
-    async with server(attack) as hostile, gateway_under_attack({"hostile": hostile.port}) as gateway:
-        rss_kib = [gateway.rss_kib()]
-
-        def is_stored() -> bool:
-            rss_kib.append(gateway.rss_kib())
-            return bool(files_of(gateway, "hostile"))
-
-        await wait_until_async(is_stored)
-        [file] = files_of(gateway, "hostile")
-        assert file.stat().st_size == LARGE_BYTES
-        content = file.read_bytes()
-        assert content[:MIB] == c3d_file(b"", MIB)
-        assert content[MIB:] == block * (LARGE_BYTES // MIB - 1)
-        assert max(rss_kib) - rss_kib[0] < MAX_GROWTH_KIB
-    gateway.report.check()
-
-
-async def test_a_flood_of_small_files_displaces_no_file_of_another_source(
-    gateway_under_attack: GatewayUnderAttack,
-) -> None:
-    files = [c3d_file(b"the only one")]
-
-    async def one_file(client: Client) -> None:
-        if files:
-            client.send(packet(5, files.pop()))
-
-    async def flood(client: Client) -> None:
-        while True:
-            for _ in range(20):
-                client.send(packet(5, c3d_file()))
-            await client.drain()
-            await asyncio.sleep(0.01)
-
-    async with (
-        server(one_file) as other,
-        server(flood) as hostile,
-        gateway_under_attack(
-            {"lab": other.port, "lab-2": hostile.port}, {"spool": {"max_files": 3}}
-        ) as gateway,
-    ):
-        await wait_until_async(lambda: files_of(gateway, "lab-2") and files_of(gateway, "lab"))
-        await asyncio.sleep(ATTACK_S)
-        assert len(files_of(gateway, "lab")) == 1
-        assert 3 <= len(files_of(gateway, "lab-2")) <= 4  # the new one is there before an old one is deleted
-    gateway.report.check()
-
-
-async def test_files_that_are_no_files(gateway_under_attack: GatewayUnderAttack) -> None:
-    garbage = bytes(MIB)
-
-    async def empty(client: Client) -> None:
-        while True:
-            client.send(packet(5) * 100)
-            await client.drain()
-            await asyncio.sleep(0.01)
-
-    async def no_c3d(client: Client) -> None:
-        while True:
-            client.send(header(100 * MIB))
-            for _ in range(100):
-                client.send(garbage)
-                await client.drain()
-
-    async def broken(client: Client) -> None:
-        client.send(packet(5, c3d_file(b"", MIB))[:-1])
+async def large(client: Client) -> None:
+    client.send(header(LARGE_BYTES) + c3d_file(b"", MIB))
+    for _ in range(LARGE_BYTES // MIB - 1):
+        client.send(BLOCK)
         await client.drain()
-        client.cut()
 
-    async def byte_by_byte(client: Client) -> None:
-        for byte in packet(5, c3d_file(b"", 4000)):
-            client.send(bytes([byte]))
+
+async def flood(client: Client) -> None:
+    while True:
+        for _ in range(20):
+            client.send(packet(5, c3d_file()))
+        await client.drain()
+        await asyncio.sleep(0.01)
+
+
+async def empty(client: Client) -> None:
+    while True:
+        client.send(packet(5) * 100)
+        await client.drain()
+        await asyncio.sleep(0.01)
+
+
+async def no_c3d(client: Client) -> None:
+    while True:
+        client.send(header(100 * MIB))
+        for _ in range(100):
+            client.send(bytes(MIB))
             await client.drain()
 
+
+async def broken(client: Client) -> None:
+    client.send(packet(5, c3d_file(b"", MIB))[:-1])
+    await client.drain()
+    client.cut()
+
+
+async def byte_by_byte(client: Client) -> None:
+    for byte in packet(5, c3d_file(b"", 4000)):
+        client.send(bytes([byte]))
+        await client.drain()
+
+
+async def test_large_many_broken_and_no_files(gateway_under_attack: GatewayUnderAttack) -> None:
+    """A large file is stored whole, a flood displaces no file of others, and memory stays bounded."""
+    once = [c3d_file(b"the only one")]
+
+    async def lonely(client: Client) -> None:
+        if once:
+            client.send(packet(5, once.pop()))
+
+    attacks = {each.__name__: each for each in (large, empty, no_c3d, broken, byte_by_byte)}
+    attacks |= {"lab": lonely, "lab-2": flood}
     async with contextlib.AsyncExitStack() as servers:
-        attacks = (empty, no_c3d, broken, byte_by_byte)
-        ports = {each.__name__: (await servers.enter_async_context(server(each))).port for each in attacks}
-        async with gateway_under_attack(ports) as gateway:
-            await wait_until_async(lambda: files_of(gateway, "byte_by_byte"))
+        ports = {
+            name: (await servers.enter_async_context(server(attack))).port for name, attack in attacks.items()
+        }
+        async with gateway_under_attack(ports, {"spool": {"max_files": 3}}) as gateway:
+            rss_kib = [gateway.rss_kib()]
+
+            def are_stored() -> bool:
+                rss_kib.append(gateway.rss_kib())
+                return all(files_of(gateway, name) for name in ("large", "byte_by_byte", "lab", "lab-2"))
+
+            await wait_until_async(are_stored)
             await asyncio.sleep(ATTACK_S)
+            [file] = files_of(gateway, "large")
+            assert file.read_bytes() == c3d_file(b"", MIB) + BLOCK * (LARGE_BYTES // MIB - 1)
+            assert len(files_of(gateway, "lab")) == 1
+            assert (
+                3 <= len(files_of(gateway, "lab-2")) <= 4
+            )  # the new one is there before an old one is deleted
             for name in ("empty", "no_c3d", "broken"):
                 assert files_of(gateway, name) == []
-            assert "it is empty" in gateway.log
-            assert "not those of a C3D file" in gateway.log
-            assert "broke off after" in gateway.log
+            for text in ("it is empty", "not those of a C3D file", "broke off after"):
+                assert text in gateway.log
+            assert max(*rss_kib, gateway.rss_kib()) - rss_kib[0] < MAX_GROWTH_KIB
     gateway.report.check()
-    assert gateway.report.rss_after_kib - gateway.report.rss_before_kib < MAX_GROWTH_KIB
-    assert unfinished_in(gateway) == []
+    assert not list((gateway.folder / "spool").glob("*.part"))
 
 
 @pytest.mark.parametrize("trouble", ["no space", "a file in place of the folder", "the folder disappears"])

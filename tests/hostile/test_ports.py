@@ -6,7 +6,6 @@ One gateway for each output endures all attacks in turn.
 import asyncio
 import contextlib
 import re
-import sys
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import pytest
 
 from tests.foxglove_viewer import viewing
 from tests.hostile import foxglove_viewers, lsl_attacks, rtc3d_clients, vrpn_clients
-from tests.hostile.gateway_under_attack import GatewayUnderAttack, num_missing, rss_kib
+from tests.hostile.gateway_under_attack import GatewayUnderAttack, num_missing, python, rss_kib
 from tests.hostile.port_attacks import Attack, attacking
 from tests.integration.raw_client import connected, consecutive
 from tests.lsl_receiver import LslReceiver, lsl_config
@@ -118,13 +117,7 @@ def viewers(name: str) -> Attack:
     """Viewers in a process of their own, which would otherwise take the time of this one."""
 
     async def attack(port: int) -> None:
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.hostile.foxglove_viewers", name, str(port))
-        )
-        try:
-            await process.wait()
-        finally:
-            process.kill()
+        async with python("-m", "tests.hostile.foxglove_viewers", name, str(port)) as process:
             await process.wait()
 
     return attack

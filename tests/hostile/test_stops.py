@@ -7,9 +7,8 @@ import os
 import re
 import signal
 import socket
-import sys
 import time
-from asyncio.subprocess import DEVNULL, PIPE, Process
+from asyncio.subprocess import DEVNULL, Process
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -18,10 +17,10 @@ import pytest
 import yaml
 
 from tests.gateway_process import PROGRAM
-from tests.hostile.gateway_under_attack import MAX_STOP_S
+from tests.hostile.gateway_under_attack import MAX_STOP_S, printed, python
 from tests.lcm_relay import LcmRelay
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
-from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
+from tests.servers import Client, Script, ScriptedServer, markers_frame, ok, packet
 from tests.stops import report, run_stops
 from tests.waiting import wait_until_async
 
@@ -61,7 +60,7 @@ class Site:
         self.config.write_text(yaml.safe_dump(configuration | sections))
 
     @contextlib.asynccontextmanager
-    async def running(self, *, sabotage: str = "", stderr: int | None = None) -> AsyncIterator[None]:
+    async def running(self, *, sabotage: str = "") -> AsyncIterator[None]:
         """Run the gateway; kill it at the end of the block."""
         (self._folder / "sitecustomize.py").write_text(sabotage)
         path = os.pathsep.join(filter(None, (str(self._folder), os.environ.get("PYTHONPATH"))))
@@ -70,7 +69,7 @@ class Site:
                 *(*PROGRAM, "run", "--config", str(self.config)),
                 env=os.environ | {"PYTHONPATH": path},
                 stdin=DEVNULL,
-                stderr=log if stderr is None else stderr,
+                stderr=log,
             )
         try:
             yield
@@ -96,12 +95,6 @@ class Site:
 @pytest.fixture
 def site(tmp_path: Path) -> Site:
     return Site(tmp_path)
-
-
-def cpu_ticks(process_id: int) -> int:
-    """Return the CPU time that a process has used."""
-    fields = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()
-    return int(fields[11]) + int(fields[12])
 
 
 def stream(client: Client, *, answers_bye: bool) -> Callable[[str], bytes | None]:
@@ -167,22 +160,6 @@ def full_server() -> Iterator[int]:
         yield server.getsockname()[1]
 
 
-@contextlib.asynccontextmanager
-async def peer(code: str, *arguments: str) -> AsyncIterator[Process]:
-    """Run a program that opens a Zenoh session and prints a line when it is ready."""
-    program = "import json, sys, zenoh\nsession = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))\n" + code
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-c", program, *arguments), stdin=PIPE, stdout=PIPE
-    )
-    try:
-        assert process.stdout is not None
-        assert await process.stdout.readline()
-        yield process
-    finally:
-        process.kill()
-        await process.wait()
-
-
 @pytest.mark.parametrize("delay_s", [0.1, 0.4, 0.8])
 async def test_while_it_starts(site: Site, delay_s: float) -> None:
     site.configure([free_port()])
@@ -208,59 +185,51 @@ async def test_with_servers_that_do_not_answer(site: Site, number: signal.Signal
                 await site.stop(number)
 
 
-async def test_during_a_reload_of_servers_that_ignore_bye(site: Site) -> None:
+@pytest.mark.parametrize("ends", [True, False], ids=["servers that ignore bye", "a reload that does not end"])
+async def test_during_a_reload(site: Site, ends: bool) -> None:
     async with ScriptedServer(ignore_bye) as server:
         site.configure([server.port] * 8)
         async with site.running():
             await site.until_logged("→ streaming", 8)
-            site.configure([free_port()] * 8, lcm={"url": lcm_url()})
+            if ends:
+                site.configure([free_port()] * 8, lcm={"url": lcm_url()})
+            else:
+                site.config.unlink()
+                os.mkfifo(site.config)
             site.process.send_signal(signal.SIGHUP)
             await asyncio.sleep(0.1)
             await site.stop()
 
 
-async def test_during_a_reload_that_does_not_end(site: Site) -> None:
-    site.configure([free_port()])
-    async with site.running():
-        await site.until_logged("zenoh: the session is open")
-        site.config.unlink()
-        os.mkfifo(site.config)
-        site.process.send_signal(signal.SIGHUP)
-        await asyncio.sleep(0.2)
-        await site.stop()
-
-
-async def test_with_a_disk_that_does_not_respond(site: Site) -> None:
-    async with ScriptedServer(send_a_file) as server:
-        site.configure([server.port] * 8)
-        async with site.running(sabotage=NEVER_ENDS.format("os", "fsync")):
-            await site.until_logged("→ streaming", 8)
-            await wait_until_async(lambda: any(site.config.parent.glob("spool/*")))
-            await site.stop()
-
-
-async def test_with_a_disk_that_does_not_take_recordings(site: Site) -> None:
-    folder = site.config.parent / "takes"
+def takes(folder: Path) -> dict[str, Any]:
+    """Return the settings for takes that keep the last minute."""
     folder.mkdir()
-    async with ScriptedServer(flood) as server:
-        site.configure(
-            [server.port] * 2, takes={"enabled": True, "directory": str(folder), "keep_last_s": 60.0}
-        )
-        async with site.running(sabotage=NEVER_ENDS.format("os", "fdatasync")):
+    return {"takes": {"enabled": True, "directory": str(folder), "keep_last_s": 60.0}}
+
+
+@pytest.mark.parametrize(("call", "script"), [("fsync", send_a_file), ("fdatasync", flood)])
+async def test_with_a_disk_that_does_not_respond(site: Site, call: str, script: Script) -> None:
+    """It takes neither files of the server nor recordings."""
+    folder = site.config.parent / "takes"
+    async with ScriptedServer(script) as server:
+        site.configure([server.port] * 2, **takes(folder))
+        async with site.running(sabotage=NEVER_ENDS.format("os", call)):
             await site.until_logged("→ streaming", 2)
-            await site.until_logged("MiB wait for it; check what else writes to it")
+            if script is send_a_file:
+                await wait_until_async(lambda: any(site.config.parent.glob("spool/*")))
+            else:
+                await site.until_logged("MiB wait for it; check what else writes to it")
             await site.stop()
-            assert re.search("bytes are not written|not finished: output takes", site.log)
+            if script is flood:
+                assert re.search("bytes are not written|not finished: output takes", site.log)
 
 
 @pytest.mark.parametrize("keeps", [False, True], ids=["sent", "kept"])
 async def test_while_frames_come_as_fast_as_possible(site: Site, keeps: bool) -> None:
     """A flood of frames delays no stop, and the kept last seconds leave no files behind."""
     folder = site.config.parent / "takes"
-    folder.mkdir()
-    takes = {"takes": {"enabled": True, "directory": str(folder), "keep_last_s": 60.0}} if keeps else {}
     async with ScriptedServer(flood) as server:
-        site.configure([server.port] * 2, **takes)
+        site.configure([server.port] * 2, **(takes(folder) if keeps else {}))
         async with site.running():
             await site.until_logged("→ streaming", 2)
             await asyncio.sleep(1)
@@ -280,20 +249,10 @@ async def test_with_an_lcm_peer_that_does_not_read(site: Site) -> None:
     relay.close()
 
 
-async def test_with_a_zenoh_router_that_has_stopped(site: Site) -> None:
-    router = zenoh_keys("router", listen=site.endpoint)
-    code = "print('ready', flush=True)\nsys.stdin.read()"
-    async with ScriptedServer(flood) as server, peer(code, json.dumps(router)) as process:
-        site.configure([server.port], zenoh={"config": zenoh_keys("client", connect=site.endpoint)})
-        async with site.running():
-            await site.until_logged("→ streaming")
-            process.send_signal(signal.SIGSTOP)
-            await asyncio.sleep(1)
-            await site.stop()
-
-
+OPEN: Final = "import json, sys, threading, time, zenoh\n" + (
+    "session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))\n"
+)
 SUBSCRIBER_AND_ASKER: Final = """
-import threading, time
 def ask():
     while True:
         list(session.get("mocap/**", timeout=1))
@@ -301,21 +260,33 @@ session.declare_subscriber("mocap/**", lambda sample: None)
 for _ in range(8):
     threading.Thread(target=ask, daemon=True).start()
 time.sleep(0.5)
-print(flush=True)
-sys.stdin.read()
 """
 
 
-async def test_with_a_subscriber_and_an_asker_that_have_stopped(site: Site) -> None:
-    async with ScriptedServer(flood) as server:
-        site.configure([server.port])
+@pytest.mark.parametrize("is_router", [True, False], ids=["router", "subscriber and asker"])
+async def test_with_a_zenoh_peer_that_has_stopped(site: Site, is_router: bool) -> None:
+    keys = (
+        zenoh_keys("router", listen=site.endpoint)
+        if is_router
+        else zenoh_keys("client", connect=site.endpoint)
+    )
+    code = OPEN + ("" if is_router else SUBSCRIBER_AND_ASKER) + "print(flush=True)\nsys.stdin.read()"
+    async with ScriptedServer(flood) as server, contextlib.AsyncExitStack() as stack:
+
+        async def start() -> Process:
+            process = await stack.enter_async_context(python("-c", code, json.dumps(keys)))
+            await printed(process)
+            return process
+
+        client = {"zenoh": {"config": zenoh_keys("client", connect=site.endpoint)}}
+        site.configure([server.port], **(client if is_router else {}))
+        router = await start() if is_router else None
         async with site.running():
             await site.until_logged("→ streaming")
-            keys = json.dumps(zenoh_keys("client", connect=site.endpoint))
-            async with peer(SUBSCRIBER_AND_ASKER, keys) as process:
-                process.send_signal(signal.SIGSTOP)
-                await asyncio.sleep(1)
-                await site.stop()
+            process = router or await start()
+            process.send_signal(signal.SIGSTOP)
+            await asyncio.sleep(1)
+            await site.stop()
 
 
 async def test_with_peers_that_do_not_answer(site: Site) -> None:
@@ -335,55 +306,6 @@ async def test_with_peers_that_do_not_answer(site: Site) -> None:
                 held.enter_context(socket.create_connection(("127.0.0.1", port)))
             await asyncio.sleep(0.1)
             await site.stop()
-
-
-async def test_with_a_log_that_nobody_reads(site: Site) -> None:
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    with contextlib.suppress(BlockingIOError):
-        while True:
-            os.write(writing, bytes(4096))
-    os.set_blocking(writing, True)
-    site.configure([free_port()])
-    async with site.running(stderr=writing):
-        used = [-1, 0]
-        while used[-1] != used[-2]:  # until it waits for the log
-            await asyncio.sleep(1)
-            used.append(cpu_ticks(site.process.pid))
-        seconds = await site.stop()
-        assert seconds > 1  # the end of the time limit, because the event loop waits for the log
-    os.close(reading)
-    os.close(writing)
-
-
-HANGING_CLOSE: Final = """
-import time
-import gateway.gateway
-async def never(output):
-    time.sleep(60)
-gateway.gateway._close = never
-"""
-
-
-async def test_what_does_not_finish_is_logged(site: Site) -> None:
-    site.configure([free_port()])
-    async with site.running(sabotage=HANGING_CLOSE):
-        await site.until_logged("zenoh: the session is open")
-        await site.stop()
-        assert (
-            "the gateway ends at once, because it did not stop within 1.5 s; not finished: output zenoh"
-        ) in site.log
-
-
-async def test_a_second_signal_ends_it_at_once(site: Site) -> None:
-    site.configure([free_port()])
-    patient = "import gateway.service.process_end as process_end\nprocess_end.STOP_S = 60.0\n"
-    async with site.running(sabotage=HANGING_CLOSE + patient):
-        await site.until_logged("zenoh: the session is open")
-        site.process.terminate()
-        await site.until_logged("stopping")
-        await site.stop(signal.SIGINT)
-        assert "because of a second signal" in site.log
 
 
 async def test_stops_under_load(tmp_path: Path) -> None:

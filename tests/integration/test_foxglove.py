@@ -5,7 +5,6 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from mcap.reader import make_reader
 
@@ -17,15 +16,12 @@ from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.foxglove_viewer import viewing
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
-from tests.unit.export.read_mcap import floats_of, points_of
 from tests.waiting import wait_until_async
 
 SCENE = SyntheticScene(markers=20, tools=3, analog=12, plates=2, rate_hz=100, analog_rate_hz=500)
@@ -84,64 +80,6 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
     assert len(description["3d"]["labels"]) == 20
 
 
-async def test_values_are_those_of_the_server_in_the_configured_frame() -> None:
-    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
-    transform = {"translation_m": [0, 0, 2], "up": "y"}
-    async with Simulator(SCENE) as server:
-        gateway = Gateway(settings(server.port, frame_id="hall", transform=transform), [viewers])
-        async with running_gateway(gateway):
-            await gateway.opened.wait()
-            topics = ("/lab/markers", "/lab/tools", "/lab/analog")
-            async with viewing(viewers.settings.port, *topics) as viewer:
-                clouds = await viewer.wait_for("/lab/markers", 50)
-                transforms = await viewer.wait_for("/lab/tools", 50)
-                analog = await viewer.wait_for("/lab/analog", 50)
-    numbers = np.arange(2000)
-    markers = SCENE.items(ComponentType.MARKERS, numbers)
-    points = points_of(clouds[0].content)
-    assert clouds[0].content.frame_id == "hall"
-    expected = np.stack([markers["x"], -markers["z"], markers["y"]], axis=-1) / 1000 + (0, 0, 2)
-    shown = np.stack([points[axis] for axis in "xyz"], axis=-1)
-    distances = np.abs(expected[:, points["marker"]] - shown).max(axis=(1, 2))
-    number = int(np.nan_to_num(distances, nan=np.inf).argmin())  # NaN: another marker was hidden
-    assert distances[number] < 1e-5
-    # The other frames follow, one by one.
-    for later, cloud in enumerate(clouds[:50]):
-        points = points_of(cloud.content)
-        shown = np.stack([points[axis] for axis in "xyz"], axis=-1)
-        assert np.allclose(expected[number + later, points["marker"]], shown, atol=1e-5)
-    assert {each.parent_frame_id for log in transforms for each in log.content.transforms} == {"hall"}
-    values = SCENE.items(ComponentType.ANALOG, np.arange(10_000)).astype(np.float32)
-    first = np.array(list(floats_of(analog[0].content).values()), np.float32)
-    [at] = np.flatnonzero((values == first).all(axis=1))[:1]
-    for later, log in enumerate(analog[:50]):
-        assert list(floats_of(log.content).values()) == values[at + later].tolist()
-
-
-async def test_streams_on_demand_run_while_a_viewer_is_subscribed() -> None:
-    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
-    streams = [
-        {"components": ["3d", "6d"], "on_demand": True, "idle_after_s": 0.1},
-        {"components": ["analog", "force"], "on_demand": True, "idle_after_s": 0.1},
-    ]
-    async with Simulator(SCENE) as server:
-        gateway = Gateway(settings(server.port, streams=streams), [viewers])
-        [source] = gateway.sources
-
-        def are_idle() -> bool:
-            return {status.state for status in source.statuses} == {StreamState.IDLE}
-
-        async with running_gateway(gateway):
-            await gateway.opened.wait()
-            async with viewing(viewers.settings.port) as viewer:
-                await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
-                await wait_until_async(are_idle)
-                viewer.subscribe("/lab/analog")
-                await viewer.wait_for("/lab/analog", 50)
-            await wait_until_async(lambda: not source.fan_out.has_subscribers(WIRE_ORDER))
-            await wait_until_async(are_idle)
-
-
 async def test_sources_come_and_go_on_reload_while_viewers_stay() -> None:
     port = free_port()
     foxglove = FoxgloveSettings(enabled=True, port=port)
@@ -178,12 +116,10 @@ async def test_sources_come_and_go_on_reload_while_viewers_stay() -> None:
 @pytest.mark.netns
 async def test_viewers_connect_over_ipv6() -> None:
     viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, host="::1", port=free_port()))
-    async with Simulator(SCENE) as server:
-        gateway = Gateway(settings(server.port), [viewers])
-        async with running_gateway(gateway):
-            await gateway.opened.wait()
-            assert viewers.health().connected, viewers.health()
-            reader, writer = await asyncio.open_connection("::1", viewers.settings.port)
-            writer.write(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
-            assert (await reader.readline()).startswith(b"HTTP/1.1 426 ")
-            writer.close()
+    viewers.start()
+    await wait_until_async(lambda: viewers.health().connected)
+    reader, writer = await asyncio.open_connection("::1", viewers.settings.port)
+    writer.write(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+    assert (await reader.readline()).startswith(b"HTTP/1.1 426 ")
+    writer.close()
+    viewers.close()

@@ -1,8 +1,6 @@
 """LSL as its users see it: pylsl's inlets in another process, and the file that LabRecorder writes."""
 
-import itertools
 import json
-import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -36,12 +34,12 @@ TIMEOUT_S: Final = 30.0
 class Lab:
     """A gateway with LSL and one source. ``config`` is the file of liblsl."""
 
-    def __init__(self, folder: Path, port: int, **source: Any) -> None:
+    def __init__(self, folder: Path, port: int) -> None:
         self.config = lsl_config(folder)
         self.file = folder / "gateway.yaml"
         self.log_file = folder / "gateway.log"
         self.configuration: dict[str, Any] = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, **source}],
+            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
             "zenoh": {"enabled": False},
             "lcm": {"enabled": False},
             "metrics": {"enabled": False},
@@ -50,12 +48,9 @@ class Lab:
         self.file.write_text(yaml.safe_dump(self.configuration))
         self._exit = ExitStack()
 
-    def start(self, **environ: str) -> Any:
-        """Start the gateway; return its process."""
+    def start(self, **environ: str) -> None:
         log = self._exit.enter_context(self.log_file.open("wb"))
-        return self._exit.enter_context(
-            program("run", "--config", str(self.file), stderr=log, environ=environ)
-        )
+        self._exit.enter_context(program("run", "--config", str(self.file), stderr=log, environ=environ))
 
     def receive(self, *names: str) -> LslReceiver:
         """Connect a receiver, and wait until it has the streams."""
@@ -73,9 +68,9 @@ class Lab:
 
 
 @contextmanager
-def running(folder: Path, *scene: str, **source: Any) -> Iterator[Lab]:
-    with simulator(*(scene or SCENE)) as (port, _):
-        lab = Lab(folder, port, **source)
+def running(folder: Path) -> Iterator[Lab]:
+    with simulator(*SCENE) as (port, _):
+        lab = Lab(folder, port)
         lab.start()
         try:
             yield lab
@@ -87,16 +82,10 @@ def has(receiver: LslReceiver, name: str, count: int) -> Callable[[], bool]:
     return lambda: len(receiver.samples[name]) >= count
 
 
-def receive_until_the_clock_is_known(receiver: LslReceiver, rate_hz: int = RATE_HZ) -> None:
+def receive_until_the_clock_is_known(receiver: LslReceiver) -> None:
     """Forget the samples of the first 2 s: until the server's clock is known, their times are of arrival."""
-    wait_until(has(receiver, "lab_3d", 2 * rate_hz), TIMEOUT_S)
+    wait_until(has(receiver, "lab_3d", 2 * RATE_HZ), TIMEOUT_S)
     receiver.forget()
-
-
-def children(process_id: int) -> list[int]:
-    """Return the process for LSL of a gateway."""
-    threads = Path(f"/proc/{process_id}/task").glob("*/children")
-    return [int(child) for children in threads for child in children.read_text().split()]
 
 
 def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) -> None:
@@ -115,21 +104,8 @@ def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) ->
     write_xdf(file, streams)
     read, _ = pyxdf.load_xdf(str(file))
     found = {stream["info"]["name"][0]: stream for stream in read}
-    assert {name: stream["info"]["type"][0] for name, stream in found.items()} == {
-        "lab_3d": "MoCap",
-        "lab_6d": "MoCap",
-        "lab_analog": "Analog",
-        "lab_force": "Force",
-        "lab_event": "Markers",
-    }
     rates_hz = {name: float(stream["info"]["nominal_srate"][0]) for name, stream in found.items()}
-    assert rates_hz == {
-        "lab_3d": RATE_HZ,
-        "lab_6d": RATE_HZ,
-        "lab_analog": ANALOG_RATE_HZ,
-        "lab_force": ANALOG_RATE_HZ,
-        "lab_event": 0,
-    }
+    assert rates_hz == dict(zip(NAMES, [RATE_HZ, RATE_HZ, ANALOG_RATE_HZ, ANALOG_RATE_HZ, 0], strict=True))
     for name, rate_hz in rates_hz.items():
         stream = found[name]
         if rate_hz:
@@ -137,22 +113,8 @@ def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) ->
         times_s = stream["time_stamps"]
         # On one computer, LSL's clock is the monotonic one: samples were captured before they arrived.
         assert began_s < times_s[0] <= times_s[-1] < ended_s
-        assert len(channels(stream)) == int(stream["info"]["channel_count"][0])
-    assert [channel["label"][0] for channel in channels(found["lab_3d"])][:4] == [
-        "Marker 1_X",
-        "Marker 1_Y",
-        "Marker 1_Z",
-        "Marker 1_reliability",
-    ]
-    tool = channels(found["lab_6d"])[:8]
-    assert [channel["type"][0] for channel in tool] == [
-        *("PositionX", "PositionY", "PositionZ"),
-        *("OrientationB", "OrientationC", "OrientationD", "OrientationA"),
-        "Error",
-    ]
-    assert {channel["unit"][0] for channel in tool} == {"meters", "quaternion"}
-    assert [channel["unit"][0] for channel in channels(found["lab_force"])] == ["N"] * 3 + ["Nm"] * 3
-    assert [channel["unit"][0] for channel in channels(found["lab_analog"])] == ["mV"] * 3
+        channels = stream["info"]["desc"][0]["channels"][0]["channel"]
+        assert len(channels) == int(stream["info"]["channel_count"][0])
     [markers] = found["lab_3d"]["info"]["desc"][0]["setup"][0]["markers"]
     assert len(markers["marker"]) == 4
     assert all(text.startswith("Button: ") for [text] in found["lab_event"]["time_series"])
@@ -163,76 +125,7 @@ def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) ->
     assert lengths == pytest.approx(np.ones_like(lengths), abs=1e-3)
 
 
-def test_a_reader_of_a_recording_keeps_the_time_stamps_around_a_gap(tmp_path: Path) -> None:
-    with running(tmp_path) as lab:
-        began_s = time.monotonic()
-        receiver = lab.receive("lab_3d")
-        wait_until(has(receiver, "lab_3d", 2 * RATE_HZ), TIMEOUT_S)
-    samples = list(receiver.samples["lab_3d"])
-    del samples[RATE_HZ // 2 : RATE_HZ]
-    file = tmp_path / "recording.xdf"
-    offsets_s = [(began_s, receiver.offset_s["lab_3d"])]
-    write_xdf(file, [RecordedStream(receiver.xml["lab_3d"], offsets_s, samples)])
-    [stream], _ = pyxdf.load_xdf(str(file))
-    distances_s = [later - earlier for (earlier, _), (later, _) in itertools.pairwise(samples)]
-    assert np.diff(stream["time_stamps"]).tolist() == pytest.approx(distances_s, abs=1e-6)
-
-
-def channels(stream: Any) -> list[Any]:
-    found: list[Any] = stream["info"]["desc"][0]["channels"][0]["channel"]
-    return found
-
-
-def test_events_have_their_own_time_between_the_frames(tmp_path: Path) -> None:
-    """The simulator's button is pressed for 0.3 s, whatever the rate of the frames is."""
-    with running(tmp_path, "--rate", "20", "--analog", "0", "--plates", "0") as lab:
-        receiver = lab.receive("lab_3d", "lab_event")
-        receive_until_the_clock_is_known(receiver, rate_hz=20)
-        wait_until(has(receiver, "lab_event", 6), TIMEOUT_S)
-    samples = receiver.samples["lab_event"]
-    pressed = [time_s for time_s, [text] in samples if text.endswith("ON")]
-    released = [time_s for time_s, [text] in samples if text.endswith("OFF")]
-    released = [time_s for time_s in released if time_s > pressed[0]]
-    assert [after - before for before, after in zip(pressed, released, strict=False)] == pytest.approx(
-        [0.3] * min(len(pressed), len(released)), abs=0.015
-    )
-
-
-def test_a_stream_on_demand_runs_only_while_somebody_receives(tmp_path: Path) -> None:
-    stream = {"on_demand": True, "idle_after_s": 0.2}
-    with running(tmp_path, streams=[stream]) as lab:
-        receiver = lab.receive("lab_3d")
-        wait_until(has(receiver, "lab_3d", 50), TIMEOUT_S)
-        receiver.close()
-        wait_until(lambda: "streaming → idle" in lab.log, TIMEOUT_S)
-        again = lab.receive("lab_3d")
-        wait_until(has(again, "lab_3d", 10), TIMEOUT_S)
-
-
-def test_the_process_for_lsl_is_replaced_when_it_ends_and_ends_with_the_gateway(tmp_path: Path) -> None:
-    """A receiver goes on by itself, and no process is left behind, however the gateway ends."""
-    with simulator(*SCENE) as (port, _):
-        lab = Lab(tmp_path, port)
-        gateway = lab.start()
-        receiver = lab.receive("lab_3d")
-        wait_until(has(receiver, "lab_3d", 10), TIMEOUT_S)
-        [process] = children(gateway.pid)
-        os.kill(process, 9)
-        wait_until(lambda: "the process for LSL ended by SIGKILL" in lab.log, TIMEOUT_S)
-        count = len(receiver.samples["lab_3d"])
-        wait_until(has(receiver, "lab_3d", count + 100), TIMEOUT_S)
-        for end in ("terminate", "kill"):
-            wait_until(lambda gateway=gateway: children(gateway.pid))  # type: ignore[misc]
-            [process] = children(gateway.pid)
-            getattr(gateway, end)()
-            gateway.wait(30)
-            wait_until(lambda process=process: not Path(f"/proc/{process}/cmdline").exists())  # type: ignore[misc]
-            gateway = lab.start() if end == "terminate" else gateway
-        lab.close()
-
-
-@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
-def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path, step_s: float) -> None:
+def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path) -> None:
     clock = WallClock(tmp_path)
     with simulator("--rate", str(RATE_HZ), "--analog", "0", "--plates", "0") as (port, _):
         lab = Lab(tmp_path, port)
@@ -240,7 +133,7 @@ def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path, s
         receiver = lab.receive("lab_3d")
         receive_until_the_clock_is_known(receiver)
         wait_until(has(receiver, "lab_3d", 100), TIMEOUT_S)
-        clock.set(step_s)
+        clock.set(-3600.0)
         wait_until(lambda: "the clock of this computer was set" in lab.log, TIMEOUT_S)
         wait_until(has(receiver, "lab_3d", len(receiver.samples["lab_3d"]) + 100), TIMEOUT_S)
         lab.close()

@@ -1,7 +1,6 @@
-"""A gateway's topics as another implementation of rmw_zenoh receives them, and beside its Zenoh keys."""
+"""A gateway's topics as another implementation of rmw_zenoh receives them."""
 
 import asyncio
-import itertools
 import json
 import sys
 from asyncio.subprocess import PIPE
@@ -9,28 +8,20 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any, Final
 
-import numpy as np
-import pytest
-import rtc3d
 import zenoh
 
 from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, StreamSettings
-from gateway.config.transform import TransformSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.ros2.message_types import ROS_TYPES
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
-from gateway.rtc3d.frames import encode_frame
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.configurations import make_settings
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.networks import open_zenoh
 from tests.running_gateway import running_gateway
-from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
-from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.waiting import wait_until_async
 
 TYPES: Final = {
@@ -44,25 +35,18 @@ TYPES: Final = {
 """A topic of each type."""
 
 
-def settings_of(router: str, sources: dict[str, int], **sections: Any) -> Any:
+def settings_of(router: str, sources: dict[str, int], ros2: Ros2Settings | None = None) -> Any:
     """Return settings with sources by name and port, for ROS on ``router`` only."""
+    reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
     return make_settings(
         sources=tuple(
-            SourceSettings(
-                name=name,
-                host="127.0.0.1",
-                port=port,
-                reconnect=ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-            )
+            SourceSettings(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
             for name, port in sources.items()
         ),
-        **{
-            "zenoh": ZenohSettings(enabled=False),
-            "lcm": LcmSettings(enabled=False),
-            "ros2": Ros2Settings(enabled=True, connect=router),
-            "metrics": MetricsSettings(enabled=False),
-            **sections,
-        },
+        zenoh=ZenohSettings(enabled=False),
+        lcm=LcmSettings(enabled=False),
+        ros2=ros2 or Ros2Settings(enabled=True, connect=router),
+        metrics=MetricsSettings(enabled=False),
     )
 
 
@@ -124,34 +108,6 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
         assert len({gid for _, _, gid in heard["attachments"][topic]}) == 1
 
 
-async def test_poses_have_the_values_and_the_capture_times_of_the_component(router: str) -> None:
-    endpoint = free_endpoint()
-    tools: dict[int, Any] = {}
-    poses: dict[int, Any] = {}
-
-    def on_tools(sample: zenoh.Sample) -> None:
-        message = rtc3d.tools_t.decode(sample.payload.to_bytes())
-        tools[message.capture_utime] = message.tools[0]
-
-    def on_pose(sample: zenoh.Sample) -> None:
-        message = ros.decoded(sample.payload.to_bytes(), "geometry_msgs/msg/PoseStamped")
-        time = message.header.stamp
-        poses[time.sec * 1_000_000 + time.nanosec // 1000] = message.pose
-
-    zenoh_settings = ZenohSettings(config=zenoh_keys("peer", listen=endpoint))
-    async with simulated() as server:
-        settings = settings_of(router, {"lab": server}, zenoh=zenoh_settings)
-        async with gateway_of(settings):
-            with open_zenoh("client", connect=endpoint) as peer, open_zenoh("client", connect=router) as node:
-                peer.declare_subscriber("mocap/lab/6d", on_tools)
-                node.declare_subscriber("0/mocap/lab/Tool_1/pose/**", on_pose)
-                await wait_until_async(lambda: len(tools.keys() & poses.keys()) >= 20)
-    for utime in tools.keys() & poses.keys():
-        tool, pose = tools[utime], poses[utime]
-        ours = (pose.position.x, pose.position.y, pose.position.z, pose.orientation.x, pose.orientation.w)
-        assert ours == pytest.approx((tool.x / 1000, tool.y / 1000, tool.z / 1000, tool.qx, tool.q0))
-
-
 async def test_a_reload_adds_and_removes_sources_and_the_output(router: str) -> None:
     with open_zenoh("client", connect=router) as node:
         async with simulated() as server:
@@ -185,64 +141,3 @@ async def test_frames_are_requested_only_while_ros_wants_them(router: str) -> No
                     subscriber = node.declare_subscriber("0/mocap/lab/markers/**", received.append)
                     await wait_until_async(lambda: received)
                     subscriber.undeclare()
-
-
-MARKERS_ONLY: Final = """<RT_Parameters Ver='1.00'><The_3D><Frequency>100</Frequency><Unit>mm</Unit>
-<Markers><Marker id='1'><Label>a</Label></Marker></Markers></The_3D></RT_Parameters>"""
-
-
-def tool_frame(number: int) -> bytes:
-    """Return a data frame with one tool."""
-    items = np.array([(1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.1)], ITEM_DTYPES[ComponentType.TOOLS])
-    component = encode_component(ComponentType.TOOLS, number, 10_000 * number, items)
-    return packet(3, encode_frame([component]))
-
-
-async def test_a_component_that_the_parameters_lack_has_topics_before_anybody_subscribes(router: str) -> None:
-    async def serve(client: Client) -> None:
-        def answer(command: str) -> bytes:
-            if command.startswith("SendParameters"):
-                return packet(2, MARKERS_ONLY)
-            return ok(f"OK-{command}")
-
-        async def stream() -> None:
-            for number in itertools.count(1):
-                client.send(markers_frame(number, (1.0, 2.0, 3.0)))
-                client.send(tool_frame(number))
-                await asyncio.sleep(0.01)
-
-        await asyncio.gather(client.commands(answer), stream())
-
-    async with ScriptedServer(serve) as server, gateway_of(settings_of(router, {"lab": server.port})):
-        with open_zenoh("client", connect=router) as node:
-            await wait_until_async(
-                lambda: {"/mocap/lab/markers", "/mocap/lab/tool_1/pose"} <= topics_on(node)
-            )
-
-
-async def test_a_server_that_gives_no_parameters_has_topics_by_position(router: str) -> None:
-    async def refuse(client: Client) -> None:
-        def answer(command: str) -> bytes:
-            return error("err-unknown") if command.startswith("SendParameters") else ok(f"OK-{command}")
-
-        async def stream() -> None:
-            for number in itertools.count(1):
-                client.send(markers_frame(number, (1.0, 2.0, 3.0)))
-                await asyncio.sleep(0.01)
-
-        await asyncio.gather(client.commands(answer), stream())
-
-    received: list[zenoh.Sample] = []
-    async with ScriptedServer(refuse) as server:
-        settings = settings_of(router, {"lab": server.port})
-        source = settings.sources[0].model_copy(
-            update={"frame_id": "world", "transform": TransformSettings(units="m")}
-        )
-        async with gateway_of(settings.model_copy(update={"sources": (source,)})):
-            with open_zenoh("client", connect=router) as node:
-                await wait_until_async(lambda: "/mocap/lab/markers" in topics_on(node))
-                node.declare_subscriber("0/mocap/lab/markers/**", received.append)
-                await wait_until_async(lambda: received)
-    cloud = ros.decoded(received[0].payload.to_bytes(), "sensor_msgs/msg/PointCloud2")
-    assert cloud.header.frame_id == "world"
-    assert np.frombuffer(cloud.data.tobytes(), "<f4")[:3].tolist() == [1.0, 2.0, 3.0]

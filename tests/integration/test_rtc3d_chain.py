@@ -94,10 +94,10 @@ def num_arrived(gateway: ServingGateway) -> dict[str, int]:
 def check_equal(first: Contents, second: Contents) -> None:
     """Check that both sent the same; the subscriber may have missed some messages on a busy computer."""
     assert set(first) == set(second)
-    for component in first:
-        common = first[component].keys() & second[component].keys()
-        assert len(common) >= 0.9 * len(first[component])
-        assert all(first[component][each] == second[component][each] for each in common)
+    for component, contents in first.items():
+        common = contents.keys() & second[component].keys()
+        assert len(common) >= 0.9 * len(contents)
+        assert all(contents[each] == second[component][each] for each in common)
 
 
 @pytest.mark.parametrize("byte_order", ["big", "little"])

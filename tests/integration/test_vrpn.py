@@ -4,58 +4,43 @@ import asyncio
 import contextlib
 import json
 import math
-import socket
 import sys
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
-from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.needs import need
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
 from tests.tool_server import ToolServer
-from tests.vrpn_client import COOKIE, VrpnClient
+from tests.vrpn_client import VrpnClient
 from tests.waiting import wait_until_async
 
 Poses = dict[str, list[float]]
 
 
-class Served:
+class Served(NamedTuple):
     """A running gateway with a VRPN server."""
 
-    def __init__(self, gateway: Gateway, port: int, memory: MemoryOutput) -> None:
-        self.gateway = gateway
-        self.port = port
-        self.memory = memory
-
-    def losses(self, source: str = "lab") -> dict[str, int]:
-        """Return how many messages of a source were lost on VRPN, by cause."""
-        for each in self.gateway.sources:
-            if each.name == source:
-                for output, status in each.fan_out.outputs:
-                    if output.name == "vrpn":
-                        return {loss.cause: loss.messages for loss in status.losses}
-        raise AssertionError(f"no source {source}")
+    gateway: Gateway
+    port: int
+    memory: MemoryOutput
 
 
 @contextlib.asynccontextmanager
-async def served(
-    servers: Mapping[str, int], *, port: int = 0, vrpn: Mapping[str, Any] | None = None, **settings: Any
-) -> AsyncIterator[Served]:
+async def served(servers: Mapping[str, int], *, port: int = 0, **settings: Any) -> AsyncIterator[Served]:
     """Run a gateway for these servers, by the source's name. ``settings`` are those of each source."""
     port = port or free_port()
     common: dict[str, Any] = {
@@ -68,7 +53,7 @@ async def served(
         for name, server_port in servers.items()
     )
     memory = MemoryOutput()
-    output = VrpnOutput(VrpnSettings(enabled=True, port=port, **(vrpn or {})))
+    output = VrpnOutput(VrpnSettings(enabled=True, port=port))
     gateway = Gateway(
         make_settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output, memory]
     )
@@ -116,36 +101,27 @@ async def libvrpn(address: str) -> AsyncIterator[LibVrpn]:
 
 
 @pytest.mark.parametrize("scheme", ["", "tcp://"])
-async def test_libvrpn_gets_names_metres_and_the_scalar_last(scheme: str) -> None:
-    server = ToolServer(["wand", "Left Foot"])
-    server.tools[0] = (0.5, -0.5, 0.5, 0.5, 1500.0, -250.0, 3.0, 0.1)
-    async with (
-        server,
-        served({"lab": server.port}) as gateway,
-        libvrpn(f"{scheme}127.0.0.1:{gateway.port}") as client,
-    ):
-        await client.wait_for(lambda poses: len(poses) == 2)
-    assert client.poses == {
-        "wand": pytest.approx([1.5, -0.25, 0.003, -0.5, 0.5, 0.5, 0.5]),
-        "Left_Foot": pytest.approx([1.0, 0.5, -0.25, 0.0, 0.0, 0.0, 1.0]),
-    }
-
-
-async def test_libvrpn_gets_poses_in_the_frame_of_the_source() -> None:
-    server = ToolServer(["wand"], unit="cm")
-    server.tools[0] = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.1)
+async def test_libvrpn_gets_names_metres_and_the_scalar_last_in_the_frame_of_the_source(scheme: str) -> None:
+    server = ToolServer(["wand", "Left Foot"], unit="cm")
+    server.tools = [
+        (0.5, -0.5, 0.5, 0.5, 150.0, -25.0, 0.3, 0.1),
+        (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.1),
+    ]
     transform = {"up": "y", "translation_m": [10.0, 0.0, 0.0]}
     async with (
         server,
         served({"lab": server.port}, transform=transform) as gateway,
-        libvrpn(f"127.0.0.1:{gateway.port}") as client,
+        libvrpn(f"{scheme}127.0.0.1:{gateway.port}") as client,
     ):
-        await client.wait_for(lambda poses: poses)
+        await client.wait_for(lambda poses: len(poses) == 2)
     half = math.sqrt(0.5)
-    assert client.poses == {"wand": pytest.approx([11.0, -3.0, 2.0, half, 0.0, 0.0, half])}
+    assert client.poses == {
+        "wand": pytest.approx([11.5, -0.003, -0.25, 0.0, 0.0, half, half]),
+        "Left_Foot": pytest.approx([11.0, -3.0, 2.0, half, 0.0, 0.0, half]),
+    }
 
 
-async def test_libvrpn_sees_no_tool_that_is_out_of_view_until_it_returns() -> None:
+async def test_libvrpn_follows_tools_that_return_change_names_and_are_added() -> None:
     server = ToolServer(["wand", "foot"])
     server.tools[1] = None
     async with (
@@ -159,68 +135,37 @@ async def test_libvrpn_sees_no_tool_that_is_out_of_view_until_it_returns() -> No
         assert list(client.poses) == ["wand"]
         server.tools[1] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 7000.0, 0.1)
         await client.wait_for(lambda poses: "foot" in poses)
-        assert client.poses["foot"][2] == pytest.approx(7.0)
-
-
-async def test_libvrpn_follows_tools_that_are_renamed_and_added() -> None:
-    server = ToolServer(["wand", "foot"])
-    async with (
-        server,
-        served({"lab": server.port}) as gateway,
-        libvrpn(f"127.0.0.1:{gateway.port}") as client,
-    ):
-        await client.wait_for(lambda poses: len(poses) == 2)
         server.labels = ["wand", "hand", "probe"]
         server.tools.append((1.0, 0.0, 0.0, 0.0, 9000.0, 0.0, 0.0, 0.1))
-        await client.wait_for(lambda poses: "hand" in poses and "probe" in poses)
+        await client.wait_for(lambda poses: poses.keys() >= {"hand", "probe"})
         client.poses.clear()
         await client.wait_for(lambda poses: len(poses) == 3)
         assert client.poses.keys() == {"wand", "hand", "probe"}
-        assert client.poses["hand"][0] == pytest.approx(1.0)
+        assert client.poses["hand"][2] == pytest.approx(7.0)
         assert client.poses["probe"][0] == pytest.approx(9.0)
 
 
-async def test_libvrpn_tells_sources_apart() -> None:
-    async with ToolServer(["wand"]) as lab, ToolServer(["wand", "foot"]) as stage:
-        stage.tools[0] = (1.0, 0.0, 0.0, 0.0, 4000.0, 0.0, 0.0, 0.1)
-        async with (
-            served({"lab": lab.port, "stage": stage.port}) as gateway,
-            libvrpn(f"127.0.0.1:{gateway.port}") as client,
-        ):
-            await client.wait_for(lambda poses: len(poses) == 3)
-        assert client.poses.keys() == {"lab/wand", "stage/wand", "stage/foot"}
-        assert [client.poses[f"{name}/wand"][0] for name in ("lab", "stage")] == [0.0, 4.0]
-
-
 async def test_libvrpn_connects_again_when_the_gateway_returns() -> None:
-    async with ToolServer(["wand"]) as server, contextlib.AsyncExitStack() as stack:
+    """Then with two sources and another client."""
+    async with ToolServer(["wand"]) as lab, ToolServer(["wand", "foot"]) as stage:
         port = free_port()
-        async with served({"lab": server.port}, port=port):
-            client = await stack.enter_async_context(libvrpn(f"127.0.0.1:{port}"))
-            await client.wait_for(lambda poses: poses)
-        client.poses.clear()
-        async with served({"lab": server.port}, port=port):
-            await client.wait_for(lambda poses: poses)
-
-
-async def test_several_clients_and_one_that_comes_again() -> None:
-    async with (
-        ToolServer(["wand"]) as server,
-        served({"lab": server.port}) as gateway,
-        libvrpn(f"127.0.0.1:{gateway.port}") as first,
-    ):
-        for _ in range(2):
-            async with libvrpn(f"127.0.0.1:{gateway.port}") as second:
-                await second.wait_for(lambda poses: poses)
-        first.poses.clear()
-        await first.wait_for(lambda poses: poses)
+        async with contextlib.AsyncExitStack() as stack:
+            async with served({"lab": lab.port}, port=port):
+                client = await stack.enter_async_context(libvrpn(f"127.0.0.1:{port}"))
+                await client.wait_for(lambda poses: poses)
+            async with served({"lab": lab.port, "stage": stage.port}, port=port):
+                other = await stack.enter_async_context(libvrpn(f"127.0.0.1:{port}"))
+                for each in (client, other):
+                    await each.wait_for(
+                        lambda poses: poses.keys() >= {"lab/wand", "stage/wand", "stage/foot"}
+                    )
 
 
 async def test_every_visible_pose_is_sent_with_its_capture_time() -> None:
     scene = SyntheticScene(markers=24, tools=4, analog=8, plates=0, rate_hz=100, analog_rate_hz=500)
     async with Simulator(scene) as simulator, served({"lab": simulator.port}) as gateway:
         async with await VrpnClient.connect(gateway.port) as client:
-            await wait_until_async(lambda: len(client.poses) > 100)
+            await wait_until_async(lambda: len(client.poses) > 150)
             frames = {
                 message.capture_utime: message.tools
                 for topic, data in list(gateway.memory.messages)
@@ -243,73 +188,4 @@ async def test_every_visible_pose_is_sent_with_its_capture_time() -> None:
                 (tool.x / 1e3, tool.y / 1e3, tool.z / 1e3, tool.qx, tool.qy, tool.qz, tool.q0), rel=1e-9
             )
             assert pose.sensor == 0
-        assert gateway.losses() == {}
-
-
-async def test_names_are_found_by_their_labels() -> None:
-    async with ToolServer(["Left Foot", "wand"]) as server, served({"lab": server.port}) as gateway:
-        async with await VrpnClient.connect(gateway.port) as client:
-            await wait_until_async(lambda: len(client.trackers) == 2)
-        [output, _] = gateway.gateway.outputs
-        assert output.topic_names("lab") == {"6d": {"Left Foot": "Left_Foot"}}
-        assert output.topic_names("stage") == {}
-
-
-async def test_unknown_unit_sends_nothing_and_is_counted(caplog: pytest.LogCaptureFixture) -> None:
-    async with (
-        ToolServer(["wand"], unit="furlong") as server,
-        served({"lab": server.port}) as gateway,
-        await VrpnClient.connect(gateway.port) as client,
-    ):
-        await wait_until_async(lambda: gateway.losses().get("unknown unit", 0) > 10)
-        assert client.trackers == {0: "wand"}
-        assert client.poses == []
-    assert caplog.text.count("unit of length 'furlong' is unknown") == 1
-
-
-async def test_tools_beyond_the_limit_are_counted() -> None:
-    labels = [f"tool {number}" for number in range(300)]
-    async with ToolServer(labels) as server, served({"lab": server.port}) as gateway:
-        async with await VrpnClient.connect(gateway.port) as client:
-            await wait_until_async(lambda: client.poses)
-            await wait_until_async(lambda: gateway.losses().get("too many tools"))
-            assert len(client.trackers) == 256
-        assert gateway.losses()["too many tools"] % 44 == 0
-
-
-async def test_slow_client_loses_only_its_own_poses(caplog: pytest.LogCaptureFixture) -> None:
-    labels = [f"tool {number}" for number in range(250)]
-    async with ToolServer(labels) as server, served({"lab": server.port}) as gateway:
-        with socket.socket() as slow:
-            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            slow.connect(("127.0.0.1", gateway.port))
-            slow.sendall(COOKIE)
-            async with await VrpnClient.connect(gateway.port) as client:
-                await wait_until_async(lambda: gateway.losses().get("slow client", 0) >= 1000)
-                num_poses = len(client.poses)
-                await wait_until_async(lambda: len(client.poses) > num_poses + 1000)
-                times = {pose.utime for pose in client.poses}
-                frames = {
-                    decode(data).capture_utime
-                    for topic, data in list(gateway.memory.messages)
-                    if topic.path == ("6d",)
-                }
-                assert {time for time in frames if min(times) < time < max(times)} <= times
-            assert gateway.losses().keys() == {"slow client"}
-            lines = [line for line in caplog.messages if "does not read them fast enough" in line]
-            assert lines == [
-                f"lab to vrpn: poses for 127.0.0.1:{slow.getsockname()[1]} are lost, because it does not "
-                "read them fast enough; look at that program"
-            ]
-
-
-async def test_frames_flow_on_demand_while_a_client_is_connected() -> None:
-    stream = StreamSettings(components=(ComponentType.TOOLS,), on_demand=True, idle_after_s=0.05)
-    async with ToolServer(["wand"]) as server, served({"lab": server.port}, streams=(stream,)) as gateway:
-        gateway.memory.has_subscriber = False
-        status = gateway.gateway.sources[0].statuses[0]
-        await wait_until_async(lambda: status.state is StreamState.IDLE)
-        async with await VrpnClient.connect(gateway.port) as client:
-            await wait_until_async(lambda: client.poses)
-            assert client.trackers == {0: "wand"}
-        await wait_until_async(lambda: status.state is StreamState.IDLE)
+        assert not any(status.losses for _, status in gateway.gateway.sources[0].fan_out.outputs)

@@ -15,9 +15,8 @@ from tests.message_vectors import VECTORS, difference, random_message, to_vector
 each_program = pytest.mark.parametrize("program", PROGRAMS, ids=str)
 
 
-def decode_with(program: ExampleProgram, messages: list[tuple[str, bytes]]) -> list[Any]:
-    """Return what the program prints for each type and message."""
-    return printed_for(program, [f"{type_name} {data.hex()}".encode() for type_name, data in messages])
+def line(type_name: str, data: bytes) -> bytes:
+    return f"{type_name} {data.hex()}".encode()
 
 
 def printed_for(program: ExampleProgram, lines: list[bytes]) -> list[Any]:
@@ -39,37 +38,27 @@ def no_json(text: str) -> Any:
 
 
 @each_program
-def test_each_program_decodes_the_test_vectors(program: ExampleProgram) -> None:
-    vectors = [vector for vector in VECTORS if vector.type_name in program.types]
-    found = decode_with(program, [(vector.type_name, vector.data) for vector in vectors])
-    problems = {
-        str(vector): problem
-        for vector, values in zip(vectors, found, strict=True)
-        if (problem := difference(vector.lcm_type, vector.values, values))
-    }
-    assert not problems
-
-
-@each_program
-def test_each_program_decodes_random_messages(program: ExampleProgram) -> None:
+def test_each_program_decodes_the_test_vectors_and_random_messages(program: ExampleProgram) -> None:
     generator = random.Random(18)
     messages = [
-        (name, random_message(MESSAGE_TYPES_BY_NAME[name], generator))
-        for name in sorted(program.types)
-        for _ in range(60)
+        (each.lcm_type, each.data, each.values) for each in VECTORS if each.type_name in program.types
     ]
-    found = decode_with(program, [(name, message.encode()) for name, message in messages])
+    for name in sorted(program.types):
+        for _ in range(60):
+            message = random_message(MESSAGE_TYPES_BY_NAME[name], generator)
+            messages.append((type(message), message.encode(), to_vector_values(message)))
+    found = printed_for(program, [line(lcm_type.__name__, data) for lcm_type, data, _ in messages])
     problems = [
-        problem
-        for (_, message), values in zip(messages, found, strict=True)
-        if (problem := difference(type(message), to_vector_values(message), values))
+        (lcm_type.__name__, data.hex(), problem)
+        for (lcm_type, data, expected), values in zip(messages, found, strict=True)
+        if (problem := difference(lcm_type, expected, values))
     ]
     assert not problems
 
 
-def damaged_messages(types: frozenset[str]) -> list[tuple[str, bytes]]:
+def damaged_messages(types: frozenset[str]) -> list[bytes]:
     """Return messages that nobody can decode: too short, too long, of other types, with wrong numbers."""
-    damaged = []
+    damaged: list[tuple[str, bytes]] = []
     for vector in VECTORS:
         if vector.type_name not in types:
             continue
@@ -82,48 +71,14 @@ def damaged_messages(types: frozenset[str]) -> list[tuple[str, bytes]]:
             num_items = int.from_bytes(data[COUNT_OFFSET : COUNT_OFFSET + 4], "big")
             for count in (num_items + 1, 1 << 28, (1 << 31) - 1, 1 << 31, (1 << 32) - 1):
                 damaged.append((name, before + count.to_bytes(4, "big") + after))
-    return damaged
+    unknown = ["nonsense_t", *sorted(set(MESSAGE_TYPES_BY_NAME) - types)]
+    damaged += [(name, VECTORS[0].data) for name in unknown]
+    return [line(*each) for each in damaged]
 
 
-@each_program
-def test_each_program_reports_messages_that_it_cannot_decode(program: ExampleProgram) -> None:
-    messages = damaged_messages(program.types)
-    found = decode_with(program, messages)
-    wrong = [
-        (name, data.hex(), answer)
-        for (name, data), answer in zip(messages, found, strict=True)
-        if list(answer) != ["error"] or not isinstance(answer["error"], str)
-    ]
-    assert not wrong
-
-
-@each_program
-def test_each_program_survives_messages_with_random_bytes(program: ExampleProgram) -> None:
-    generator = random.Random(17)
-    messages = []
-    for vector in VECTORS:
-        for _ in range(40 if vector.type_name in program.types else 0):
-            data = bytearray(vector.data)
-            for _ in range(generator.randint(1, 3)):
-                data[generator.randrange(8, len(data))] = generator.choice(
-                    (0, 0x7F, 0xFF, generator.randrange(256))
-                )
-            messages.append((vector.type_name, bytes(data)))
-    assert all(isinstance(values, dict) for values in decode_with(program, messages))
-
-
-@each_program
-def test_each_program_reports_types_that_it_does_not_know(program: ExampleProgram) -> None:
-    unknown = ["nonsense_t", *sorted(set(MESSAGE_TYPES_BY_NAME) - program.types)]
-    found = decode_with(program, [(name, VECTORS[0].data) for name in unknown])
-    assert [list(answer) for answer in found] == [["error"]] * len(unknown)
-
-
-@each_program
-def test_each_program_reports_lines_that_are_not_hexadecimal(program: ExampleProgram) -> None:
-    vector = next(vector for vector in VECTORS if vector.type_name == "markers_t")
-    digits = vector.data.hex().encode()
-    damaged = [
+def damaged_lines(digits: bytes) -> list[bytes]:
+    """Return lines that are no type and hexadecimal digits."""
+    texts = [
         b"",
         digits + b"0",
         digits + b"zz",
@@ -133,10 +88,37 @@ def test_each_program_reports_lines_that_are_not_hexadecimal(program: ExamplePro
         b"-1",
         digits + b"\xff",
     ]
-    lines = [b"", b" ", b"\xff 00", b'"\\ 00', b"markers_t", *(b"markers_t " + text for text in damaged)]
+    others = [b"", b" ", b"\xff 00", b'"\\ 00', b"markers_t"]
+    return [*others, *(b"markers_t " + text for text in texts)]
+
+
+@each_program
+def test_each_program_reports_what_it_cannot_decode(program: ExampleProgram) -> None:
+    vector = next(vector for vector in VECTORS if vector.type_name == "markers_t")
+    digits = vector.data.hex().encode()
+    lines = [*damaged_messages(program.types), *damaged_lines(digits)]
     *found, last = printed_for(program, [*lines, b"markers_t " + digits.upper() + b"\r"])
-    assert [list(answer) for answer in found] == [["error"]] * len(lines)
+    wrong = [
+        (each, answer)
+        for each, answer in zip(lines, found, strict=True)
+        if list(answer) != ["error"] or not isinstance(answer["error"], str)
+    ]
+    assert not wrong
     assert difference(vector.lcm_type, vector.values, last) is None
+
+
+@each_program
+def test_each_program_survives_messages_with_random_bytes(program: ExampleProgram) -> None:
+    generator = random.Random(17)
+    lines = []
+    for vector in VECTORS:
+        for _ in range(40 if vector.type_name in program.types else 0):
+            data = bytearray(vector.data)
+            for _ in range(generator.randint(1, 3)):
+                value = generator.choice((0, 0x7F, 0xFF, generator.randrange(256)))
+                data[generator.randrange(8, len(data))] = value
+            lines.append(line(vector.type_name, bytes(data)))
+    assert all(isinstance(values, dict) for values in printed_for(program, lines))
 
 
 @pytest.mark.parametrize("program", [each for each in PROGRAMS if "status_t" in each.types], ids=str)
@@ -145,9 +127,8 @@ def test_each_program_reports_texts_that_are_not_utf8_up_to_a_nul(program: Examp
     texts = (b"ab", b"a\xff\0", b"\xed\xa0\x80\0", b"\xf4\x90\x80\x80\0", b"\xc0\x80\0", b"\xe2\x82\0", b"")
     begin = vector.data[:40]  # up to the only text
     damaged = [begin + len(text).to_bytes(4, "big") + text for text in texts]
-    messages = [("parameters_t", data) for each in damaged for data in (each, vector.data)]
-    found = decode_with(program, messages)
-    assert [list(answer) for answer in found[::2]] == [["error"]] * len(texts)
-    assert [difference(vector.lcm_type, vector.values, values) for values in found[1::2]] == [None] * len(
-        texts
+    found = printed_for(
+        program, [line("parameters_t", each) for data in damaged for each in (data, vector.data)]
     )
+    assert [list(answer) for answer in found[::2]] == [["error"]] * len(texts)
+    assert not any(difference(vector.lcm_type, vector.values, values) for values in found[1::2])

@@ -7,10 +7,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import lcm
 import numpy as np
 import pytest
+import rtc3d
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
@@ -24,18 +26,23 @@ from tests.example_programs import (
     run_gateway,
     run_program,
 )
+from tests.joined_components import MARKERS, SCENARIOS, Pair, Scenario
 from tests.networks import free_port, open_zenoh
 
 pytestmark = pytest.mark.netns
 
 
+SCENE = SyntheticScene(markers=20, tools=0, analog=2, plates=0, rate_hz=200, analog_rate_hz=2000)
+SUBSCRIBERS = [program for program in PROGRAMS if program.arguments is not None]
+
+
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The Zenoh endpoint of a gateway that runs, like its simulator, as a separate program."""
+    """The Zenoh endpoint of a gateway that plays SCENE; like its simulator, it is a separate program."""
     folder = tmp_path_factory.mktemp("gateway")
-    with run_gateway(
-        folder, "--markers", "20", "--rate", "100", ready="zenoh: the session is open"
-    ) as endpoint:
+    sizes = ("--markers", "20", "--tools", "0", "--analog", "2", "--plates", "0")
+    rates = ("--rate", "200", "--analog-rate", "2000")
+    with run_gateway(folder, *sizes, *rates, ready="lab (analog): connected to") as endpoint:
         yield endpoint
 
 
@@ -49,7 +56,6 @@ LINE = re.compile(
 
 def assert_lines_match_the_scene(text: str) -> None:
     """Check the lines against what the simulator sends. On a busy machine, UDP loses some messages."""
-    scene = SyntheticScene(markers=20, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
     printed = [match for line in text.splitlines() if (match := LINE.fullmatch(line))]
     assert len(printed) == COUNT, text
     first = printed[0]
@@ -58,18 +64,16 @@ def assert_lines_match_the_scene(text: str) -> None:
         step = int(line["sequence"]) - int(first["sequence"])
         number = int(line["number"])
         assert number == int(first["number"]) + step
-        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + step / 100, abs=2e-4)
+        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + step / 200, abs=2e-4)
         assert line["version"] == "1"
-        [items] = scene.items(ComponentType.MARKERS, np.array([number - 1]))
+        [items] = SCENE.items(ComponentType.MARKERS, np.array([number - 1]))
         visible = items[~np.isnan(items["x"])]
         assert (int(line["visible"]), int(line["count"])) == (len(visible), len(items))
         coordinates = [float(line[axis]) for axis in "xyz"]
         assert coordinates == pytest.approx([visible[0][axis] for axis in "xyz"], abs=6e-4)
 
 
-@pytest.mark.parametrize(
-    "program", [program for program in PROGRAMS if program.arguments is not None], ids=str
-)
+@pytest.mark.parametrize("program", SUBSCRIBERS, ids=str)
 def test_each_program_prints_the_markers_of_every_frame(endpoint: str, program: ExampleProgram) -> None:
     program.build()
     with run_program(*program.run_command(endpoint), ready="listening") as process:
@@ -78,12 +82,16 @@ def test_each_program_prints_the_markers_of_every_frame(endpoint: str, program: 
     assert_lines_match_the_scene(text)
 
 
-JOIN = ExampleProgram("join.py", (sys.executable, "join.py"), ("--connect", "{endpoint}"))
-
-
-@pytest.mark.parametrize(
-    "program", [*(program for program in PROGRAMS if program.arguments is not None), JOIN], ids=str
+PAIRS = 60
+JOIN = ExampleProgram(
+    "Python, join",
+    (sys.executable, "join.py"),
+    ("--connect", "{endpoint}", "--source", "lab", "--count", str(PAIRS)),
 )
+CPP = ExampleProgram("C++, join", ("build/join",), ("LAB", str(PAIRS)), target="cpp", tools=("c++", "make"))
+
+
+@pytest.mark.parametrize("program", [*SUBSCRIBERS, JOIN], ids=str)
 def test_each_program_says_in_a_sentence_that_it_cannot_receive(program: ExampleProgram) -> None:
     program.build()
     run = subprocess.run(
@@ -132,3 +140,68 @@ def test_the_python_examples_ignore_malformed_messages_and_end_quietly_at_ctrl_c
     assert line.startswith("ignored a malformed message: ")
     assert "Traceback" not in rest
     assert program.returncode in {0, -signal.SIGINT}
+
+
+# Markers joined with analog samples of another rate --------------------------------------------
+
+PAIR_LINE = re.compile(
+    r"at (?P<time_s>\d+\.\d+) s: (?P<visible>\d+) markers in view \(frame (?P<frame>-?\d+)\)"
+    r"(?:, (?P<count>\d+) analog samples \(frames (?P<first>-?\d+) to (?P<last>-?\d+)\),"
+    r" mean of channel 1: (?P<mean>\S+))?"
+)
+
+
+@pytest.mark.parametrize("program", [JOIN, CPP], ids=str)
+def test_each_frame_of_markers_is_printed_with_its_ten_analog_samples(
+    endpoint: str, program: ExampleProgram
+) -> None:
+    program.build()
+    with run_program(*program.run_command(endpoint), ready="listening") as process:
+        text = output_until_the_end(process)
+    assert process.returncode == 0, text
+    lines = [PAIR_LINE.fullmatch(line) for line in text.splitlines()]
+    assert len(lines) == PAIRS, text
+    complete = [line for line in lines if line and line["count"] == "10"]
+    assert len(complete) >= PAIRS // 2  # it may hear one component before the other, and lose messages on LCM
+    for line in complete:
+        sample = round(float(line["time_s"]) * 2000)
+        [markers] = SCENE.items(ComponentType.MARKERS, np.array([sample // 10]))
+        assert int(line["visible"]) == np.count_nonzero(~np.isnan(markers["x"]))
+        assert int(line["frame"]) == sample // 10 + 1
+        assert (int(line["first"]), int(line["last"])) == (sample - 8, sample + 1)
+        analog = SCENE.items(ComponentType.ANALOG, np.arange(sample - 9, sample + 1))
+        assert float(line["mean"]) == pytest.approx(float(np.mean(analog[:, 0])), abs=2e-3)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_the_cpp_example_pairs_messages_in_any_order(scenario: Scenario) -> None:
+    CPP.build()
+    # The end of each scenario: a pair that shows that everything before it has been printed.
+    last_us = 10_000_000
+    final = [(MARKERS, last_us), ("analog", last_us), (MARKERS, last_us + 5000), ("analog", last_us + 5000)]
+    connection = lcm.LCM(LCM_URL)
+    with run_program(str(EXAMPLES / "build/join"), "OTHER", "0", ready="listening") as process:
+        for component, timestamp_us in [*scenario.messages, *final]:
+            is_frame = component == MARKERS
+            message: Any = rtc3d.markers_t() if is_frame else rtc3d.analog_t()
+            message.timestamp = timestamp_us
+            message.frame_number = timestamp_us // 500
+            connection.publish(f"MOCAP_OTHER_{'3D' if is_frame else 'ANALOG'}", message.encode())
+        assert process.stdout is not None
+        found = []
+        for line in process.stdout:
+            match = PAIR_LINE.fullmatch(line.rstrip("\n"))
+            assert match, line
+            frame_us = int(match["frame"]) * 500
+            if frame_us == last_us + 5000:
+                break
+            if frame_us < last_us:
+                found.append((frame_us, match["first"], match["last"], match["count"]))
+    assert found == [as_printed(pair) for pair in scenario.pairs]
+
+
+def as_printed(pair: Pair) -> tuple[int, str | None, str | None, str | None]:
+    if not pair.samples_us:
+        return (pair.frame_us, None, None, None)
+    numbers = [timestamp_us // 500 for timestamp_us in pair.samples_us]
+    return (pair.frame_us, str(numbers[0]), str(numbers[-1]), str(len(numbers)))

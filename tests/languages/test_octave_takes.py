@@ -127,14 +127,9 @@ def test_damage_and_malformed_messages_are_skipped_with_a_warning(tmp_path: Path
     channel, message = markers(3, 1)
     good = [markers(3, number) for number in range(4)]
     take = tmp_path / "take.lcmlog"
-    take.write_bytes(
-        b"garbage"
-        + log_bytes([(channel, b"x"), *good[:2], (channel, message[:-1]), (channel, message + b"x")])
-        + b"\xed\xa1\xda\x01"
-        + bytes(50)
-        + log_bytes(good[2:])
-        + log_bytes(good)[:-5]
-    )
+    malformed = log_bytes([(channel, b"x"), *good[:2], (channel, message[:-1]), (channel, message + b"x")])
+    damaged = b"\xed\xa1\xda\x01" + bytes(50)
+    take.write_bytes(b"garbage" + malformed + damaged + log_bytes(good[2:]) + log_bytes(good)[:-5])
     found = OctaveTake(take, tmp_path)
     np.testing.assert_array_equal(found("3D", "sequence"), [0, 1, 2, 3, 0, 1, 2])
     cut = len(log_bytes(good[3:])) - 5

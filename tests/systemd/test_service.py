@@ -4,15 +4,10 @@ import asyncio
 import re
 import shlex
 import subprocess
-from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from gateway.messages.decode import decode
-from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.fresh_clones import ROOT
@@ -37,37 +32,20 @@ def simulator(port: int = 0) -> Simulator:
     return Simulator(SyntheticScene(markers=2, tools=0, analog=0, plates=0, rate_hz=100), port=port)
 
 
-async def test_the_status_line_shows_every_source(service: Service) -> None:
+async def test_the_status_line_shows_every_source_and_a_missing_router_delays_nothing(
+    service: Service,
+) -> None:
     away = free_port()
     async with simulator() as server:
-        service.configure({"lab": away, "sim": server.port})
+        router = {"config": zenoh_keys("client", connect=service.endpoint)}
+        service.configure({"lab": away, "sim": server.port}, zenoh=router)
         await service.start()
+        await service.wait_for_status("zenoh: the Zenoh session does not open")
         await service.wait_for_status("sim: streaming")
         await service.wait_for_status(f"lab: waiting for 127.0.0.1:{away}, ")
         status = await service.machine.show("StatusText")
-        assert re.fullmatch(r"lab: waiting for [\d.:]+, \d+ (try|tries); sim: streaming \d+\.\d Hz", status)
+        assert re.search(r"lab: waiting for [\d.:]+, \d+ (try|tries); sim: streaming \d+\.\d Hz", status)
         assert await service.machine.show("ActiveState") == "active"
-
-
-async def test_the_service_reconnects_when_a_server_returns(service: Service) -> None:
-    async with simulator() as server:
-        service.configure({"lab": server.port})
-        await service.start()
-        await service.wait_for_status("lab: streaming")
-        before = await service.main_pid()
-    await service.wait_for_status(f"lab: waiting for 127.0.0.1:{server.port}")
-    async with simulator(server.port):
-        await service.wait_for_status("lab: streaming")
-    assert await service.main_pid() == before
-
-
-async def test_a_missing_router_does_not_delay_the_start(service: Service) -> None:
-    away = {"config": zenoh_keys("client", connect=service.endpoint)}
-    async with simulator() as server:
-        service.configure({"lab": server.port}, zenoh=away)
-        await service.start()
-        await service.wait_for_status("lab: streaming")
-        await service.wait_for_status("zenoh: the Zenoh session does not open")
 
 
 async def test_multicast_and_metrics_work_in_the_sandbox(service: Service) -> None:
@@ -87,18 +65,6 @@ async def test_multicast_and_metrics_work_in_the_sandbox(service: Service) -> No
         assert "process_resident_memory_bytes" in page
 
 
-async def test_a_killed_service_is_restarted(service: Service) -> None:
-    async with simulator() as server:
-        service.configure({"lab": server.port})
-        await service.start()
-        before = await service.main_pid()
-        await service.machine.run("kill", "-KILL", before)
-        await service.machine.wait_for("NRestarts", "1")
-        await service.machine.wait_for("ActiveState", "active")
-        await service.wait_for_status("lab: streaming")
-        assert await service.main_pid() != before
-
-
 @pytest.mark.parametrize(
     ("restarts", "delay_s"), [(0, None), (1, 1), (2, 2), (3, 4), (4, 8), (5, 16), (6, 16), (100, 16)]
 )
@@ -111,29 +77,34 @@ def test_each_restart_in_a_row_waits_longer(restarts: int, delay_s: int | None) 
     assert output == ("" if delay_s is None else f"slept {delay_s}\n")
 
 
-async def test_the_watchdog_restarts_a_hung_service(service: Service) -> None:
+async def test_a_killed_service_and_one_that_hangs_are_restarted(service: Service) -> None:
+    machine = service.machine
     async with simulator() as server:
         service.configure({"lab": server.port})
         await service.drop_in("WatchdogSec=1s")
         await service.start()
-        await service.wait_for_status("lab: streaming")
-        before = await service.main_pid()
-        await service.machine.run("kill", "-STOP", before)
-        await service.machine.wait_for("NRestarts", "1")
-        await service.machine.wait_for("ActiveState", "active")
-        await service.wait_for_status("lab: streaming")
-        assert await service.main_pid() != before
-    log = (await service.machine.run("journalctl", "--output=cat", "--unit", UNIT)).text
+        for restarts, signal in (("1", "-KILL"), ("2", "-STOP")):
+            await service.wait_for_status("lab: streaming")
+            before = await service.main_pid()
+            await machine.run("kill", signal, before)
+            await machine.wait_for("NRestarts", restarts)
+            await machine.wait_for("ActiveState", "active")
+            await service.wait_for_status("lab: streaming")
+            assert await service.main_pid() != before
+    log = (await machine.run("journalctl", "--output=cat", "--unit", UNIT)).text
     assert "Watchdog timeout" in log
     assert "Fatal Python error: Aborted" in log  # and the traceback shows where it hung
 
 
-async def test_the_limits_are_in_force(service: Service) -> None:
+async def test_the_limits_are_in_force_and_journal_entries_have_fields(service: Service) -> None:
     machine = service.machine
     async with simulator() as server:
         service.configure({"lab": server.port})
         await service.start()
         await service.wait_for_status("lab: streaming")
+    [entry] = [entry for entry in await machine.journal() if "connected to" in entry["MESSAGE"]]
+    assert (entry["SOURCE"], entry["PEER"]) == ("lab", f"127.0.0.1:{server.port}")
+    assert (entry["STREAM"], entry["PRIORITY"]) == ("3d 6d analog force event", "6")
     pid = await service.main_pid()
     limits = (await machine.run("cat", f"/proc/{pid}/limits")).text
     assert re.search(r"Max open files +8192 +8192 ", limits)
@@ -151,84 +122,28 @@ async def test_the_limits_are_in_force(service: Service) -> None:
         assert (await machine.run("cat", f"{folder}/{file}")).text.strip() == value
 
 
-class Received:
-    """The session and sequence numbers of each source's markers, as a Zenoh subscriber received them."""
-
-    def __init__(self) -> None:
-        self.numbers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-
-    def add(self, key: str, message: bytes) -> None:
-        markers = decode(message)
-        self.numbers[key.split("/")[1]].append((markers.session, markers.sequence))
-
-    async def wait_for_more(self, source: str, count: int = 20) -> None:
-        wanted = len(self.numbers[source]) + count
-        await wait_until_async(lambda: len(self.numbers[source]) >= wanted)
-
-    def assert_no_gap(self, source: str) -> None:
-        sequences = [sequence for _, sequence in self.numbers[source]]
-        assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
-
-
-@contextmanager
-def subscribed_to(endpoint: str) -> Iterator[Received]:
-    received = Received()
-    session = open_zenoh(endpoint)
-    try:
-        ZenohSubscriber(session, key_patterns("mocap", None, "3d"), received.add)
-        yield received
-    finally:
-        session.close()
-
-
-async def test_a_reload_changes_only_the_sources_that_differ(service: Service) -> None:
-    async with simulator() as kept, simulator() as first, simulator() as second, simulator() as new:
-        service.configure({"kept": kept.port, "moved": first.port, "gone": first.port})
-        await service.start()
-        await service.wait_for_status("gone: streaming")
-        with subscribed_to(service.endpoint) as received:
-            await received.wait_for_more("kept")
-            await received.wait_for_more("moved")
-            [connection] = kept.connections
-            service.configure({"kept": kept.port, "moved": second.port, "new": new.port})
-            assert (await service.reload()).status == 0
-            await received.wait_for_more("new")
-            await received.wait_for_more("kept")
-            await wait_until_async(lambda: received.numbers["moved"][-1][0] == 2)
-            received.assert_no_gap("kept")
-            received.assert_no_gap("moved")  # another server, but the sequence of the key continues
-            assert {session for session, _ in received.numbers["kept"]} == {1}
-            assert kept.connections == {connection}
-            assert not first.connections
-        await service.wait_for_status("new: streaming")
-        assert "gone" not in await service.machine.show("StatusText")
-
-
 async def test_a_bad_configuration_is_refused_and_the_old_one_stays_in_use(service: Service) -> None:
     async with simulator() as server:
         service.configure({"lab": server.port})
         await service.start()
         await service.wait_for_status("lab: streaming")
-        with subscribed_to(service.endpoint) as received:
-            await received.wait_for_more("lab")
-            file = service.machine.path(CONFIG)
-            good = file.read_text()
-            file.write_text(f"{good}bogus: 1\n")
-            refused = await service.reload()
-            await received.wait_for_more("lab")
-            received.assert_no_gap("lab")
-        assert refused.status != 0  # so that scripts notice it
-        line = len(good.splitlines()) + 1
+        [connection] = server.connections
+        file = service.machine.path(CONFIG)
+        good = file.read_text()
+        file.write_text(f"{good}bogus: 1\n")
+        assert (await service.reload()).status != 0  # so that scripts notice it
+        place = f"{CONFIG}:{len(good.splitlines()) + 1}:1"
         await service.wait_for_status(
-            f"new configuration refused, the old one stays in use: {CONFIG}:{line}:1: bogus: unknown key"
+            f"new configuration refused, the old one stays in use: {place}: bogus: unknown key"
         )
         assert await service.machine.show("ActiveState") == "active"
         errors = [entry for entry in await service.machine.journal() if entry["PRIORITY"] == "3"]
-        assert any(f"{CONFIG}:{line}:1" in entry["MESSAGE"] for entry in errors)
+        assert any(place in entry["MESSAGE"] for entry in errors)
         file.write_text(good)
         assert (await service.reload()).status == 0
         await service.machine.wait_for("StatusText", "lab: streaming")
         assert "refused" not in await service.machine.show("StatusText")
+        assert server.connections == {connection}
 
 
 async def test_a_start_with_a_bad_configuration_fails_once_and_logs_why(service: Service) -> None:
@@ -290,17 +205,6 @@ def test_the_units_differ_only_in_the_name_of_the_configuration() -> None:
     named = named.replace("Description=RTC3D gateway", "Description=RTC3D gateway of %i.yaml")
     named = named.replace("StateDirectory=rtc3d-gateway", "StateDirectory=rtc3d-gateway/%i")
     assert named == "\n".join(other)
-
-
-async def test_the_journal_entries_have_fields(service: Service) -> None:
-    async with simulator() as server:
-        service.configure({"lab": server.port})
-        await service.start()
-        await service.wait_for_status("lab: streaming")
-    entries = [entry for entry in await service.machine.journal() if "connected to" in entry["MESSAGE"]]
-    assert [(entry["SOURCE"], entry["PEER"]) for entry in entries] == [("lab", f"127.0.0.1:{server.port}")]
-    assert entries[0]["STREAM"] == "3d 6d analog force event"
-    assert entries[0]["PRIORITY"] == "6"
 
 
 C3D_FILE = b"\x02\x50" + bytes(510)

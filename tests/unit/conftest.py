@@ -7,6 +7,7 @@ from typing import Final
 import pytest
 
 from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.settable_clock import SettableClock
 from tests.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {
@@ -37,3 +38,8 @@ async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
 async def threads(servers: Servers) -> SlowThreads:
     """The threads that stand for those of ``call_in_thread``."""
     return servers.threads
+
+
+@pytest.fixture
+def clock() -> SettableClock:
+    return SettableClock()

@@ -4,7 +4,7 @@ import asyncio
 import dataclasses
 import io
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from gateway.demo import run_demo
 from gateway.doctor.all_checks import run_checks_without_settings
 from gateway.doctor.output_checks import check_output
 from gateway.errors import ConfigError
-from gateway.findings import Finding, Result
+from gateway.findings import Result
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.monitoring.health import health_page
@@ -32,20 +32,22 @@ from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from gateway.rtc3d.packets import FilePiece
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
-from tests.servers import c3d_file
 from tests.waiting import wait_until_async
 
 OFF = {"zenoh": {"enabled": False}, "lcm": {"enabled": False}, "metrics": {"enabled": False}}
 
 
 @pytest.fixture(autouse=True)
-def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+def _registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    before = dict(OUTPUTS)
     monkeypatch.setitem(OUTPUTS, EXAMPLE.name, EXAMPLE)
+    yield
+    OUTPUTS.clear()  # monkeypatch would put back at the end what a test has removed
+    OUTPUTS.update(before)
 
 
 def scene() -> SyntheticScene:
@@ -123,14 +125,10 @@ async def running(
             await task
 
 
-# The configuration ---------------------------------------------------------------------------
-
-
 def test_yaml_and_environment_variables_configure_it(tmp_path: Path) -> None:
     file = written(tmp_path, address="from-file")
-    assert read(file).outputs["example"] == ExampleSettings(enabled=True, address="from-file")
-    overridden = read(file, RTC3D_GATEWAY__EXAMPLE__ADDRESS="from-variable")
-    assert overridden.outputs["example"] == ExampleSettings(enabled=True, address="from-variable")
+    for variables, address in (({}, "from-file"), ({"RTC3D_GATEWAY__EXAMPLE__ADDRESS": "other"}, "other")):
+        assert read(file, **variables).outputs["example"] == ExampleSettings(enabled=True, address=address)
 
 
 def test_a_mistake_in_its_section_is_reported_with_its_position(tmp_path: Path) -> None:
@@ -150,60 +148,54 @@ def test_config_show_prints_its_values_with_their_origin(
 ) -> None:
     monkeypatch.setenv("RTC3D_GATEWAY__EXAMPLE__WHOLE_FRAMES", "true")
     file = written(tmp_path, address="from-file")
-    lines = [
-        " ".join(line.split()) for line in run_command("config", "show", "--config", str(file)).splitlines()
-    ]
-    begin = lines.index("example:")
-    assert lines[begin + 1 : begin + 4] == [
+    text = run_command("config", "show", "--config", str(file)).partition("\nexample:\n")[2]
+    assert [" ".join(line.split()) for line in text.splitlines()[:3]] == [
         f"enabled: true # {file}:1",
         f"address: from-file # {file}:1",
         "whole_frames: true # RTC3D_GATEWAY__EXAMPLE__WHOLE_FRAMES",
     ]
 
 
-# The commands --------------------------------------------------------------------------------
+class Broken(ExampleOutput):
+    def __init__(self, settings: ExampleSettings) -> None:
+        if settings.address == "refused":
+            raise ConfigError("example.address is no address")
+        super().__init__(settings)
+
+    def health(self) -> OutputHealth:
+        return OutputHealth(False, "it is broken") if self.settings.address == "broken" else super().health()
 
 
-def doctor(**settings: Any) -> list[Finding]:
-    return check_output(EXAMPLE, ExampleSettings(**settings), ["lab"], [], 0.0)
-
-
-def test_the_doctor_checks_that_it_opens() -> None:
-    [finding] = doctor(enabled=True)
-    assert (finding.subject, finding.check, finding.result) == ("example", "opens", Result.PASSING)
-
-
-def test_the_doctor_says_why_it_does_not_open() -> None:
-    [finding] = doctor(enabled=True, address=UNREACHABLE)
-    assert (finding.check, finding.result) == ("opens", Result.FAILING)
-    assert finding.found == "nothing answers at unreachable"
-    assert finding.remedy == "Correct example.address."
-
-
-def test_the_doctor_points_at_its_section_if_it_names_no_remedy() -> None:
-    class Broken(ExampleOutput):
-        def health(self) -> OutputHealth:
-            return OutputHealth(False, "it is broken")
-
-    broken = dataclasses.replace(EXAMPLE, create=Broken)
-    [finding] = check_output(broken, ExampleSettings(enabled=True), ["lab"], [], 0.0)
-    assert (finding.found, finding.remedy) == ("it is broken", "Correct example in the configuration.")
-
-
-def test_the_doctor_says_which_configuration_it_refuses() -> None:
-    def refuse(_settings: ExampleSettings) -> ExampleOutput:
-        raise ConfigError("example.address is no address")
-
-    refusing = dataclasses.replace(EXAMPLE, create=refuse)
-    [finding] = check_output(refusing, ExampleSettings(enabled=True), ["lab"], [], 0.0)
-    assert (finding.check, finding.result) == ("opens", Result.FAILING)
-    assert finding.found == "example.address is no address"
-    assert finding.remedy == "Correct example in the configuration."
-
-
-def test_the_doctor_does_not_test_it_while_it_is_disabled() -> None:
-    [finding] = doctor(enabled=False)
-    assert (finding.check, finding.result) == ("opens", Result.NOT_TESTED)
+@pytest.mark.parametrize(
+    ("settings", "result", "found", "remedy"),
+    [
+        ({"enabled": True}, Result.PASSING, "", ""),
+        ({"enabled": False}, Result.NOT_TESTED, "", ""),
+        ({"address": UNREACHABLE}, Result.FAILING, "nothing answers at", "Correct example.address."),
+        ({"address": "broken"}, Result.FAILING, "it is broken", "Correct example in the configuration."),
+        (
+            {"address": "refused"},
+            Result.FAILING,
+            "example.address is no",
+            "Correct example in the configuration.",
+        ),
+    ],
+    ids=[
+        "it opens",
+        "it is disabled",
+        "it says why not",
+        "it names no remedy",
+        "it refuses its configuration",
+    ],
+)
+def test_the_doctor_checks_that_it_opens(
+    settings: dict[str, Any], result: Result, found: str, remedy: str
+) -> None:
+    kind = dataclasses.replace(EXAMPLE, create=Broken)
+    [finding] = check_output(kind, ExampleSettings(**({"enabled": True} | settings)), ["lab"], [], 0.0)
+    assert (finding.subject, finding.check, finding.result) == ("example", "opens", result)
+    assert finding.found.startswith(found)
+    assert finding.remedy.startswith(remedy)
 
 
 def test_the_doctor_lists_its_check_without_a_configuration() -> None:
@@ -235,9 +227,6 @@ async def test_the_demo_shows_it_and_counts_its_messages(monkeypatch: pytest.Mon
     assert "Nothing was lost." in out.getvalue()
 
 
-# Data ----------------------------------------------------------------------------------------
-
-
 async def test_it_receives_components_status_and_clock(tmp_path: Path) -> None:
     async with running(tmp_path) as lab:
         with closing(lab.subscribe()):
@@ -255,23 +244,24 @@ async def test_it_receives_components_status_and_clock(tmp_path: Path) -> None:
 async def test_the_metrics_and_the_health_check_show_it(tmp_path: Path) -> None:
     async with running(tmp_path) as lab:
         await wait_until_async(lambda: lab.metric("messages_total", output="example", component="3d") > 0)
-        assert lab.metric("output_connected", output="example") == 1
         assert lab.metric("message_bytes_total", output="example", component="3d") > 0
+        assert lab.metric("output_connected", output="example") == 1
         assert lab.metric("output_drops_total", output="example", cause="not open") == 0
         assert lab.metric("output_drops_total", output="example", cause="request of lab ignored") == 1
-        assert lab.metric("queries_total", output="example", result="ok") == 0
+        await wait_until_async(lambda: lab.source.streams[0].session)
+        assert b"<The_3D>" in (await lab.output.query("lab/parameters")).payload
+        assert lab.metric("queries_total", output="example", result="ok") == 1
         assert lab.health()["outputs"] == [{"output": "example", "problem": ""}]
 
 
 async def test_what_it_does_not_accept_is_counted_and_makes_the_gateway_unhealthy(tmp_path: Path) -> None:
     async with running(tmp_path, address=UNREACHABLE) as lab:
-        await wait_until_async(
-            lambda: lab.metric("output_drops_total", output="example", cause="not open") > 0, timeout_s=20
-        )
+        not_open = {"output": "example", "cause": "not open"}
+        await wait_until_async(lambda: lab.metric("output_drops_total", **not_open) > 0, timeout_s=20)
         assert lab.metric("output_connected", output="example") == 0
-        assert lab.health()["healthy"] is False
-        [output] = lab.health()["outputs"]
-        assert output["problem"] == "nothing answers at unreachable; correct example.address"
+        health = lab.health()
+        assert (health["healthy"], len(health["outputs"])) == (False, 1)
+        assert health["outputs"][0]["problem"] == "nothing answers at unreachable; correct example.address"
 
 
 async def test_it_may_take_whole_frames(tmp_path: Path) -> None:
@@ -280,16 +270,14 @@ async def test_it_may_take_whole_frames(tmp_path: Path) -> None:
             messages = await lab.messages("frame", 5)
             await lab.messages("status")
         frames = [split_frame(message[4:], "big") for message in messages]
-        assert {tuple(part.type for part in frame.components) for frame in frames} == {
-            (ComponentType.MARKERS, ComponentType.TOOLS)
-        }
+        types = {part.type for frame in frames for part in frame.components}
+        assert types - {ComponentType.EVENT} == {ComponentType.MARKERS, ComponentType.TOOLS}
         sequences = [int.from_bytes(message[:4]) for message in messages]
         assert sequences == list(range(sequences[0], sequences[0] + len(messages)))
         assert [topic.path for topic in lab.output.topics] == [("status",), ("clock",)]
-        assert lab.metric("messages_total", output="example", component="frame") >= 5
-        assert lab.metric("message_bytes_total", output="example", component="frame") >= 5 * len(
-            frames[0].body
-        )
+        labels = {"output": "example", "component": "frame"}
+        assert lab.metric("messages_total", **labels) >= 5
+        assert lab.metric("message_bytes_total", **labels) >= 5 * len(frames[0].body)
 
 
 @pytest.mark.parametrize("whole_frames", [False, True])
@@ -303,52 +291,6 @@ async def test_its_subscribers_keep_an_on_demand_stream_running(tmp_path: Path, 
         await wait_until_async(lambda: status.state is StreamState.IDLE)
 
 
-async def test_it_shows_which_sources_are_served_and_which_stream(tmp_path: Path) -> None:
-    async with running(tmp_path) as lab:
-        assert lab.output.announced == {"lab"}
-        await wait_until_async(lambda: lab.output.streaming == {"lab"})
-        elsewhere = lab.gateway.settings.sources[0].model_copy(update={"name": "hall"})
-        await lab.gateway.opened.wait()
-        await lab.gateway.reload(lab.gateway.settings.model_copy(update={"sources": (elsewhere,)}))
-        assert lab.gateway.outputs == [lab.output]
-        assert lab.output.announced == {"hall"}
-        await wait_until_async(lambda: lab.output.streaming == {"hall"})
-
-
-async def test_it_receives_parameters_and_announcements_of_files(tmp_path: Path) -> None:
-    directory = {"spool": {"directory": str(tmp_path / "c3d")}}
-    async with Simulator(scene()) as simulator:
-        file = written(tmp_path, simulator.port)
-        file.write_text(json.dumps(json.loads(file.read_text()) | directory))
-        gateway = Gateway(read(file))
-        stop = asyncio.Event()
-        task = asyncio.create_task(gateway.run(stop))
-        lab = Lab(gateway)
-        await wait_until_async(lambda: lab.output.parameters)
-        source, parameters = lab.output.parameters[0]
-        assert (source, parameters.session) == ("lab", 1)
-        assert b"<The_3D>" in parameters.xml
-        content = c3d_file(b"a take")
-        lab.source._files.receiver(print).receive(FilePiece(content, 0, len(content)))
-        await wait_until_async(lambda: lab.output.files)
-        stop.set()
-        await task
-    [(source, description)] = lab.output.files
-    assert source == "lab"
-    assert description["bytes"] == len(content)
-
-
-# Queries -------------------------------------------------------------------------------------
-
-
-async def test_it_answers_queries_about_sources(tmp_path: Path) -> None:
-    async with running(tmp_path) as lab:
-        await wait_until_async(lambda: lab.source.streams[0].session)
-        assert b"<The_3D>" in (await lab.output.query("lab/parameters")).payload
-        assert decode((await lab.output.query("lab/status")).payload).source == "lab"
-        assert lab.metric("queries_total", output="example", result="ok") == 2
-
-
 @pytest.mark.parametrize("whole_frames", [False, True])
 async def test_it_answers_queries_about_the_newest_components(tmp_path: Path, whole_frames: bool) -> None:
     async with running(tmp_path, whole_frames=whole_frames) as lab:
@@ -356,23 +298,3 @@ async def test_it_answers_queries_about_the_newest_components(tmp_path: Path, wh
         await wait_until_async(lambda: lab.source.streams[0].session)
         answer = await lab.output.query("lab/3d")
         assert len(decode(answer.payload).markers) == 3
-
-
-async def test_peers_call_its_commands(tmp_path: Path) -> None:
-    async with running(tmp_path) as lab:
-        answer = await lab.output.query("lab/greet", name="the operator")
-    assert answer.payload == b"lab greets the operator"
-
-
-# Reload --------------------------------------------------------------------------------------
-
-
-async def test_a_reload_keeps_it_while_its_settings_are_the_same(tmp_path: Path) -> None:
-    async with running(tmp_path) as lab:
-        await lab.gateway.opened.wait()
-        port = lab.source.settings.port
-        assert await lab.gateway.reload(read(written(tmp_path, port))) == []
-        changed = read(written(tmp_path, port, address="elsewhere"))
-        assert await lab.gateway.reload(changed) == ["output example changed"]
-        assert lab.gateway.outputs[0].health().connected
-        assert not lab.output.is_open

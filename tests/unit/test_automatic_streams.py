@@ -131,42 +131,42 @@ async def running(lab: AutoLab) -> AsyncIterator[None]:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_two_connections_stay(lab: AutoLab) -> None:
+async def test_two_connections_stay_although_the_second_one_breaks_at_times(lab: AutoLab) -> None:
     async with running(lab):
         await lab.uses_two()
         await asyncio.sleep(3600)
-        assert (lab.components, lab.limitations, lab.scripted.num_open) == (TWO, [], 2)
-        assert len(lab.scripted.connections) == 2
+        assert (lab.scripted.num_open, len(lab.scripted.connections)) == (2, 2)
+        for _ in range(10):
+            await asyncio.sleep(20)
+            await end(lab.scripted.connections[-1])
+            await lab.uses_two()
+        assert (lab.limitations, lab.scripted.connections[0].is_open) == ([], True)
 
 
-async def test_a_second_connection_without_any_reply(lab: AutoLab) -> None:
-    answer = lab.scripted.answer_on
-    lab.scripted.answer_on = lambda each, command: answer(each, command) if each.number == 1 else None
-    async with running(lab):
-        began_s = asyncio.get_running_loop().time()
-        await until(lambda: lab.limitations)
-        assert asyncio.get_running_loop().time() - began_s < 10
-        assert (lab.components, lab.limitations) == ([EVERYTHING], [NO_FRAMES])
-        await asyncio.sleep(3600)
-        assert lab.scripted.num_open == 1
-        assert len(lab.scripted.connections) == 2
-
-
-async def test_a_second_connection_that_is_accepted_and_brings_no_frames(lab: AutoLab) -> None:
+@pytest.mark.parametrize(("accepts_commands", "most_connections"), [(False, 2), (True, 3)])
+async def test_a_second_connection_without_frames_is_given_up(
+    lab: AutoLab, accepts_commands: bool, most_connections: int
+) -> None:
+    """It may not even reply."""
     answer = lab.scripted.answer_on
 
     def without_frames(each: Numbered, command: str) -> bytes | None:
+        if each.number > 1 and not accepts_commands:
+            return None
         if each.number > 1 and command.startswith("StreamFrames"):
             return ok(f"OK-{command}")
         return answer(each, command)
 
     lab.scripted.answer_on = without_frames
     async with running(lab):
+        began_s = asyncio.get_running_loop().time()
         await until(lambda: lab.limitations)
+        assert asyncio.get_running_loop().time() - began_s < 10 or accepts_commands
         assert lab.components == [EVERYTHING]
-        await asyncio.sleep(100)
+        assert lab.limitations == [NO_FRAMES] or accepts_commands
+        await asyncio.sleep(3600)
         assert lab.scripted.num_open == 1
-        assert len(lab.scripted.connections) <= 3
+        assert len(lab.scripted.connections) <= most_connections
 
 
 async def test_frames_on_the_second_connection_only(lab: AutoLab) -> None:
@@ -189,39 +189,19 @@ async def test_frames_on_the_second_connection_only(lab: AutoLab) -> None:
         assert lab.states == [StreamState.NO_MEASUREMENT]
 
 
-async def test_a_second_connection_that_breaks_later_is_opened_again(lab: AutoLab) -> None:
+@pytest.mark.parametrize("first_lasts_s", [3, 20])
+async def test_a_second_connection_that_breaks_twice_in_a_row_is_given_up(
+    lab: AutoLab, first_lasts_s: float
+) -> None:
+    """Two failures in a row are enough, also if the first one came after a while."""
     async with running(lab):
-        await lab.uses_two()
-        for _ in range(10):
-            await asyncio.sleep(20)
-            lab.scripted.connections[-1].end()
-            await settle()
+        for lasted_s in (first_lasts_s, 3):
             await lab.uses_two()
-        assert (lab.limitations, lab.scripted.connections[0].is_open) == ([], True)
-
-
-async def test_a_second_connection_that_always_breaks_soon_is_given_up(lab: AutoLab) -> None:
-    async with running(lab):
-        for _ in range(2):
-            await lab.uses_two()
-            await asyncio.sleep(3)
-            lab.scripted.connections[-1].end()
-            await settle()
+            await asyncio.sleep(lasted_s)
+            await end(lab.scripted.connections[-1])
         await until(lambda: lab.limitations)
         assert lab.limitations[0].startswith(f"{ONE_CONNECTION}the server accepts one connection only (")
         await asyncio.sleep(3600)
-        assert len(lab.scripted.connections) == 3
-
-
-async def test_a_late_end_of_a_second_connection_counts_as_the_first_of_its_failures(lab: AutoLab) -> None:
-    """Two failures in a row are enough, also if the first one came after a while."""
-    async with running(lab):
-        for lasted_s in (20, 3):
-            await lab.uses_two()
-            await asyncio.sleep(lasted_s)
-            lab.scripted.connections[-1].end()
-            await settle()
-        await until(lambda: lab.limitations)
         assert len(lab.scripted.connections) == 3
 
 
@@ -240,10 +220,14 @@ async def test_the_further_connection_ends_with_the_first(lab: AutoLab) -> None:
         assert (len(lab.scripted.connections), lab.limitations) == (4, [])
 
 
-async def end_all(lab: AutoLab) -> None:
-    for connection in lab.scripted.connections:
+async def end(*connections: Connection) -> None:
+    for connection in connections:
         connection.end()
     await settle()
+
+
+async def end_all(lab: AutoLab) -> None:
+    await end(*lab.scripted.connections)
 
 
 async def test_a_server_that_is_restarted_at_times_keeps_two_connections(lab: AutoLab) -> None:
@@ -257,6 +241,7 @@ async def test_a_server_that_is_restarted_at_times_keeps_two_connections(lab: Au
 
 
 async def test_a_server_that_ends_with_every_second_connection_is_remembered(lab: AutoLab) -> None:
+    """Until it has another version."""
     async with running(lab):
         for _ in range(3):
             await lab.uses_two()
@@ -268,14 +253,6 @@ async def test_a_server_that_ends_with_every_second_connection_is_remembered(lab
             await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
             assert lab.components == [EVERYTHING]
         assert len(lab.scripted.connections) == 3 * 2 + 6
-
-
-async def test_another_version_of_the_server_is_tried_again(lab: AutoLab) -> None:
-    async with running(lab):
-        for _ in range(3):
-            await lab.uses_two()
-            await end_all(lab)
-        await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
         lab.scripted.answer_on = answering(parameters(version="2"))
         await end_all(lab)
         await lab.uses_two()

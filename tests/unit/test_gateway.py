@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import MetricsSettings, Settings, SourceSettings, SpoolSettings
-from gateway.config.transform import TransformSettings
+from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.descriptions.source_frame import source_frame
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
@@ -77,29 +76,36 @@ def settings(*sources: str, example: str = "local", other: str | None = None, **
     """Return settings with these sources, each NAME or NAME@HOST, and the addresses of the outputs."""
     names = [source.partition("@") for source in sources or ("lab",)]
     section = ExampleSettings(enabled=True, address=example)
-    return settings_type().model_validate(
-        {
-            "sources": [SourceSettings(name=name, host=host or name) for name, _, host in names],
-            "zenoh": {"enabled": False},
-            "lcm": {"enabled": False},
-            "metrics": MetricsSettings(enabled=False),
-            "example": section,
-            "other": section.model_copy(update={"enabled": other is not None, "address": other or ""}),
-            **sections,
-        }
-    )
+    off = {"enabled": False}
+    values = {
+        "sources": [SourceSettings(name=name, host=host or name) for name, _, host in names],
+        "example": section,
+        "other": section.model_copy(update={"enabled": other is not None, "address": other or ""}),
+    }
+    return settings_type().model_validate(dict.fromkeys(("zenoh", "lcm", "metrics"), off) | values | sections)
+
+
+def with_source(whole_frames: bool = False, **keys: Any) -> Settings:
+    """Return settings with the source lab, with further keys."""
+    source = SourceSettings.model_validate({"name": "lab", "host": "lab", **keys})
+    output = ExampleSettings(enabled=True, whole_frames=whole_frames)
+    return settings().model_copy(update={"sources": (source,), "example": output})
+
+
+def started(
+    settings: Settings, outputs: list[Output] | None = None
+) -> tuple[Gateway, asyncio.Event, asyncio.Task[None]]:
+    """Return a gateway that starts, the event that stops it, and its task."""
+    gateway, stop = Gateway(settings, outputs), asyncio.Event()
+    return gateway, stop, asyncio.create_task(gateway.run(stop))
 
 
 @asynccontextmanager
-async def running(
-    settings: Settings, outputs: list[Output] | None = None
-) -> AsyncIterator[tuple[Gateway, asyncio.Event]]:
-    """Run a gateway until the block ends; the event stops it earlier."""
-    gateway = Gateway(settings, outputs)
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
+async def running(settings: Settings, outputs: list[Output] | None = None) -> AsyncIterator[Gateway]:
+    """Run a gateway until the block ends."""
+    gateway, stop, task = started(settings, outputs)
     await gateway.opened.wait()
-    yield gateway, stop
+    yield gateway
     stop.set()
     await task
 
@@ -123,26 +129,23 @@ def subscribe(address: str, *, component: str = "3d", source: str | None = None)
     return messages
 
 
-# Life cycle ----------------------------------------------------------------------------------
-
-
 async def test_outputs_start_before_sources_connect_and_close_after_bye(
     servers: Servers, events: list[tuple[str, str]]
 ) -> None:
-    async with running(settings(other="elsewhere")) as (gateway, _):
+    async with running(settings(other="elsewhere")) as gateway:
         assert events == [("start", "local"), ("start", "elsewhere")]
         assert not servers["lab"].connections
         await connected(gateway)
     assert servers["lab"].connection.commands[-1] == "Bye"
-    assert sorted(events[2:]) == sorted(
-        (event, address) for event in ("stop queries", "close") for address in ("local", "elsewhere")
-    )
+    for address in ("local", "elsewhere"):
+        ends = [event for event, name in events[2:] if name == address]
+        assert ends == ["stop queries", "close"]
 
 
 async def test_sources_start_although_an_output_does_not_open(servers: Servers) -> None:
     loop = asyncio.get_running_loop()
     begin_s = loop.time()
-    async with running(settings(example=UNREACHABLE)) as (gateway, _):
+    async with running(settings(example=UNREACHABLE)) as gateway:
         assert loop.time() - begin_s == pytest.approx(2.0, abs=0.1)
         await connected(gateway)
         assert servers["lab"].connection.is_open
@@ -151,9 +154,7 @@ async def test_sources_start_although_an_output_does_not_open(servers: Servers) 
 async def test_stopping_while_outputs_open_closes_them(
     servers: Servers, events: list[tuple[str, str]]
 ) -> None:
-    gateway = Gateway(settings(example=UNREACHABLE))
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
+    _, stop, task = started(settings(example=UNREACHABLE))
     await settle()
     stop.set()
     await task
@@ -165,17 +166,17 @@ async def test_what_an_output_was_losing_is_logged_when_the_gateway_stops(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level("INFO", "gateway.publish.routes")
-    async with running(settings(example=UNREACHABLE)) as (gateway, _):
+    async with running(settings(example=UNREACHABLE)) as gateway:
         gateway.sources[0].fan_out.publish_status(b"status")
-        assert not [record for record in caplog.records if "lost within" in record.getMessage()]
-    [end] = [record.getMessage() for record in caplog.records if "lost within" in record.getMessage()]
+        assert "lost within" not in caplog.text
+    [end] = [text for text in caplog.messages if "lost within" in text]
     assert end.startswith("lab to example: lost within ")
     assert "1 message (not open)" in end
 
 
 async def test_outputs_are_maintained_and_status_is_published_every_second() -> None:
     statuses = subscribe("local", component="status")
-    async with running(settings()) as (gateway, _):
+    async with running(settings()) as gateway:
         output = example(gateway)
         await asyncio.sleep(0.9)
         assert (output.num_maintained, len(statuses)) == (0, 0)
@@ -198,7 +199,7 @@ async def test_outputs_are_closed_although_a_source_has_a_defect(
 
 
 async def test_outputs_call_their_commands_and_queries_through_one_service() -> None:
-    async with running(settings(other="elsewhere")) as (gateway, _):
+    async with running(settings(other="elsewhere")) as gateway:
         for index in (0, 1):
             answer = await example(gateway, index).query("lab/greet", name="the operator")
             assert answer.payload == b"lab greets the operator"
@@ -207,7 +208,7 @@ async def test_outputs_call_their_commands_and_queries_through_one_service() -> 
 
 async def test_parameters_and_files_reach_every_output(servers: Servers, tmp_path: Path) -> None:
     spool = SpoolSettings(directory=str(tmp_path))
-    async with running(settings(other="elsewhere", spool=spool)) as (gateway, _):
+    async with running(settings(other="elsewhere", spool=spool)) as gateway:
         await connected(gateway)
         servers["lab"].connection.send(packet(5, c3d_file(b"a file")))
         await settle()
@@ -218,11 +219,8 @@ async def test_parameters_and_files_reach_every_output(servers: Servers, tmp_pat
             assert [(name, each["bytes"]) for name, each in example(gateway, index).files] == [("lab", 1024)]
 
 
-# Reloading outputs ---------------------------------------------------------------------------
-
-
 async def test_equal_settings_change_nothing(servers: Servers, events: list[tuple[str, str]]) -> None:
-    async with running(settings()) as (gateway, _):
+    async with running(settings()) as gateway:
         await connected(gateway)
         outputs, sources = list(gateway.outputs), list(gateway.sources)
         assert await gateway.reload(settings()) == []
@@ -236,7 +234,7 @@ async def test_a_changed_output_is_replaced_and_its_numbers_continue(
     servers: Servers, events: list[tuple[str, str]]
 ) -> None:
     before, after = subscribe("local"), subscribe("new")
-    async with running(settings(other="elsewhere")) as (gateway, _):
+    async with running(settings(other="elsewhere")) as gateway:
         await connected(gateway)
         other = gateway.outputs[1]
         servers["lab"].connection.send_frames(1, 2)
@@ -251,21 +249,19 @@ async def test_a_changed_output_is_replaced_and_its_numbers_continue(
 
 
 async def test_a_new_output_gets_the_known_parameters_and_the_state_of_every_source(servers: Servers) -> None:
-    async with running(settings("lab", "hall")) as (gateway, _):
+    async with running(settings("lab", "hall")) as gateway:
         await connected(gateway)
         servers["lab"].connection.send_frames(1)
         await gateway.reload(settings("lab", "hall", example="new"))
         output = example(gateway)
-        assert [(name, each.xml, each.session) for name, each in output.parameters] == [
-            ("lab", XML[8:], 1),
-            ("hall", XML[8:], 1),
-        ]
+        found = [(name, each.xml, each.session) for name, each in output.parameters]
+        assert found == [("lab", XML[8:], 1), ("hall", XML[8:], 1)]
         assert (output.announced, output.streaming) == ({"lab", "hall"}, {"lab"})
         assert decode((await output.query("hall/status")).payload).source == "hall"
 
 
 async def test_outputs_can_be_added_and_removed(events: list[tuple[str, str]]) -> None:
-    async with running(settings()) as (gateway, _):
+    async with running(settings()) as gateway:
         assert await gateway.reload(settings(other="elsewhere")) == ["output other added"]
         assert [output.name for output in gateway.outputs] == ["example", "other"]
         other = example(gateway, 1)
@@ -276,7 +272,7 @@ async def test_outputs_can_be_added_and_removed(events: list[tuple[str, str]]) -
 
 
 async def test_a_removed_output_takes_its_commands_with_it() -> None:
-    async with running(settings(other="elsewhere")) as (gateway, _):
+    async with running(settings(other="elsewhere")) as gateway:
         off = ExampleSettings(enabled=False)
         await gateway.reload(settings(other="elsewhere").model_copy(update={"example": off}))
         [output] = gateway.outputs
@@ -287,7 +283,7 @@ async def test_a_removed_output_takes_its_commands_with_it() -> None:
 
 async def test_given_outputs_stay_at_a_reload(servers: Servers) -> None:
     output = MemoryOutput()
-    async with running(settings("lab@first"), [output]) as (gateway, _):
+    async with running(settings("lab@first"), [output]) as gateway:
         assert await gateway.reload(settings("lab@second", example="new")) == ["source lab changed"]
         assert list(gateway.outputs) == [output]
         assert output.is_open
@@ -296,7 +292,7 @@ async def test_given_outputs_stay_at_a_reload(servers: Servers) -> None:
 
 
 async def test_a_configuration_that_an_output_refuses_changes_nothing(servers: Servers) -> None:
-    async with running(settings()) as (gateway, _):
+    async with running(settings()) as gateway:
         await connected(gateway)
         before, outputs = gateway.settings, list(gateway.outputs)
         with pytest.raises(ConfigError, match="is refused"):
@@ -306,12 +302,9 @@ async def test_a_configuration_that_an_output_refuses_changes_nothing(servers: S
         assert servers["lab"].connection.is_open
 
 
-# Reloading sources ---------------------------------------------------------------------------
-
-
 async def test_a_changed_source_connects_again_and_continues_its_numbers(servers: Servers) -> None:
     markers, statuses = subscribe("local"), subscribe("local", component="status")
-    async with running(settings("lab@first", "hall")) as (gateway, _):
+    async with running(settings("lab@first", "hall")) as gateway:
         await connected(gateway)
         hall = gateway.sources[1]
         servers["first"].connection.send_frames(1, 2)
@@ -329,21 +322,10 @@ async def test_a_changed_source_connects_again_and_continues_its_numbers(servers
 
 
 async def test_a_changed_frame_reaches_every_output_and_the_source_stays_connected(servers: Servers) -> None:
-    """Only the frame changes: in ``plain`` and ``turned``, everything else is the same."""
-    plain = settings("lab", "hall")
-    source = plain.sources[0]
-    turned = plain.model_copy(
-        update={
-            "sources": (
-                source.model_copy(
-                    update={"frame_id": "world", "transform": TransformSettings(units="m", up="y")}
-                ),
-                plain.sources[1],
-            )
-        }
-    )
+    plain = with_source()
+    turned = with_source(frame_id="world", transform={"units": "m", "up": "y"})
     markers = subscribe("local")
-    async with running(plain) as (gateway, _):
+    async with running(plain) as gateway:
         await connected(gateway)
         output = example(gateway)
         servers["lab"].connection.send_frames(1)
@@ -353,29 +335,25 @@ async def test_a_changed_frame_reaches_every_output_and_the_source_stays_connect
         [(name, parameters)] = output.parameters[len(known) :]
         assert (name, parameters.frame) == ("lab", source_frame(turned.sources[0], Parameters()))
         assert parameters._replace(frame=known[0][1].frame, version=1) == known[0][1]
-        frame = await output.query("lab/frame")
-        assert json.loads(frame.payload)["frame_id"] == "world"
+        assert json.loads((await output.query("lab/frame")).payload)["frame_id"] == "world"
         await asyncio.sleep(1.0)
         assert decode((await output.query("lab/status")).payload).frame_id == "world"
         found = [(each.session, each.sequence, each.parameters_version) for each in markers]
         assert found == [(1, 0, 1), (1, 1, 2)]
-        assert len(servers["lab"].connections) == len(servers["hall"].connections) == 1
         assert await gateway.reload(turned) == []
         assert await gateway.reload(plain) == ["coordinate frame of source lab changed"]
         assert output.parameters[-1] == ("lab", known[0][1]._replace(version=3))
+        assert len(servers["lab"].connections) == 1
         assert servers["lab"].connection.is_open
 
 
 async def test_a_changed_frame_gets_a_version_of_its_own_if_the_source_connects_again(
     servers: Servers,
 ) -> None:
-    def framed(frame_id: str, reply_timeout_s: float) -> Settings:
-        source = SourceSettings(name="lab", host="lab", frame_id=frame_id, reply_timeout_s=reply_timeout_s)
-        return settings().model_copy(update={"sources": (source,)})
-
-    async with running(framed("hall", 2.0)) as (gateway, _):
+    async with running(with_source(frame_id="hall", reply_timeout_s=2.0)) as gateway:
         await connected(gateway)
-        assert await gateway.reload(framed("world", 3.0)) == ["source lab changed"]
+        changed = with_source(frame_id="world", reply_timeout_s=3.0)
+        assert await gateway.reload(changed) == ["source lab changed"]
         await connected(gateway)
         found = {(each.version, each.frame.frame_id) for _, each in example(gateway).parameters}
         assert found == {(1, "hall"), (2, "world")}
@@ -385,21 +363,16 @@ async def test_a_changed_frame_gets_a_version_of_its_own_if_the_source_connects_
 async def test_a_changed_frame_reaches_outputs_although_the_server_gives_no_parameters(
     servers: Servers,
 ) -> None:
-    def framed(frame_id: str) -> Settings:
-        whole_frames = ExampleSettings(enabled=True, whole_frames=True)
-        source = SourceSettings(name="lab", host="lab", frame_id=frame_id)
-        return settings().model_copy(update={"example": whole_frames, "sources": (source,)})
-
     servers["lab"].answer = silent_to("SendParameters")
-    async with running(framed("hall")) as (gateway, _):
+    async with running(with_source(whole_frames=True, frame_id="hall")) as gateway:
         await settle()
-        await gateway.reload(framed("world"))
+        await gateway.reload(with_source(whole_frames=True, frame_id="world"))
         found = [(each.version, each.frame.frame_id) for _, each in example(gateway).parameters]
         assert found == [(0, "hall"), (0, "world")]
 
 
 async def test_sources_can_be_added_and_removed(servers: Servers) -> None:
-    async with running(settings("lab", "hall")) as (gateway, _):
+    async with running(settings("lab", "hall")) as gateway:
         await connected(gateway)
         output = example(gateway)
         servers["hall"].connection.send_frames(1)
@@ -418,7 +391,7 @@ async def test_sources_can_be_added_and_removed(servers: Servers) -> None:
 async def test_a_source_that_is_removed_and_added_again_continues_its_numbers(servers: Servers) -> None:
     hall = subscribe("local", source="hall")
     statuses = subscribe("local", source="hall", component="status")
-    async with running(settings("lab", "hall")) as (gateway, _):
+    async with running(settings("lab", "hall")) as gateway:
         for changed in (None, settings("lab"), settings("lab", "hall"), settings("lab"), settings("hall")):
             if changed is not None:
                 await gateway.reload(changed)
@@ -437,38 +410,32 @@ async def test_a_source_that_is_removed_and_added_again_continues_its_numbers(se
 async def test_sessions_never_go_back_when_a_reload_changes_the_number_of_streams(
     servers: Servers, order: tuple[int, ...]
 ) -> None:
-    everything = ("3d", "6d", "analog")
-
-    def streams(number: int) -> Settings:
-        rest = everything[number - 1 :]
-        components = [[key] for key in everything[: number - 1]] + [list(rest)]
-        source = SourceSettings.model_validate(
-            {"name": "lab", "host": "lab", "streams": [{"components": keys} for keys in components]}
-        )
-        return settings().model_copy(update={"sources": (source,)})
-
+    components = {1: [["3d", "6d", "analog"]], 2: [["3d"], ["6d", "analog"]], 3: [["3d"], ["6d"], ["analog"]]}
+    streams = {
+        number: with_source(streams=[{"components": keys} for keys in each])
+        for number, each in components.items()
+    }
     statuses = subscribe("local", component="status")
     markers = subscribe("local")
-    async with running(streams(order[0])) as (gateway, _):
+    async with running(streams[order[0]]) as gateway:
         for number in order:
-            await gateway.reload(streams(number))
+            await gateway.reload(streams[number])
             await connected(gateway)
             for connection in servers["lab"].connections:
                 connection.send_frames(1)
             await asyncio.sleep(2.1)
             servers["lab"].connection.end()
             await asyncio.sleep(2.1)
-    sessions = [each.session for each in statuses]
-    assert sessions == sorted(sessions)
-    assert len(set(sessions)) >= len(order) + 1
-    sessions = [each.session for each in markers]
-    assert sessions == sorted(sessions)
+    for messages in (statuses, markers):
+        sessions = [each.session for each in messages]
+        assert sessions == sorted(sessions)
+    assert len({each.session for each in statuses}) >= len(order) + 1
 
 
 async def test_the_start_deletes_what_a_killed_gateway_left(servers: Servers, tmp_path: Path) -> None:
     left = tmp_path / "tmpkilled.c3d.part"
     left.touch()
-    async with running(settings(spool=SpoolSettings(directory=str(tmp_path)))) as (gateway, _):
+    async with running(settings(spool=SpoolSettings(directory=str(tmp_path)))) as gateway:
         await connected(gateway)
         assert servers
     assert not left.exists()
@@ -476,7 +443,7 @@ async def test_the_start_deletes_what_a_killed_gateway_left(servers: Servers, tm
 
 async def test_a_changed_spool_is_used_by_running_sources(servers: Servers, tmp_path: Path) -> None:
     before, after = (SpoolSettings(directory=str(tmp_path / name)) for name in ("before", "after"))
-    async with running(settings(spool=before)) as (gateway, _):
+    async with running(settings(spool=before)) as gateway:
         await connected(gateway)
         assert await gateway.reload(settings(spool=after)) == ["spool changed"]
         servers["lab"].connection.send(packet(5, c3d_file(b"a file")))
@@ -488,15 +455,10 @@ async def test_a_changed_spool_is_used_by_running_sources(servers: Servers, tmp_
     assert (tmp_path / "after").exists()
 
 
-# Stopping and reloading at the same time -----------------------------------------------------
-
-
 async def test_stopping_waits_for_a_reload_and_then_closes_everything(
     servers: Servers, events: list[tuple[str, str]], threads: SlowThreads
 ) -> None:
-    gateway = Gateway(settings("lab@first"))
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
+    gateway, stop, task = started(settings("lab@first"))
     await gateway.opened.wait()
     await connected(gateway)
     threads.is_slow = True  # closing the old output takes long
@@ -515,12 +477,8 @@ async def test_stopping_waits_for_a_reload_and_then_closes_everything(
 
 
 async def test_no_reload_begins_after_stopping(servers: Servers) -> None:
-    gateway = Gateway(settings("lab@first"))
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    await gateway.opened.wait()
-    stop.set()
-    await task
+    async with running(settings("lab@first")) as gateway:
+        pass
     reload = asyncio.create_task(gateway.reload(settings("lab@second")))
     await settle()
     assert not reload.done()
@@ -529,7 +487,7 @@ async def test_no_reload_begins_after_stopping(servers: Servers) -> None:
 
 
 async def test_two_reloads_run_one_after_the_other(servers: Servers, threads: SlowThreads) -> None:
-    async with running(settings("lab@first")) as (gateway, _):
+    async with running(settings("lab@first")) as gateway:
         threads.is_slow = True
         first = asyncio.create_task(gateway.reload(settings("lab@first", example="new")))
         second = asyncio.create_task(gateway.reload(settings("lab@second", example="new")))

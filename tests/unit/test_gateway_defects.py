@@ -49,25 +49,12 @@ def let_fail(monkeypatch: pytest.MonkeyPatch, owner: type, method: str) -> set[s
 
 
 DEFECTS = [
-    (StreamStatus, "disconnected"),
-    (StreamStatus, "connecting"),
-    (StreamStatus, "reconnecting"),
-    (StreamStatus, "check"),
-    (AutomaticStreams, "check"),
-    (Supervisor, "check_rate"),
-    (Source, "publish_status"),
-    (Source, "_encoded_status"),
-    (Source, "_read_parameters"),
-    (Source, "_on_state"),
-    (FanOut, "publish"),
-    (FanOut, "publish_clock"),
-    (FanOut, "check_losses"),
-    (Session, "_receive"),
-    (Session, "_report_change"),
-    (Session, "close"),
-    (ParameterRefresh, "_due_s"),
-    (Ingest, "receive"),
-    (ClientProtocol, "receive"),
+    *((StreamStatus, name) for name in ("disconnected", "connecting", "reconnecting", "check")),
+    *((Source, name) for name in ("publish_status", "_encoded_status", "_read_parameters", "_on_state")),
+    *((FanOut, name) for name in ("publish", "publish_clock", "check_losses")),
+    *((Session, name) for name in ("_receive", "_report_change", "close")),
+    *((AutomaticStreams, "check"), (Supervisor, "check_rate"), (ParameterRefresh, "_due_s")),
+    *((Ingest, "receive"), (ClientProtocol, "receive")),
 ]
 
 
@@ -84,7 +71,7 @@ async def test_a_defect_in_one_source_is_logged_once_and_the_source_recovers(
 ) -> None:
     caplog.set_level(logging.INFO)
     failing = let_fail(monkeypatch, owner, method)
-    async with running(settings("lab", "hall")) as (gateway, _):
+    async with running(settings("lab", "hall")) as gateway:
         await connected(gateway)
         failing.add("lab")
         for _ in range(60):  # the servers send frames, and that of lab breaks off
@@ -116,7 +103,7 @@ async def test_a_defect_in_one_output_does_not_stop_the_others(
     def fail(*_: Any) -> None:
         raise ZeroDivisionError("by the test")
 
-    async with running(settings(example="broken", other="elsewhere")) as (gateway, _):
+    async with running(settings(example="broken", other="elsewhere")) as gateway:
         monkeypatch.setattr(gateway.outputs[0], method, fail)
         await connected(gateway)
         messages = subscribe("elsewhere")
@@ -142,7 +129,7 @@ async def test_the_tasks_of_a_source_that_end_or_are_cancelled_are_started_again
                 raise asyncio.CancelledError
 
     monkeypatch.setattr(AutomaticStreams, "run", end)
-    async with running(settings()) as (gateway, _):
+    async with running(settings()) as gateway:
         await asyncio.sleep(5)
         await connected(gateway)
         assert servers["lab"].connection.is_open
@@ -154,7 +141,7 @@ async def test_a_source_that_had_a_defect_continues_its_numbers_and_shows_why(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing = let_fail(monkeypatch, AutomaticStreams, "check")
-    async with running(settings("lab", "hall")) as (gateway, _):
+    async with running(settings("lab", "hall")) as gateway:
         await connected(gateway)
         messages = subscribe("local", source="lab")
         servers["lab"].connection.send_frames(1)

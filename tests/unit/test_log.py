@@ -8,25 +8,16 @@ import pytest
 
 from gateway.log import FIELDS, HOLD_S, MAX_HOLD_S, MAX_REPEATS, DefectLog, EventLog, FailureLog, log_fields
 from gateway.service.log_format import ContextFilter
+from tests.unit.settable_clock import SettableClock
 
 LOGGER = logging.getLogger("tests.failures")
 
 
-class Clock:
-    """Replaces the clock of gateway.log."""
-
-    now_s = 0.0
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr("gateway.log.monotonic", lambda: clock.now_s)
-    return clock
-
-
 @pytest.fixture(autouse=True)
-def _every_level(caplog: pytest.LogCaptureFixture) -> None:
+def _clock_and_every_level(
+    clock: SettableClock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("gateway.log.monotonic", clock)
     caplog.set_level(logging.DEBUG, LOGGER.name)
 
 
@@ -34,10 +25,13 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
     return [(record.levelname, record.message) for record in caplog.records]
 
 
-# Failures -------------------------------------------------------------------------------------
+def levels(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.levelname for record in caplog.records]
 
 
-def test_a_failure_is_loud_once_and_its_recovery_too(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_loud_once_and_its_recovery_too(
+    clock: SettableClock, caplog: pytest.LogCaptureFixture
+) -> None:
     """What fails for hours must not fill the log, but its begin and its end must be there."""
     failures = FailureLog(LOGGER, "lab")
     failures.recovered("streaming")
@@ -58,7 +52,9 @@ def test_a_failure_is_loud_once_and_its_recovery_too(clock: Clock, caplog: pytes
     ]
 
 
-def test_success_is_always_logged_and_ends_a_failure(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+def test_success_is_always_logged_and_ends_a_failure(
+    clock: SettableClock, caplog: pytest.LogCaptureFixture
+) -> None:
     """Each connection is logged, and a new failure after it is loud again."""
     failures = FailureLog(LOGGER, "lab")
     failures.succeeded("streaming")
@@ -66,14 +62,12 @@ def test_success_is_always_logged_and_ends_a_failure(clock: Clock, caplog: pytes
         failures.failed("no answer")
         clock.now_s += 1.0
         failures.succeeded("streaming")
-    assert logged(caplog) == [
-        ("INFO", "lab: streaming"),
-        *[("WARNING", "lab: no answer"), ("INFO", "lab: streaming, after 1.0 s and 1 failure")] * 2,
-    ]
+    failure = [("WARNING", "lab: no answer"), ("INFO", "lab: streaming, after 1.0 s and 1 failure")]
+    assert logged(caplog) == [("INFO", "lab: streaming"), *failure, *failure]
 
 
 def test_intermittent_failures_are_over_after_the_hold_time_without_one(
-    clock: Clock, caplog: pytest.LogCaptureFixture
+    clock: SettableClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A link that loses every other packet is one failure, not a thousand."""
     failures = FailureLog(LOGGER, "lab", hold_s=5.0)
@@ -87,7 +81,7 @@ def test_intermittent_failures_are_over_after_the_hold_time_without_one(
     clock.now_s = 8.0
     failures.recovered("sending")
     assert [*is_failing, failures.failing] == [True, False]
-    assert [level for level, _ in logged(caplog)] == ["WARNING", "DEBUG", "DEBUG", "DEBUG", "INFO"]
+    assert levels(caplog) == ["WARNING", "DEBUG", "DEBUG", "DEBUG", "INFO"]
     assert caplog.messages[-1] == "lab: sending, after 8.0 s and 4 failures"
 
 
@@ -95,7 +89,7 @@ def test_intermittent_failures_are_over_after_the_hold_time_without_one(
     ("pause_s", "holds_s"), [(MAX_HOLD_S - 1, [5, 10, 20, 40, 60, 60]), (MAX_HOLD_S, [5, 5, 5])]
 )
 def test_the_hold_time_doubles_while_failures_come_back_soon(
-    clock: Clock, pause_s: float, holds_s: list[float]
+    clock: SettableClock, pause_s: float, holds_s: list[float]
 ) -> None:
     """The wait ends at a minute, and starts again after a minute without a failure."""
     failures = FailureLog(LOGGER, "lab", HOLD_S)
@@ -110,70 +104,45 @@ def test_the_hold_time_doubles_while_failures_come_back_soon(
         clock.now_s += pause_s
 
 
-@pytest.mark.usefixtures("clock")
 def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptureFixture) -> None:
     """The recovery of a hidden failure is hidden, too."""
     failures = FailureLog(LOGGER, "lab")
     for _ in range(100):
         failures.failed("no router")
         failures.recovered("connected")
-    assert [level for level, _ in logged(caplog)] == [
-        *["WARNING", "INFO"] * MAX_REPEATS,
-        *["DEBUG"] * 2 * (100 - MAX_REPEATS),
-    ]
+    assert levels(caplog) == ["WARNING", "INFO"] * MAX_REPEATS + ["DEBUG"] * 2 * (100 - MAX_REPEATS)
 
 
-# Events ---------------------------------------------------------------------------------------
-
-
-def test_an_event_is_loud_some_times_in_five_minutes(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_event_is_loud_some_times_in_five_minutes(
+    clock: SettableClock, caplog: pytest.LogCaptureFixture
+) -> None:
     """The window slides: after it, as many are loud again as are older, and the next says what was hidden."""
     events = EventLog(LOGGER, "lab")
-    for _ in range(MAX_REPEATS):
-        events.log(logging.WARNING, "renamed", "renamed")
-        clock.now_s += 10.0  # at 0, 10, 20, 30 and 40 s
-    for now_s in (299.9, 300.0, 300.1, 310.0):
-        clock.now_s = now_s
+    begin_s = clock.now_s
+    for seconds in (0, 10, 20, 30, 40, 299.9, 300.0, 300.1, 310.0):
+        clock.now_s = begin_s + seconds
         events.log(logging.WARNING, "renamed", "renamed")
     events.log(logging.INFO, "changed", "changed")
-    assert logged(caplog)[MAX_REPEATS:] == [
+    hidden, loud = (
         ("DEBUG", "lab: renamed"),
         ("WARNING", "lab: renamed (1 more like this since the last one)"),
-        ("DEBUG", "lab: renamed"),
-        ("WARNING", "lab: renamed (1 more like this since the last one)"),
-        ("INFO", "lab: changed"),
-    ]
-    assert {level for level, _ in logged(caplog)[:MAX_REPEATS]} == {"WARNING"}
-
-
-@pytest.mark.usefixtures("clock")
-def test_a_kind_of_event_can_have_its_own_number(caplog: pytest.LogCaptureFixture) -> None:
-    """Some are worth one line only."""
-    events = EventLog(LOGGER, "lab")
+    )
+    assert levels(caplog)[:MAX_REPEATS] == ["WARNING"] * 5
+    assert logged(caplog)[MAX_REPEATS:] == [hidden, loud, hidden, loud, ("INFO", "lab: changed")]
     for _ in range(3):
         events.log(logging.WARNING, "late", "late", most=1)
-    assert [level for level, _ in logged(caplog)] == ["WARNING", "DEBUG", "DEBUG"]
-
-
-# Fields ---------------------------------------------------------------------------------------
-
-
-class Collector(logging.Handler):
-    def __init__(self) -> None:
-        super().__init__()
-        self.records: list[logging.LogRecord] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.records.append(record)
+    assert levels(caplog)[-3:] == ["WARNING", "DEBUG", "DEBUG"]
 
 
 @pytest.fixture
 def records() -> Iterator[list[logging.LogRecord]]:
     """Collect the records that a handler with the filter receives."""
-    handler = Collector()
+    records: list[logging.LogRecord] = []
+    handler = logging.Handler()
+    handler.emit = records.append  # type: ignore[assignment, method-assign] # shorter than a class
     handler.addFilter(ContextFilter())
     LOGGER.addHandler(handler)
-    yield handler.records
+    yield records
     LOGGER.removeHandler(handler)
 
 
@@ -189,12 +158,8 @@ def test_records_have_the_fields_that_are_set_and_no_others(records: list[loggin
             LOGGER.warning("inside")
         LOGGER.warning("outside")
     LOGGER.warning("after")
-    assert [fields(record) for record in records] == [
-        {},
-        {"source": "lab", "stream": "3d", "peer": "192.0.2.20:3020"},
-        {"source": "lab"},
-        {},
-    ]
+    inside = {"source": "lab", "stream": "3d", "peer": "192.0.2.20:3020"}
+    assert [fields(record) for record in records] == [{}, inside, {"source": "lab"}, {}]
 
 
 async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_them(
@@ -211,9 +176,6 @@ async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_th
     await asyncio.gather(run("hall"), run("lab"))
     found = [(fields(record)["source"], record.getMessage()) for record in records]
     assert sorted(found) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]
-
-
-# Defects --------------------------------------------------------------------------------------
 
 
 def test_a_defect_is_an_error_with_its_traceback_once_for_each_place(
@@ -245,5 +207,5 @@ def test_a_log_of_defects_can_continue_a_former_one(caplog: pytest.LogCaptureFix
             int("x")
         except ValueError as defect:
             defects.log(defect)
-    assert [level for level, _ in logged(caplog)] == ["ERROR", "DEBUG"]
+    assert levels(caplog) == ["ERROR", "DEBUG"]
     assert [defects.count for defects in logs] == [2, 2]

@@ -6,27 +6,13 @@ import pytest
 
 from gateway.losses import MAX_HOLD_S, MIN_HOLD_S, Losses, last_minute_text
 from tests.losses import amounts
+from tests.unit.settable_clock import SettableClock
 
 LOGGER = logging.getLogger("tests.losses")
 
 
-class Clock:
-    """A monotonic clock that the tests set."""
-
-    def __init__(self) -> None:
-        self.now_s = 1000.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def losses(clock: Clock, caplog: pytest.LogCaptureFixture) -> Losses:
+def losses(clock: SettableClock, caplog: pytest.LogCaptureFixture) -> Losses:
     caplog.set_level(logging.DEBUG, LOGGER.name)
     return Losses(LOGGER, "lab", clock)
 
@@ -54,22 +40,23 @@ def test_a_frame_counts_once_for_each_cause_however_many_messages_it_loses(losse
     assert amounts(losses.report()) == {"no router": (4, 2), "put failed": (1, 1)}
 
 
-def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(losses: Losses, clock: Clock) -> None:
+def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(
+    losses: Losses, clock: SettableClock
+) -> None:
     losses.lost("skipped", "late", messages=2)
     clock.now_s += 30
     losses.lost("skipped", "later", messages=3)
+    for expected in ((5, 2, 0.0), (3, 1, 30.0), (0, 0, 60.0)):
+        [loss] = losses.report()
+        assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == expected
+        clock.now_s += 30
     [loss] = losses.report()
-    assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == (5, 2, 0.0)
-    clock.now_s += 30
-    [loss] = losses.report()
-    assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == (3, 1, 30.0)
-    clock.now_s += 30
-    [loss] = losses.report()
-    assert (loss.messages_last_minute, loss.frames_last_minute) == (0, 0)
     assert (loss.messages, loss.frames, loss.text) == (5, 2, "later")
 
 
-def test_the_last_minute_is_complete_if_something_is_lost_all_the_time(losses: Losses, clock: Clock) -> None:
+def test_the_last_minute_is_complete_if_something_is_lost_all_the_time(
+    losses: Losses, clock: SettableClock
+) -> None:
     for _ in range(200 * 10):
         losses.lost("skipped", "late")
         clock.now_s += 0.1
@@ -79,7 +66,7 @@ def test_the_last_minute_is_complete_if_something_is_lost_all_the_time(losses: L
 
 
 def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
-    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
+    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(250):
         losses.lost("no router", "start zenohd", messages=5)
@@ -98,33 +85,24 @@ def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
 
 
 def test_the_next_period_has_a_total_of_its_own(
-    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
+    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Also one that begins while nobody has checked for the end of the former one."""
     for number in (1, 2):
         for _ in range(number):
             losses.lost("no router", "start zenohd", frames=0)
         clock.now_s += 100
-        losses.check()
-    assert logged(caplog) == [
-        "WARNING lab: start zenohd",
-        "INFO lab: lost within 0.0 s: 1 message (no router); nothing lost for 5 s",
-        "WARNING lab: start zenohd",
-        "INFO lab: lost within 0.0 s: 2 messages (no router); nothing lost for 5 s",
-    ]
-    assert amounts(losses.report()) == {"no router": (3, 0)}
-
-
-def test_a_period_that_ended_while_nobody_checked_is_logged_before_the_next(
-    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
-) -> None:
-    losses.lost("no router", "start zenohd")
-    clock.now_s += 100
-    losses.lost("no router", "start zenohd")
-    assert [line.split()[0] for line in logged(caplog)] == ["WARNING", "INFO", "WARNING"]
+        if number == 1:
+            losses.check()
+    losses.lost("no router", "start zenohd", frames=0)
+    begin, end = "WARNING lab: start zenohd", "(no router); nothing lost for 5 s"
+    first, second = (f"INFO lab: lost within 0.0 s: {number} {end}" for number in ("1 message", "2 messages"))
+    assert logged(caplog) == [begin, first, begin, second, begin]
+    assert amounts(losses.report()) == {"no router": (4, 0)}
 
 
 def test_causes_that_alternate_are_logged_once_each(
-    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
+    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(1000):
         losses.lost("no router", "start zenohd")
@@ -151,7 +129,7 @@ def test_a_loss_that_is_expected_at_first_is_logged_again_as_warning(
 
 @pytest.mark.parametrize("period_s", [6.0, 20.0, 59.0])
 def test_loss_that_comes_and_goes_does_not_fill_the_log(
-    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture, period_s: float
+    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture, period_s: float
 ) -> None:
     for _ in range(1000):
         losses.lost("no router", "start zenohd")
@@ -170,7 +148,7 @@ def test_loss_that_comes_and_goes_does_not_fill_the_log(
     assert len(logged(caplog)) == 2  # after a long pause, the wait is short again
 
 
-def test_texts_say_how_much_and_why(losses: Losses, clock: Clock) -> None:
+def test_texts_say_how_much_and_why(losses: Losses, clock: SettableClock) -> None:
     assert last_minute_text(losses.report()) == ""
     losses.lost("skipped while behind", "late", messages=872, frames=436)
     losses.lost("C3D file", "disk full", frames=0)

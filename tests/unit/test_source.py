@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -85,9 +85,17 @@ class Lab:
         )
 
 
+NewLab = Callable[..., Lab]
+
+
 @pytest.fixture
-def spool(tmp_path: Path) -> Spool:
-    return Spool(tmp_path, max_files=10, max_bytes=1000)
+def new_lab(servers: Servers, tmp_path: Path) -> NewLab:
+    """Return a function that makes a source of the server, with its own spool or another one."""
+
+    def make(before: Source | None = None, *, spool: Spool | None = None, **settings: Any) -> Lab:
+        return Lab(servers, spool or Spool(tmp_path, max_files=10, max_bytes=1000), before, **settings)
+
+    return make
 
 
 @asynccontextmanager
@@ -100,26 +108,31 @@ async def running(lab: Lab) -> AsyncIterator[None]:
         await asyncio.gather(task, return_exceptions=True)
 
 
-# Status --------------------------------------------------------------------------------------
+def messages_of(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:
+    return [record.message for record in caplog.records if record.levelno == level]
 
 
-async def test_status_and_clock_are_numbered(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
-    for _ in range(3):
+async def receive_files(lab: Lab, number: int) -> None:
+    """Run the source until it has received files of 600 bytes."""
+    async with running(lab):
+        await lab.connected()
+        for _ in range(number):
+            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
+            await settle()
+        assert len(lab.server.connections) == 1
+
+
+async def test_status_and_clock_are_numbered_and_queries_get_the_newest_status(new_lab: NewLab) -> None:
+    lab = new_lab()
+    for sequence in (-1, 0, 1):
+        answer = await lab.source.queries.answer(Question("status"))
+        assert decode(answer.payload).sequence == sequence
         lab.source.publish_status()
-    assert [message.sequence for message in lab.messages("status")] == [0, 1, 2]
-    assert [message.sequence for message in lab.messages("clock")] == [0, 1, 2]
+    for component in ("status", "clock"):
+        assert [message.sequence for message in lab.messages(component)] == [0, 1, 2]
 
 
-async def test_queries_get_the_newest_status(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
-    question = Question("status")
-    assert decode((await lab.source.queries.answer(question)).payload).sequence == -1
-    lab.source.publish_status()
-    assert decode((await lab.source.queries.answer(question)).payload).sequence == 0
-
-
-async def test_problems_with_the_status_are_logged_with_the_source(servers: Servers, spool: Spool) -> None:
+async def test_problems_with_the_status_are_logged_with_the_source(new_lab: NewLab) -> None:
     class RecordingPublisher(ToyPublisher):
         def publish(self, message: bytes) -> None:
             fields.append(current_log_fields())
@@ -131,12 +144,12 @@ async def test_problems_with_the_status_are_logged_with_the_source(servers: Serv
             return RecordingPublisher(self, topic)
 
     fields: list[Mapping[str, str]] = []
-    Lab(servers, spool, output=RecordingOutput()).source.publish_status()
+    new_lab(output=RecordingOutput()).source.publish_status()
     assert fields == [{"source": "lab"}, {"source": "lab"}]
 
 
-async def test_the_status_describes_every_stream_and_output(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_the_status_describes_every_stream_and_output(new_lab: NewLab) -> None:
+    lab = new_lab(streams=TWO_STREAMS)
     lab.source.publish_status()
     [status] = lab.messages("status")
     assert (status.source, status.server) == ("lab", f"{HOST}:3020")
@@ -145,15 +158,12 @@ async def test_the_status_describes_every_stream_and_output(servers: Servers, sp
 
 
 @pytest.mark.parametrize("better", [0, 1])
-async def test_the_clock_with_the_least_uncertainty_is_published(
-    servers: Servers, spool: Spool, better: int
-) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_the_clock_with_the_least_uncertainty_is_published(new_lab: NewLab, better: int) -> None:
+    lab = new_lab(streams=TWO_STREAMS)
     for index, num_frames in ((better, 5000), (1 - better, 300)):
         for number in range(num_frames):
-            delay_us = number * 7919 % 1000
             time_us = 10_000 * number
-            lab.source.statuses[index].clock.observe(time_us, number, 10**15 + time_us + delay_us)
+            lab.source.statuses[index].clock.observe(time_us, number, 10**15 + time_us + number * 7919 % 1000)
     clocks = [status.clock for status in lab.source.statuses]
     assert clocks[better].uncertainty_us < clocks[1 - better].uncertainty_us
     lab.source.publish_status()
@@ -162,8 +172,8 @@ async def test_the_clock_with_the_least_uncertainty_is_published(
     assert message.clock.uncertainty_us == clocks[better].uncertainty_us
 
 
-async def test_a_stream_without_a_clock_is_never_the_best(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_a_stream_without_a_clock_is_never_the_best(new_lab: NewLab) -> None:
+    lab = new_lab(streams=TWO_STREAMS)
     for number in range(300):
         lab.source.statuses[1].clock.observe(10_000 * number, number, 10**15 + 10_000 * number)
     lab.source.publish_status()
@@ -171,8 +181,8 @@ async def test_a_stream_without_a_clock_is_never_the_best(servers: Servers, spoo
     assert (message.components, bool(message.clock.has_clock)) == ("analog", True)
 
 
-async def test_the_source_shows_streaming_while_any_stream_has_frames(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_the_source_shows_streaming_while_any_stream_has_frames(new_lab: NewLab) -> None:
+    lab = new_lab(streams=TWO_STREAMS)
     async with running(lab):
         await lab.connected(2)
         assert True not in lab.output.streaming
@@ -180,36 +190,28 @@ async def test_the_source_shows_streaming_while_any_stream_has_frames(servers: S
         first.send_frames(1)
         second.send(packet(3, b"\0\0\0\0"))  # a frame without components
         assert lab.output.streaming[-1] is True
-        second.end()
-        await settle()
-        assert lab.output.streaming[-1] is True
-        first.end()
-        await settle()
-        assert lab.output.streaming[-1] is False
+        for connection, is_streaming in ((second, True), (first, False)):
+            connection.end()
+            await settle()
+            assert lab.output.streaming[-1] is is_streaming
 
 
-async def test_a_source_that_replaces_another_continues_its_numbers(servers: Servers, spool: Spool) -> None:
-    before = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_a_source_that_replaces_another_continues_its_numbers(new_lab: NewLab) -> None:
+    before = new_lab(streams=TWO_STREAMS)
     before.source.sessions.newest = 5
     before.source.parameters_version = 7
     before.source.publish_status()
-    after = Lab(servers, spool, before.source)
+    after = new_lab(before.source)
     assert [(each.session, each.parameters_version) for each in after.source.statuses] == [(5, 7)]
     after.source.publish_status()
     assert [message.sequence for message in after.messages("status")] == [1]
 
 
-# Tasks ---------------------------------------------------------------------------------------
-
-
-# C3D files -----------------------------------------------------------------------------------
-
-
 async def test_a_file_is_stored_and_announced(
-    servers: Servers, spool: Spool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    lab, content = Lab(servers, spool), c3d_file(b"a file", 600)
+    lab, content = new_lab(), c3d_file(b"a file", 600)
     async with running(lab):
         await lab.connected()
         lab.server.connection.send(packet(5, content))
@@ -220,61 +222,45 @@ async def test_a_file_is_stored_and_announced(
         assert (answer.payload, answer.attachment) == (content, file.description)
     path = tmp_path / file.description["name"]
     assert file.path == path
-    assert spool.newest("lab") == path
+    assert lab.source.spool.newest("lab") == path
     assert f"lab: the server sent a C3D file of 600 bytes, kept as {path}" in caplog.messages
 
 
 async def test_the_files_that_a_new_one_displaces_are_logged_with_it(
-    servers: Servers, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    lab = Lab(servers, Spool(tmp_path, max_files=1, max_bytes=1000))
-    async with running(lab):
-        await lab.connected()
-        for _ in range(2):
-            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-            await settle()
+    lab = new_lab(spool=Spool(tmp_path, max_files=1, max_bytes=1000))
+    await receive_files(lab, 2)
     path = lab.files[1][1].path
     [line] = [message for message in caplog.messages if path.name in message]
     assert line.endswith(f"kept as {path}; deleted the oldest (1)")
 
 
 async def test_a_file_is_announced_although_an_old_one_cannot_be_deleted(
-    servers: Servers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.INFO)
-    lab = Lab(servers, Spool(tmp_path, max_files=1, max_bytes=1000))
-
     def refuse(_path: Path, **_options: bool) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    async with running(lab):
-        await lab.connected()
-        with monkeypatch.context() as disk:
-            disk.setattr(Path, "unlink", refuse)
-            for _ in range(3):
-                lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-                await settle()
-        assert len(lab.files) == 3
-    warnings = [record.message for record in caplog.records if record.levelno == logging.WARNING]
-    [warning] = [text for text in warnings if "C3D" in text]
+    lab = new_lab(spool=Spool(tmp_path, max_files=1, max_bytes=1000))
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "unlink", refuse)
+        await receive_files(lab, 3)
+    assert len(lab.files) == 3
+    [warning] = [text for text in messages_of(caplog, logging.WARNING) if "C3D" in text]
     assert warning.startswith(f"lab: old C3D files are not deleted: {tmp_path}/lab-")
     assert warning.endswith(" cannot be deleted: Operation not permitted")
 
 
 async def test_files_that_cannot_be_stored_are_logged_once(
-    servers: Servers, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     (tmp_path / "c3d").write_text("a file in place of the folder")
-    lab = Lab(servers, Spool(tmp_path / "c3d", max_files=10, max_bytes=1000))
-    async with running(lab):
-        await lab.connected()
-        for _ in range(6):
-            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-            await settle()
-    errors = [record.message for record in caplog.records if record.levelno == logging.ERROR]
-    assert errors == [
+    lab = new_lab(spool=Spool(tmp_path / "c3d", max_files=10, max_bytes=1000))
+    await receive_files(lab, 6)
+    assert messages_of(caplog, logging.ERROR) == [
         f"{STREAM}: a C3D file of 600 bytes from lab cannot be stored in {tmp_path / 'c3d'}: File exists; "
         "check spool.directory and the space on it"
     ]
@@ -284,64 +270,47 @@ async def test_files_that_cannot_be_stored_are_logged_once(
 
 
 async def test_a_file_that_breaks_off_with_the_connection_is_logged(
-    servers: Servers, spool: Spool, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, caplog: pytest.LogCaptureFixture
 ) -> None:
-    lab = Lab(servers, spool)
+    lab = new_lab()
     async with running(lab):
         await lab.connected()
         lab.server.connection.send(packet(5, c3d_file(b"", 600))[:-1])
         lab.server.connection.end()
         await settle()
-    assert spool.newest("lab") is None
-    [error] = [record.message for record in caplog.records if record.levelno == logging.ERROR]
+    assert lab.source.spool.newest("lab") is None
+    [error] = messages_of(caplog, logging.ERROR)
     assert error.startswith(f"{STREAM}: a C3D file of 600 bytes from lab broke off after 599 bytes: the conn")
 
 
 async def test_a_missing_file_is_an_error_for_the_peer(
-    servers: Servers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    new_lab: NewLab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lab = Lab(servers, Spool(tmp_path, max_files=10, max_bytes=1000))
-    with pytest.raises(QueryError, match="has sent no C3D file so far") as caught:
+    lab = new_lab()
+    with pytest.raises(QueryError, match="has sent no C3D file so far") as none:
         await lab.source.queries.answer(Question("c3d"))
-    assert caught.value.code == "nothing-yet"
     monkeypatch.setattr(Spool, "newest", lambda _spool, _source: tmp_path / "gone.c3d")
-    with pytest.raises(QueryError, match=r"of source 'lab' cannot be read: No such file") as caught:
+    with pytest.raises(QueryError, match=r"of source 'lab' cannot be read: No such file") as gone:
         await lab.source.queries.answer(Question("c3d"))
-    assert caught.value.code == "nothing-yet"
-
-
-async def test_a_disk_that_does_not_give_the_file_is_an_error_for_the_peer(
-    servers: Servers, spool: Spool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lab = Lab(servers, spool)
     monkeypatch.setattr(WorkerThread, "submit", lambda _thread, _call: Future())
-    with pytest.raises(QueryError, match="did not find the file within 4 s") as caught:
+    with pytest.raises(QueryError, match="did not find the file within 4 s") as slow:
         await lab.source.queries.answer(Question("c3d"))
-    assert caught.value.code == "timeout"
+    assert [each.value.code for each in (none, gone, slow)] == ["nothing-yet", "nothing-yet", "timeout"]
 
 
 async def test_a_defect_in_announcing_a_file_is_an_error_and_streams_continue(
-    servers: Servers, spool: Spool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    lab = Lab(servers, spool)
+    lab = new_lab()
     monkeypatch.setattr(lab, "files", None)  # what takes the description of a file raises AttributeError
-    async with running(lab):
-        await lab.connected()
-        lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-        await settle()
-        assert len(lab.server.connections) == 1
+    await receive_files(lab, 1)
     [error] = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert error.message.startswith("lab: defect in the gateway: AttributeError: ")
     assert error.exc_info is not None
 
 
-# Recording -----------------------------------------------------------------------------------
-
-
-async def test_recording_is_controlled_on_the_first_connection_that_works(
-    servers: Servers, spool: Spool
-) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS, remote_control=True)
+async def test_recording_is_controlled_on_the_first_connection_that_works(new_lab: NewLab) -> None:
+    lab = new_lab(streams=TWO_STREAMS, remote_control=True)
     start = Question("recording", set="start")
     with pytest.raises(QueryError, match="has no connection") as caught:
         await lab.source.queries.answer(start)
@@ -349,10 +318,9 @@ async def test_recording_is_controlled_on_the_first_connection_that_works(
     async with running(lab):
         await lab.connected(2)
         first, second = lab.server.connections
-        await lab.source.queries.answer(start)
-        assert (first.num_recording_packets, second.num_recording_packets) == (1, 0)
-        first.end()
-        await settle()
-        answer = await lab.source.queries.answer(start)
-        assert (first.num_recording_packets, second.num_recording_packets) == (1, 1)
-        assert answer.payload == b'{"source":"lab","sent":"start"}'
+        for expected in ((1, 0), (1, 1)):
+            answer = await lab.source.queries.answer(start)
+            assert (first.num_recording_packets, second.num_recording_packets) == expected
+            first.end()
+            await settle()
+            assert answer.payload == b'{"source":"lab","sent":"start"}'

@@ -5,7 +5,6 @@ import logging
 
 import pytest
 
-from gateway.c3d_files.spool import Spool
 from gateway.config.settings import StreamSettings
 from gateway.errors import QueryError
 from gateway.outputs.contract import ServerParameters
@@ -17,12 +16,11 @@ from tests.spec_parameters import in_root
 from tests.toy_output import ToyOutput
 from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
 from tests.unit.queries.fake_source import parameters_xml
-from tests.unit.scripted_sources import Servers
 from tests.unit.stream.scripted_server import XML, Answer, obliging, refusing, silent_to
-from tests.unit.test_source import TWO_STREAMS, Lab, running, spool
+from tests.unit.test_source import TWO_STREAMS, Lab, NewLab, new_lab, running
 from tests.virtual_time import settle
 
-__all__ = ["spool"]  # a fixture
+__all__ = ["new_lab"]  # a fixture
 
 OTHER_XML = packet(2, in_root("<The_3D><Unit>cm</Unit></The_3D>"))
 NO_DATA = packet(4)
@@ -45,8 +43,8 @@ def published(lab: Lab) -> list[tuple[bytes, int, int]]:
     return [parameters[:3] for _, parameters in lab.parameters]
 
 
-async def test_parameters_are_published_with_every_connection(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
+async def test_parameters_are_published_with_every_connection(new_lab: NewLab) -> None:
+    lab = new_lab()
     async with running(lab):
         await lab.connected()
         assert published(lab) == [(XML[8:], 1, 1)]
@@ -56,8 +54,8 @@ async def test_parameters_are_published_with_every_connection(servers: Servers, 
         assert published(lab)[1:] == [(XML[8:], 2, 1)]
 
 
-async def test_a_server_that_hung_in_the_handshake_is_asked_again(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
+async def test_a_server_that_hung_in_the_handshake_is_asked_again(new_lab: NewLab) -> None:
+    lab = new_lab()
     lab.server.answer = silent_to(REQUEST)
     async with running(lab):
         await lab.connected()
@@ -71,10 +69,10 @@ async def test_a_server_that_hung_in_the_handshake_is_asked_again(servers: Serve
         assert "the server did not answer SendParameters" not in status.limitations
 
 
-async def test_one_request_per_connection_is_enough(servers: Servers, spool: Spool) -> None:
+async def test_one_request_per_connection_is_enough(new_lab: NewLab) -> None:
     sections = ("General", "The_3D", "The_6D", "Analog", "Force", "Events")
     whole = packet(2, in_root(*(f"<{section}/>" for section in sections)))
-    lab = Lab(servers, spool, parameters_interval_s=0.0, stall_timeout_s=3600.0)
+    lab = new_lab(parameters_interval_s=0.0, stall_timeout_s=3600.0)
     lab.server.answer = sending(whole)
     async with running(lab):
         # The frames of the second connection have other numbers, and another number of markers.
@@ -90,8 +88,8 @@ async def test_one_request_per_connection_is_enough(servers: Servers, spool: Spo
             await settle()
 
 
-async def test_streams_that_connect_together_need_one_request(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_streams_that_connect_together_need_one_request(new_lab: NewLab) -> None:
+    lab = new_lab(streams=TWO_STREAMS)
     async with running(lab):
         await lab.connected(2)
         assert lab.count(REQUEST) == 1
@@ -106,11 +104,11 @@ async def test_streams_that_connect_together_need_one_request(servers: Servers, 
 
 @pytest.mark.parametrize("on_demand", [False, True])
 async def test_parameters_are_read_again_at_the_interval(
-    servers: Servers, spool: Spool, on_demand: bool, caplog: pytest.LogCaptureFixture
+    new_lab: NewLab, on_demand: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     stream = StreamSettings(components=(ComponentType.TOOLS,), on_demand=on_demand)
     output = ToyOutput("toy", *([] if on_demand else ["6d"]), has_tool_poses=True)
-    lab = Lab(servers, spool, streams=(stream,), output=output, stall_timeout_s=3600.0)
+    lab = new_lab(streams=(stream,), output=output, stall_timeout_s=3600.0)
     lab.server.answer = sending(tools("Probe"))
     async with running(lab):
         await lab.connected()
@@ -133,9 +131,9 @@ async def test_parameters_are_read_again_at_the_interval(
 
 @pytest.mark.parametrize(("answer", "count"), [(refusing(REQUEST), 1), (silent_to(REQUEST), 2)])
 async def test_a_server_that_gives_no_parameters_is_not_asked_for_ever(
-    servers: Servers, spool: Spool, answer: Answer, count: int
+    new_lab: NewLab, answer: Answer, count: int
 ) -> None:
-    lab = Lab(servers, spool)
+    lab = new_lab()
     lab.server.answer = answer
     async with running(lab):
         await lab.connected()
@@ -146,8 +144,8 @@ async def test_a_server_that_gives_no_parameters_is_not_asked_for_ever(
         assert lab.parameters == []
 
 
-async def test_a_changed_number_of_items_requests_the_parameters_once(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
+async def test_a_changed_number_of_items_requests_the_parameters_once(new_lab: NewLab) -> None:
+    lab = new_lab()
     async with running(lab):
         await lab.connected()
         lab.server.connection.send(NO_DATA)
@@ -163,26 +161,24 @@ async def test_a_changed_number_of_items_requests_the_parameters_once(servers: S
         assert lab.count(REQUEST) == before + 2
 
 
-async def test_a_new_measurement_requests_the_parameters(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
+async def test_a_new_measurement_requests_the_parameters(new_lab: NewLab) -> None:
+    lab = new_lab()
     async with running(lab):
         await lab.connected()
-        lab.server.connection.send_frames(1)
-        await settle()
-        assert lab.count(REQUEST) == 1
-        lab.server.connection.send(NO_DATA)
-        await settle()
-        assert lab.count(REQUEST) == 1
-        lab.server.connection.send_frames(2)
-        await settle()
-        assert lab.count(REQUEST) == 2
+        for sends_data, num_requests in ((True, 1), (False, 1), (True, 2)):
+            if sends_data:
+                lab.server.connection.send_frames(num_requests)
+            else:
+                lab.server.connection.send(NO_DATA)
+            await settle()
+            assert lab.count(REQUEST) == num_requests
 
 
 @pytest.mark.parametrize(("interval_s", "expected"), [(10.0, 11), (0.0, 11), (20.0, 6)])
 async def test_a_server_that_plays_in_a_loop_is_not_asked_at_every_pass(
-    servers: Servers, spool: Spool, interval_s: float, expected: int
+    new_lab: NewLab, interval_s: float, expected: int
 ) -> None:
-    lab = Lab(servers, spool, parameters_interval_s=interval_s)
+    lab = new_lab(parameters_interval_s=interval_s)
     async with running(lab):
         await lab.connected()
         for _ in range(100):
@@ -192,20 +188,9 @@ async def test_a_server_that_plays_in_a_loop_is_not_asked_at_every_pass(
         assert lab.count(REQUEST) == pytest.approx(expected, abs=1)
 
 
-async def test_tools_are_named_by_their_labels_in_the_parameters(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, output=ToyOutput("toy", "Probe", has_tool_poses=True))
-    lab.server.answer = sending(tools("Probe"))
-    async with running(lab):
-        await lab.connected()
-        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
-        assert lab.output.tool_names() == ["Probe"]
-
-
 @pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST), sending(packet(2, "what?"))])
-async def test_parameters_are_void_if_another_server_gives_none(
-    servers: Servers, spool: Spool, answer: Answer
-) -> None:
-    lab = Lab(servers, spool, output=ToyOutput("toy", has_tool_poses=True))
+async def test_parameters_are_void_if_another_server_gives_none(new_lab: NewLab, answer: Answer) -> None:
+    lab = new_lab(output=ToyOutput("toy", has_tool_poses=True))
     lab.server.answer = sending(tools("Probe"))
     async with running(lab):
         await lab.connected()
@@ -227,10 +212,8 @@ async def test_parameters_are_void_if_another_server_gives_none(
         assert published(lab)[2:] == [(tools("Probe")[8:], 3, 3)]
 
 
-async def test_parameters_are_published_before_the_frames_that_have_their_version(
-    servers: Servers, spool: Spool
-) -> None:
-    lab = Lab(servers, spool)
+async def test_parameters_are_published_before_the_frames_that_have_their_version(new_lab: NewLab) -> None:
+    lab = new_lab()
     is_sent = asyncio.Event()
     is_sent.set()
 
@@ -253,63 +236,53 @@ async def test_parameters_are_published_before_the_frames_that_have_their_versio
             await settle()
 
 
-async def test_a_reload_continues_the_version(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
+async def test_a_reload_continues_the_version_and_the_parameters_of_another_server_are_void(
+    new_lab: NewLab,
+) -> None:
+    lab = new_lab()
     async with running(lab):
         await lab.connected()
         lab.server.answer = sending(OTHER_XML)
         lab.source.fan_out.on_items_changed()
         await settle()
-    after = Lab(servers, spool, lab.source, query_timeout_s=3.0)
+    after = new_lab(lab.source, query_timeout_s=3.0)
     assert after.source.statuses[0].parameters_version == 2
     async with running(after):
         await after.connected()
         assert published(after) == [(OTHER_XML[8:], 2, 2)]
-
-
-async def test_the_parameters_of_another_server_are_void_after_a_reload(
-    servers: Servers, spool: Spool
-) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-    lab.server.refuses = True
-    after = Lab(servers, spool, lab.source, port=3021)
-    async with running(after):
+    after.server.refuses = True
+    other = new_lab(after.source, port=3021)
+    async with running(other):
         await settle()
-        assert published(after) == [(b"", 1, 2)]
+        assert published(other) == [(b"", 2, 3)]
         with pytest.raises(QueryError, match="has no connection"):
-            await after.source.queries.answer(Question("parameters", stale_ok=True))
+            await other.source.queries.answer(Question("parameters", stale_ok=True))
 
 
-async def test_every_message_carries_the_version_of_the_parameters(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
+async def test_every_message_carries_the_version_of_the_parameters(new_lab: NewLab) -> None:
+    lab = new_lab(streams=TWO_STREAMS)
 
     async def check_version(version: int) -> None:
         """Check the version of a new frame, of the status and of the clock."""
         lab.server.connections[0].send_frames(1)
         lab.source.publish_status()
         await settle()
-        newest = [lab.messages(name)[-1] for name in ("3d", "status", "clock")]
-        assert [message.parameters_version for message in newest] == [version] * 3
-
-    async def change_parameters(xml: bytes) -> None:
-        lab.server.answer = lambda command: (
-            packet(2, xml.decode()) if command.startswith("SendParameters") else obliging(command)
-        )
-        await lab.source.queries.answer(Question("parameters", fresh=True))
-        await settle()
+        newest = [lab.messages(name)[-1].parameters_version for name in ("3d", "status", "clock")]
+        assert newest == [version] * 3
 
     assert [status.parameters_version for status in lab.source.statuses] == [0, 0]
     async with running(lab):
         await lab.connected(2)
         await check_version(1)
+        more_frames = parameters_xml("cm", frames_sent=2)
         for xml, version in (
             (parameters_xml("cm"), 2),
-            (parameters_xml("cm", frames_sent=2), 2),
+            (more_frames, 2),
             (parameters_xml("m"), 3),
             (parameters_xml("cm"), 4),
         ):
-            await change_parameters(xml)
+            lab.server.answer = sending(packet(2, xml.decode()))
+            await lab.source.queries.answer(Question("parameters", fresh=True))
+            await settle()
             await check_version(version)
             assert lab.parameters[-1][1].version == version

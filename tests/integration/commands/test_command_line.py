@@ -66,26 +66,16 @@ async def test_text_that_is_not_utf8_is_a_mistake(command: str) -> None:
     assert (await run(*command.split(), "--nope\udcff\x1b[31m", environ=_ASCII)).status == 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status"),
-    [
-        (("config", "schema"), 0),
-        (("check", CONFIG), 0),
-    ],
-)
-async def test_output_goes_nowhere(arguments: tuple[str, ...], status: int) -> None:
+@pytest.mark.parametrize("arguments", ["config schema", f"check {CONFIG}"])
+async def test_output_goes_nowhere(arguments: str) -> None:
     """A reader that leaves, a full device, and a closed stream."""
-    command = f"$PROGRAM {' '.join(arguments)}"
-    gone = await run_shell(f"set -o pipefail; {command} | true")
-    assert gone.status == 0
-    assert not gone.stderr
+    command = f"$PROGRAM {arguments}"
     full = await run_shell(f"{command} >/dev/full")
-    assert full.status == 1
-    assert full.stderr == "cannot write the output: No space left on device\n"
-    assert (await run_shell(f"{command} 2>/dev/full")).status == status
-    for closed in (">&-", ">&- 2>&- <&-"):
-        ended = await run_shell(f"{command} {closed}")
-        assert (ended.status, ended.stderr) == (status, "")
+    assert full == (1, "", "cannot write the output: No space left on device\n")
+    assert (await run_shell(f"{command} 2>/dev/full")).status == 0
+    for nowhere in ("| true", ">&-", ">&- 2>&- <&-"):
+        ended = await run_shell(f"set -o pipefail; {command} {nowhere}")
+        assert (ended.status, ended.stderr) == (0, "")
 
 
 async def press_ctrl_c(process: asyncio.subprocess.Process) -> None:

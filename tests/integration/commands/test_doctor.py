@@ -3,8 +3,9 @@
 import asyncio
 import re
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+import struct
+from contextlib import ExitStack
+from typing import Any, Final
 
 import pytest
 
@@ -14,37 +15,226 @@ from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests import networks
-from tests.diagnosed_servers import (
-    MARKERS_XML,
-    TOOLS_XML,
-    diagnose,
-    parameters,
-    replying,
-    streaming,
-    tools_frame,
-)
-from tests.findings import lab, run_doctor
-from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
+from tests.findings import MARKERS_XML, TOOLS_XML, diagnose, lab, parameters, replying, run_doctor, streaming
+from tests.findings import tools_frame as tools
+from tests.networks import free_port
+from tests.servers import Client, Script, ScriptedServer, markers_frame, ok, packet
 
 MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
 FORCE, EVENT = ComponentType.FORCE, ComponentType.EVENT
-NAN = float("nan")
+PASSING, NOTE, WARNING, FAILING = Result.PASSING, Result.NOTE, Result.WARNING, Result.FAILING
+CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "buffer", "visibility")
+HIP: Final = (1.0, 2.0, 3.0)
+GONE: Final = (float("nan"),) * 3
+GOOD: Final = markers_frame(1, HIP)
+NO_DATA: Final = packet(4)
+XML: Final = {hz: parameters(MARKERS_XML.format(hz)) for hz in (1, 50, 100, 500, 900, 1000)}
+WITH_TOOLS: Final = parameters(MARKERS_XML.format(100), TOOLS_XML)
+FASTER_TOOLS: Final = parameters(MARKERS_XML.format(100), TOOLS_XML.replace("100", "200"))
+FURLONGS: Final = parameters("<The_3D><Frequency>100</Frequency><Unit>furlong</Unit><Markers/></The_3D>")
+
+
+def markers(number: int) -> bytes:
+    return markers_frame(number, HIP)
+
+
+def little_endian(number: int) -> bytes:
+    return markers_frame(number, HIP, order="<")
+
+
+def markers_and_tools(number: int) -> bytes:
+    """Return a frame with both components. In a packet, they begin at byte 12."""
+    return packet(3, struct.pack(">I", 2) + markers(number)[12:] + tools(number, 1.0)[12:])
+
+
+FRAMES: Final = [markers(number) for number in range(0, 100, 10)]
+NEVER_SEEN: Final = [markers_frame(number, GONE, HIP, GONE) for number in (1, 2)]
+SEEN_LATER: Final = [markers_frame(number, HIP, HIP, GONE) for number in (3, 4)]
+
+
+async def web_server(client: Client) -> None:
+    client.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+    await client.command()
+
+
+async def silent(client: Client) -> None:
+    await client.commands(lambda _command: None)
+
+
+async def disconnecting(client: Client) -> None:
+    await client.command()
+    client.cut()
+
+
+async def cut_while_streaming(client: Client) -> None:
+    def answer(command: str) -> bytes:
+        if command.startswith("StreamFrames"):
+            asyncio.get_running_loop().call_later(0.05, client.cut)
+        return ok(f"OK-{command}")
+
+    await client.commands(answer)
+
+
+def of(*components: ComponentType, rate: Rate | None = None) -> tuple[StreamSettings, ...]:
+    """Return a stream, of all components by default."""
+    given: dict[str, Any] = {"components": components or None, "rate": rate}
+    return (StreamSettings(**{key: value for key, value in given.items() if value}),)
+
+
+def case(result: Result, server: Script, check: str, found: str, remedy: str = "", **keys: Any) -> Any:
+    """Return what the doctor finds out about a server. ``keys`` are settings of the source."""
+    return pytest.param(result, server, check, found, remedy, keys, id=f"{check}: {found}")
+
+
+NO_RATE: Final = "the server announces no rate, so the configured divisor 2 cannot be compared"
+NO_6D: Final = "the server's parameters list items of 6d, but no frame contains 6d"
+PORTS: Final = "3020 is First Principles, 3030 WaveFront"
+REFUSALS: Final = "server refused Version 1.0: err-unknown command; the server refused SendParameters: err-"
+
+
+@pytest.mark.parametrize(
+    ("result", "server", "check", "found", "remedy", "keys"),
+    [
+        case(FAILING, web_server, "protocol", "is not an RT server; its first bytes are 'HTTP/1.1 4", PORTS),
+        case(FAILING, silent, "protocol", "accepts a connection but sends nothing", "restart the RT server."),
+        case(FAILING, disconnecting, "protocol", "the connection to 127.0.0.1:", "accepts one more client"),
+        case(
+            *(FAILING, replying(parameters(), refused="StreamFrames"), "protocol"),
+            *("refuses every form of the StreamFrames command", "Enable the real-time output"),
+        ),
+        case(PASSING, replying(b"", *FRAMES, refused="Version|SendParameters"), "protocol", REFUSALS),
+        case(
+            *(FAILING, replying(packet(2, "no xml"), GOOD), "parameters"),
+            *("the server's XML cannot be read: ", "The gateway publishes data without names and units."),
+        ),
+        case(
+            PASSING, replying(packet(2, "<RT_Parameters><The_3D></The_6D>"), GOOD), "parameters", "(repaired"
+        ),
+        case(
+            *(WARNING, replying(FURLONGS, GOOD), "parameters"),
+            *("0 markers; unit of length 'furlong' is unknown: no positions in metres", "transform.units"),
+        ),
+        case(PASSING, replying(FURLONGS, GOOD), "parameters", "0 markers", transform={"units": "mm"}),
+        case(
+            *(FAILING, replying(parameters(), NO_DATA), "frames"),
+            *("the server reports that no measurement is running", "Start a measurement on the server"),
+        ),
+        case(
+            *(FAILING, replying(parameters()), "frames"),
+            *("no frame of stream 3d 6d arrived, and the server did not", "Check that the server shows"),
+            streams=of(MARKERS, TOOLS),
+        ),
+        case(
+            *(Result.NOT_TESTED, replying(parameters()), "frames", "no event occurred during the check"),
+            streams=of(EVENT),
+        ),
+        case(
+            *(FAILING, replying(parameters(), GOOD, packet(3, GOOD[8:-4])), "frames"),
+            *("1 of 2 frames are malformed: component 1 of 1", "The gateway drops malformed frames."),
+        ),
+        case(
+            *(FAILING, replying(WITH_TOOLS, GOOD), "frames", NO_6D),
+            *("Enable the real-time output of 6d on the server, or remove 6d from the stream's components.",),
+            streams=of(MARKERS, TOOLS),
+        ),
+        *(
+            case(
+                *(NOTE, streaming(WITH_TOOLS, markers), "frames", NO_6D),
+                *("If you need 6d, enable its real-time output on the server.",),
+                streams=streams,
+            )
+            for streams in ("auto", of())
+        ),
+        case(
+            *(FAILING, streaming(parameters(), markers), "frames"),
+            *("frames arrived, but none has a component of stream 6d",),
+            streams=of(TOOLS),
+        ),
+        case(
+            *(FAILING, cut_while_streaming, "frames"),
+            *("the server closed the connection while the doctor waited", "takes over the stream"),
+        ),
+        case(
+            *(FAILING, replying(XML[100], *FRAMES, NO_DATA), "frames"),
+            *(" s, and the server reports that no measurement is running",),
+        ),
+        case(FAILING, streaming(XML[500], markers), "rate", "3d 100 of 500 Hz", "too slow. Check the server"),
+        case(FAILING, streaming(XML[50], markers), "rate", "50 Hz: the server sends more frames than its"),
+        case(FAILING, streaming(XML[1], lambda _: GOOD), "rate", "of 1 Hz: the server sends more frames"),
+        case(FAILING, streaming(XML[900], markers, step=1), "rate", " of 900 Hz"),
+        *(
+            case(
+                *(FAILING, streaming(xml, markers), "rate"),
+                *("3d 100 of 25 Hz: the server ignores the requested rate",),
+                streams=of(rate=Frequency(25)),
+            )
+            for xml in (XML[100], parameters())
+        ),
+        *(
+            case(
+                *(result, streaming(b"", markers, refused="SendParameters"), "rate", f"3d 100 of {hz:g} Hz"),
+                streams=of(rate=Frequency(hz)),
+            )
+            for result, hz in ((PASSING, 100), (FAILING, 200))
+        ),
+        case(NOTE, streaming(parameters(), markers), "rate", NO_RATE, streams=of(rate=FrequencyDivisor(2))),
+        *(
+            case(
+                *(WARNING, streaming(XML[100], frame), "byte order"),
+                *(f"sends {sent}-endian frames, although the gateway requests {wanted}-endian ones",),
+                *(f"set byte_order: {sent} for this source",),
+                byte_order=wanted,
+            )
+            for wanted, sent, frame in (("big", "little", little_endian), ("little", "big", markers))
+        ),
+        case(
+            *(PASSING, streaming(XML[100], little_endian), "byte order"),
+            *("the frames are little-endian, as requested",),
+            byte_order="little",
+        ),
+        case(
+            *(FAILING, replying(XML[100], markers_frame(1, GONE, GONE)), "visibility"),
+            *("in view: markers 0%", "Check that the cameras see the volume"),
+        ),
+        case(
+            *(FAILING, replying(XML[1000], *NEVER_SEEN), "visibility"),
+            *("markers 33% (never hip, number 3)",),
+        ),
+        case(
+            *(PASSING, replying(XML[1000], *NEVER_SEEN, *SEEN_LATER), "visibility"),
+            *("markers 50% (never number 3)",),
+        ),
+        case(
+            *(FAILING, replying(parameters(TOOLS_XML), tools(1, GONE[0]), tools(2, GONE[0])), "visibility"),
+            *("in view: tools 0%",),
+        ),
+    ],
+)
+async def test_what_is_found_about_a_server(
+    result: Result, server: Script, check: str, found: str, remedy: str, keys: dict[str, Any]
+) -> None:
+    """The finding and its remedy are these; without the protocol, nothing that needs it is checked."""
+    findings = await diagnose(server, **keys)
+    finding = findings.of(check)
+    assert (finding.result, found in finding.found, remedy in finding.remedy) == (result, True, True), finding
+    assert (check in findings.failing()) is (result is FAILING)
+    if check == "protocol" and result is FAILING:
+        assert findings.failing() == [check]
+        assert findings.not_tested(*CHECKS[3:]) == {"it needs protocol, which failed"}
 
 
 async def test_a_healthy_server_passes_every_check() -> None:
     scene = SyntheticScene(markers=3, tools=1, analog=4, plates=1, rate_hz=200, analog_rate_hz=1000)
-    streams = (StreamSettings(components=(MARKERS, TOOLS, EVENT)), StreamSettings(components=(ANALOG, FORCE)))
     async with Simulator(scene) as simulator:
-        findings = await run_doctor(lab(simulator.port, *streams))
-    assert {each.result for each in findings.all if each.subject == "lab"} == {Result.PASSING}
+        findings = await run_doctor(lab(simulator.port, *of(MARKERS, TOOLS, EVENT), *of(ANALOG, FORCE)))
+    assert {each.result for each in findings.all if each.subject == "lab"} == {PASSING}
     assert [each.stream for each in findings.all_of("frames")] == ["3d 6d event", "analog force"]
     assert {each.stream for each in findings.all_of("protocol")} == {""}
     texts = [(each.check, each.found) for each in findings.all if each.subject == "lab"]
     frames = [text for check, text in texts if check == "frames"]
     assert re.fullmatch(r"\d+ frames with 3d, 6d(, event)?; the largest message has \d+ bytes", frames[0])
     assert re.fullmatch(r"\d+ frames with analog, force; the largest message has \d+ bytes", frames[1])
-    for text in (
+    assert set(texts) >= {
         ("name", "127.0.0.1 is an IP address"),
         ("TCP", f"127.0.0.1:{simulator.port} accepts 2 connections, one per stream"),
         ("protocol", "the server accepts every command"),
@@ -52,300 +242,104 @@ async def test_a_healthy_server_passes_every_check() -> None:
         ("rate", "3d 200 of 200, 6d 200 of 200 Hz"),
         ("rate", "analog 1000 of 1000, force 1000 of 1000 Hz"),
         ("visibility", "in view: markers 100%, tools 100%"),
-    ):
-        assert text in texts
+    }
     assert findings.of("file", "configuration").found == "lab.yaml: lab to lcm"
 
 
-async def test_a_host_name_is_resolved() -> None:
-    async with Simulator(SyntheticScene(markers=1)) as simulator:
-        findings = await run_doctor(lab(simulator.port, host="localhost"))
-    assert findings.of("name").result is Result.PASSING
-    assert "127.0.0.1" in findings.of("name").found
-
-
-async def test_an_unknown_host_name_fails_and_ends_the_checks_of_its_source() -> None:
-    scene = SyntheticScene(markers=1, tools=0, analog=0, plates=0)
-    async with Simulator(scene) as simulator:
-        other = SourceSettings(name="other", host="127.0.0.1", port=simulator.port)
+async def test_an_unknown_host_name_ends_the_checks_of_its_source_only() -> None:
+    async with Simulator(SyntheticScene(markers=1, tools=0, analog=0, plates=0)) as simulator:
+        other = SourceSettings(name="other", host="localhost", port=simulator.port)
         findings = await run_doctor(lab(3020, host="no-such-host.invalid"), other)
-    finding = findings.of("name")
-    assert finding.found.startswith("the host name 'no-such-host.invalid' cannot be resolved: ")
-    assert finding.remedy == (
-        "Correct the source's host, add the name to DNS or /etc/hosts, or use an IP address."
-    )
+    assert "the host name 'no-such-host.invalid' cannot be resolved: " in findings.of("name").found
+    assert findings.of("name").remedy.startswith("Correct the source's host, add the name to DNS")
     assert findings.failing() == ["name"]
-    later = ("TCP", "protocol", "parameters", "frames", "rate", "buffer", "visibility")
-    assert findings.not_tested(*later) == {"it needs name, which failed"}
+    assert findings.not_tested(*CHECKS[1:]) == {"it needs name, which failed"}
     assert findings.failing("other") == []
+    assert "127.0.0.1" in findings.of("name", "other").found
 
 
-async def test_a_refused_connection_fails() -> None:
-    port = networks.free_port()
-    findings = await run_doctor(lab(port))
-    assert findings.of("TCP").found == f"connection refused by 127.0.0.1:{port}"
-    assert findings.of("TCP").remedy == "Is the RT server running, and is this its port?"
+@pytest.mark.parametrize("is_full", [False, True], ids=["refused", "no answer"])
+async def test_a_server_that_does_not_accept_connections_fails(is_full: bool) -> None:
+    found, remedy, port = "connection refused by 127.0.0.1:", "Is the RT server running, and is", free_port()
+    with ExitStack() as stack:
+        if is_full:  # the queue of a listener: further connections get no answer
+            found, remedy = "no answer from 127.0.0.1:", "Is the computer on and reachable, and its firewall"
+            full = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+            port = full.getsockname()[1]
+            for _ in range(4):
+                waiting = stack.enter_context(socket.socket())
+                waiting.setblocking(False)
+                waiting.connect_ex(full.getsockname())
+        findings = await run_doctor(lab(port, connect_timeout_s=0.2))
+    assert findings.of("TCP").found.startswith(f"{found}{port}")
+    assert findings.of("TCP").remedy.startswith(remedy)
     assert findings.failing() == ["TCP"]
-    later = ("protocol", "parameters", "frames", "rate", "buffer", "visibility")
-    assert findings.not_tested(*later) == {"it needs TCP, which failed"}
+    assert findings.not_tested(*CHECKS[2:]) == {"it needs TCP, which failed"}
 
 
-async def test_a_computer_that_does_not_respond_fails() -> None:
-    with socket.create_server(("127.0.0.1", 0), backlog=0) as full:
-        address = full.getsockname()
-        with _full_queue(address):
-            findings = await run_doctor(lab(address[1], connect_timeout_s=0.2))
-    assert findings.of("TCP").found == f"no answer from 127.0.0.1:{address[1]} within 0.2 s"
-    assert findings.of("TCP").remedy == (
-        "Is the computer on and reachable, and its firewall open for this port?"
-    )
-
-
-@contextmanager
-def _full_queue(address: tuple[str, int]) -> Iterator[None]:
-    """Fill the queue of a listener, so that further connections get no answer."""
-    waiting = [socket.socket() for _ in range(4)]
-    for each in waiting:
-        each.setblocking(False)
-        each.connect_ex(address)
-    try:
-        yield
-    finally:
-        for each in waiting:
-            each.close()
-
-
-async def test_the_first_bytes_of_another_protocol_are_quoted() -> None:
-    async def script(client: Client) -> None:
-        client.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-        await client.command()
-
-    async with ScriptedServer(script) as server:
-        findings = await run_doctor(lab(server.port))
-    assert findings.of("protocol").found == (
-        f"the program at 127.0.0.1:{server.port} is not an RT server; "
-        r"its first bytes are 'HTTP/1.1 400 Bad Request\r\n\r\n'"
-    )
-    assert findings.of("protocol").remedy == (
-        "Correct the source's host and port: 3020 is First Principles, 3030 WaveFront."
-    )
-    assert findings.failing() == ["protocol"]
-    assert findings.not_tested("parameters", "frames", "rate") == {"it needs protocol, which failed"}
-
-
-async def test_a_server_that_sends_nothing_fails() -> None:
-    findings = await diagnose(lambda client: client.commands(lambda _command: None))
-    assert findings.of("protocol").found.endswith("accepts a connection but sends nothing")
-    assert findings.of("protocol").remedy == (
-        "Correct the source's host and port (3020 is First Principles, 3030 WaveFront). "
-        "If they are correct, restart the RT server."
-    )
-
-
-async def test_a_server_that_disconnects_fails() -> None:
-    async def script(client: Client) -> None:
-        await client.command()
-        client.cut()
-
-    findings = await diagnose(script)
-    assert "the connection to 127.0.0.1:" in findings.of("protocol").found
-    assert findings.of("protocol").remedy == (
-        "Check that this is the RT server's port (3020 is First Principles, 3030 WaveFront) and that the "
-        "server accepts one more client. Close other programs that are connected to it, and read the "
-        "server's own messages."
-    )
-
-
-async def test_a_server_that_refuses_to_stream_fails() -> None:
-    findings = await diagnose(replying(parameters(), refused="StreamFrames"))
-    assert "refuses every form of the StreamFrames command" in findings.of("protocol").found
-    assert findings.of("protocol").remedy == "Enable the real-time output in the server's settings."
-
-
-async def test_commands_that_the_server_refuses_are_listed() -> None:
-    frames = [markers_frame(number, (1.0, 2.0, 3.0)) for number in range(0, 100, 10)]
-    script = replying(b"", *frames, refused="Version|SendParameters")
-    findings = await diagnose(script)
-    assert findings.of("protocol").result is Result.PASSING
-    assert findings.of("protocol").found == (
-        "the server is an RT server; the gateway works around this: the server refused Version 1.0: "
-        "err-unknown command; the server refused SendParameters: err-unknown command"
-    )
-    assert findings.not_tested("parameters") == {
-        "the server refused SendParameters: err-unknown command; names, units and configured rates are "
-        "unknown"
-    }
-    assert findings.of("frames").result is Result.PASSING
+async def test_what_needs_parameters_is_not_tested_without_them() -> None:
+    findings = await diagnose(replying(b"", *FRAMES, refused="SendParameters"))
+    [reason] = findings.not_tested("parameters")
+    assert reason.endswith("err-unknown command; names, units and configured rates are unknown")
+    assert findings.of("frames").result is PASSING
     assert findings.not_tested("rate") == {"3d 100 Hz; the server's parameters have no rate to compare with"}
 
 
-async def test_unreadable_parameters_fail() -> None:
-    findings = await diagnose(replying(packet(2, "no xml"), markers_frame(1, (1.0, 2.0, 3.0))))
-    assert findings.of("parameters").found.startswith("the server's XML cannot be read: ")
-    assert findings.of("parameters").remedy == (
-        "The gateway publishes data without names and units. Look for unusual characters in the names of "
-        "markers and tools on the server, or update the server's software."
-    )
-    assert findings.of("frames").result is Result.PASSING
-
-
-async def test_a_repair_of_the_parameters_is_reported() -> None:
-    findings = await diagnose(replying(packet(2, "<RT_Parameters><The_3D></The_6D>"), markers_frame(1)))
-    assert findings.of("parameters").result is Result.PASSING
-    assert "(repaired: " in findings.of("parameters").found
-
-
-async def test_an_unknown_unit_of_length_is_a_warning() -> None:
-    markers = "<The_3D><Frequency>100</Frequency><Unit>furlong</Unit><Markers/></The_3D>"
-    server = replying(parameters(markers), markers_frame(1))
-    finding = (await diagnose(server)).of("parameters")
-    assert (finding.result, finding.found) == (
-        Result.WARNING,
-        "0 markers; unit of length 'furlong' is unknown: no positions in metres are published",
-    )
-    assert finding.remedy == (
-        "Set it to mm or m in the server, or set transform.units of the source in the configuration."
-    )
-    corrected = await diagnose(server, transform={"units": "mm"})
-    assert corrected.of("parameters").result is Result.PASSING
-
-
-async def test_no_measurement_fails() -> None:
-    async with Simulator(SyntheticScene(markers=1)) as simulator:
-        simulator.stop_measurement()
-        findings = await run_doctor(lab(simulator.port))
-    assert findings.of("frames").found == "the server reports that no measurement is running"
-    assert findings.of("frames").remedy == (
-        "Start a measurement on the server; the gateway then streams automatically."
-    )
+async def test_what_needs_frames_is_not_tested_without_them() -> None:
+    findings = await diagnose(replying(parameters(), NO_DATA))
     assert findings.failing() == ["frames"]
     assert findings.not_tested("rate") == {"too few frames to measure the rate"}
     assert findings.not_tested("visibility") == {"no markers or tools arrived"}
 
 
-async def test_no_frames_without_a_reason_fail() -> None:
-    findings = await diagnose(replying(parameters()), StreamSettings(components=(MARKERS, TOOLS)))
-    assert findings.of("frames").found == (
-        "no frame of stream 3d 6d arrived, and the server did not report that no measurement is running"
-    )
-    assert findings.of("frames").remedy.startswith("Check that the server shows live data")
-
-
-async def test_no_event_does_not_fail() -> None:
-    findings = await diagnose(replying(parameters()), StreamSettings(components=(EVENT,)))
-    assert findings.not_tested("frames") == {"no event occurred during the check"}
-    assert findings.failing() == []
-
-
-async def test_malformed_frames_fail() -> None:
-    good = markers_frame(1, (1.0, 2.0, 3.0))
-    findings = await diagnose(replying(parameters(), good, packet(3, good[8:-4])))
-    assert findings.of("frames").found.startswith("1 of 2 frames are malformed: component 1 of 1")
-    assert findings.of("frames").remedy == (
-        "The gateway drops malformed frames. Update the server's software, or report this to its maker."
-    )
-
-
-async def test_a_component_in_the_parameters_but_not_in_the_frames_fails() -> None:
-    xml = parameters(MARKERS_XML.format(100), TOOLS_XML)
-    stream = StreamSettings(components=(MARKERS, TOOLS))
-    findings = await diagnose(replying(xml, markers_frame(1, (1.0, 2.0, 3.0))), stream)
-    assert findings.of("frames").found == (
-        "the server's parameters list items of 6d, but no frame contains 6d"
-    )
-    assert findings.of("frames").remedy == (
-        "Enable the real-time output of 6d on the server, or remove 6d from the stream's components."
-    )
-
-
-async def test_a_connection_that_ends_during_streaming_fails() -> None:
-    async def script(client: Client) -> None:
-        def answer(command: str) -> bytes:
-            if command.startswith("StreamFrames"):
-                asyncio.get_running_loop().call_later(0.05, client.cut)
-            return ok(f"OK-{command}")
-
-        await client.commands(answer)
-
-    findings = await diagnose(script)
-    assert (
-        findings.of("frames").found == "the server closed the connection while the doctor waited for frames"
-    )
-    assert findings.of("frames").remedy == (
-        "Check whether another program takes over the stream, and read the server's own messages."
-    )
+async def test_frames_that_stop_while_the_doctor_watches_fail() -> None:
+    async with ScriptedServer(streaming(XML[100], markers, stops_after=30)) as server:
+        finding = (await run_doctor(lab(server.port), seconds=1.5)).of("frames")
+    assert finding.result is FAILING
+    assert finding.found.startswith("the server stopped sending after 30 frames: none arrived for ")
+    assert finding.remedy.startswith("Check whether the server's own display has stopped, too")
 
 
 async def test_a_component_limited_by_a_slower_one_fails() -> None:
     scene = SyntheticScene(markers=1, tools=0, analog=2, plates=1, rate_hz=100, analog_rate_hz=1000)
     async with Simulator(scene) as simulator:
-        findings = await run_doctor(lab(simulator.port))
-    assert findings.of("rate").found == "3d 100 of 100, analog 100 of 1000, force 100 of 1000 Hz"
-    assert findings.of("rate").remedy == (
-        "A stream is as fast as its slowest component. Move analog and force to a stream of their own, or "
-        "configure a lower rate for this stream."
-    )
-
-
-async def test_a_server_that_is_too_slow_fails() -> None:
-    script = streaming(parameters(MARKERS_XML.format(500)), lambda number: markers_frame(number, (1, 2, 3)))
-    findings = await diagnose(script)
-    assert findings.of("rate").found == "3d 100 of 500 Hz"
-    assert findings.of("rate").remedy == (
-        "The server or the network is too slow. Check the server's real-time processing rate and load, the "
-        "cable and the switch, or configure a lower rate for the stream."
-    )
+        finding = (await run_doctor(lab(simulator.port))).of("rate")
+    assert finding.found == "3d 100 of 100, analog 100 of 1000, force 100 of 1000 Hz"
+    assert "Move analog and force to a stream of their own" in finding.remedy
 
 
 @pytest.mark.parametrize(
-    ("rate", "text"), [(FrequencyDivisor(4), "3d 50 of 50 Hz"), (Frequency(20), "3d 20 of 20 Hz")]
+    ("rate", "found"), [(FrequencyDivisor(4), "3d 50 of 50 Hz"), (Frequency(20), "3d 20 of 20 Hz")]
 )
-async def test_a_configured_lower_rate_passes(rate: Rate, text: str) -> None:
+async def test_a_configured_lower_rate_passes(rate: Rate, found: str) -> None:
     scene = SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200)
     async with Simulator(scene) as simulator:
-        findings = await run_doctor(lab(simulator.port, StreamSettings(components=(MARKERS,), rate=rate)))
-    assert (findings.of("rate").result, findings.of("rate").found) == (Result.PASSING, text)
+        finding = (await run_doctor(lab(simulator.port, *of(MARKERS, rate=rate)))).of("rate")
+    assert (finding.result, finding.found) == (PASSING, found)
 
 
-async def test_constant_time_stamps_are_ignored() -> None:
-    frame = markers_frame(7, (1.0, 2.0, 3.0))
-    findings = await diagnose(streaming(parameters(MARKERS_XML.format(1)), lambda _number: frame))
-    # The server announces 1 Hz; by arrival times, the rate is about 100 Hz.
-    assert findings.of("rate").result is Result.FAILING
-    assert "the server sends more frames than its parameters announce" in findings.of("rate").found
+async def test_a_stream_of_auto_without_its_component_is_a_note() -> None:
+    """With 100 and 200 Hz, ``auto`` opens a second connection for 6d. The server sends only 3d there, too."""
+    findings = await diagnose(streaming(FASTER_TOOLS, markers), streams="auto")
+    frames = [(each.result, each.stream) for each in findings.all_of("frames")]
+    assert frames == [(PASSING, "3d analog force event"), (NOTE, "6d")]
+    assert findings.failing() == []
 
 
-async def test_time_stamps_that_are_not_in_microseconds_are_ignored() -> None:
-    # The server's clock advances 1 ms per frame, this computer's 10 ms.
-    script = streaming(
-        parameters(MARKERS_XML.format(900)), lambda number: markers_frame(number, (1, 2, 3)), step=1
+async def test_components_that_share_the_only_connection_are_a_warning() -> None:
+    """``streams: auto`` cannot do better with a server that serves one client only (field note 21)."""
+    script = streaming(FASTER_TOOLS, markers_and_tools)
+    is_first = iter([True])
+
+    async def serve_one(client: Client) -> None:
+        if next(is_first, False):
+            await script(client)
+        else:
+            client.cut()
+
+    finding = (await diagnose(serve_one, streams="auto")).of("rate")
+    assert finding.result is WARNING
+    assert finding.found == (
+        "3d 100 of 100, 6d 100 of 200 Hz, because the server accepts one connection only"
     )
-    findings = await diagnose(script)
-    # The server announces 900 Hz; by arrival times, the rate is about 100 Hz.
-    assert findings.of("rate").result is Result.FAILING
-
-
-async def test_markers_out_of_view_fail() -> None:
-    gone = markers_frame(1, (NAN, NAN, NAN), (NAN, NAN, NAN))
-    findings = await diagnose(replying(parameters(MARKERS_XML.format(100)), gone))
-    assert findings.of("visibility").found == "in view: markers 0%"
-    assert findings.of("visibility").remedy == (
-        "Check that the cameras see the volume, that the markers are inside it and not covered, and that the "
-        "strobers are on and charged."
-    )
-
-
-async def test_markers_that_are_never_in_view_are_named() -> None:
-    frames = [markers_frame(n, (NAN, NAN, NAN), (1.0, 2.0, 3.0), (NAN, NAN, NAN)) for n in (1, 2)]
-    frames += [markers_frame(n, (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), (NAN, NAN, NAN)) for n in (3, 4)]
-    labels = MARKERS_XML.format(1000)
-    findings = await diagnose(replying(parameters(labels), *frames))
-    assert findings.of("visibility").found == "in view: markers 50% (never number 3)"
-    findings = await diagnose(replying(parameters(labels), *frames[:2]))
-    assert findings.of("visibility").found == "in view: markers 33% (never hip, number 3)"
-
-
-async def test_tools_out_of_view_fail() -> None:
-    findings = await diagnose(replying(parameters(TOOLS_XML), tools_frame(1, NAN), tools_frame(2, NAN)))
-    assert findings.of("visibility").found == "in view: tools 0%"
-    assert findings.of("visibility").result is Result.FAILING
+    assert finding.remedy.endswith("request nothing else: streams: [{components: [6d]}].")

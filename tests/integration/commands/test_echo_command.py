@@ -1,12 +1,10 @@
 """``rtc3d-gateway echo`` as a program of its own: what does not exist, silence, single tools and rates."""
 
 import asyncio
-import itertools
 import json
 import subprocess
 import sys
 from collections.abc import AsyncIterator
-from typing import NamedTuple
 
 import pytest
 import pytest_asyncio
@@ -17,30 +15,19 @@ from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.command_process import run
+from tests.integration.commands.test_params_command import Lab
 from tests.networks import free_endpoint, lcm_url, open_zenoh
 from tests.pseudo_terminals import in_terminal
-from tests.queried_gateway import run_gateway
+from tests.queried_gateway import ParameterServer, run_gateway
 from tests.waiting import wait_until_async
 
 pytestmark = [pytest.mark.netns, pytest.mark.asyncio(loop_scope="module")]
-sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
-
-
-class Place(NamedTuple):
-    """Where the messages of the gateway are."""
-
-    endpoint: str
-    url: str
-
-
-def options(at: Place, side: str) -> list[str]:
-    return ["--lcm", "--url", at.url] if side == "lcm" else ["--connect", at.endpoint]
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def lab() -> AsyncIterator[Place]:
+async def lab() -> AsyncIterator[Lab]:
     """A gateway with tool poses and one stream of 3d, 6d and event, from a simulator with two tools."""
-    place = Place(free_endpoint(), lcm_url())
+    place = Lab(ParameterServer(), free_endpoint(), lcm_url())
     scene = SyntheticScene(markers=2, tools=2, analog=0, plates=0, rate_hz=100)
     components = (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT)
     async with (
@@ -59,7 +46,7 @@ async def lab() -> AsyncIterator[Place]:
         yield place
 
 
-async def test_what_does_not_exist_is_an_error_with_what_exists(lab: Place) -> None:
+async def test_what_does_not_exist_is_an_error_with_what_exists(lab: Lab) -> None:
     """A typing error in an option must not look like silence; the message helps to correct it."""
     no_force = "no force from lab; accepted for --component: 3d, 6d, event, status, clock or parameters\n"
     cases = {
@@ -68,16 +55,14 @@ async def test_what_does_not_exist_is_an_error_with_what_exists(lab: Place) -> N
         ("--component", "force", "--hz"): no_force,
         ("--component", "6d/Nothing"): "no gateway has a tool 'Nothing'; tools found: Tool 1, Tool 2\n",
     }
-    commands = list(itertools.product(cases, ("zenoh", "lcm")))
-    ended = await asyncio.gather(*(run("echo", *case, *options(lab, side)) for case, side in commands))
-    for (case, side), done in zip(commands, ended, strict=True):
-        assert done == (3, "", cases[case]), (case, side)
+    ended = await asyncio.gather(*(lab.run("echo", *case) for case in cases))
+    for error, done in zip(cases.values(), ended, strict=True):
+        assert done == [(3, "", error)] * 2
 
 
-async def test_silence_of_a_source_is_said_once_with_its_state(lab: Place) -> None:
+async def test_silence_of_a_source_is_said_once_with_its_state(lab: Lab) -> None:
     """The user learns that the gateway runs, and that only this component is silent."""
-    command = ("echo", "--component", "c3d", "--seconds", "9")
-    for done in await asyncio.gather(*(run(*command, *options(lab, side)) for side in ("zenoh", "lcm"))):
+    for done in await lab.run("echo", "--component", "c3d", "--seconds", "9"):
         assert (done.status, done.stdout) == (0, "")
         assert done.stderr.startswith("nothing heard of c3d although a gateway runs (lab: streaming ")
         assert done.stderr.count("\n") == 1
@@ -116,34 +101,32 @@ async def test_on_lcm_the_sentence_is_that_of_params_too() -> None:
     assert echo.stderr == params.stderr != ""
 
 
-@sides
-async def test_the_poses_of_one_tool_are_printed(lab: Place, side: str) -> None:
+async def test_the_poses_of_one_tool_are_printed(lab: Lab) -> None:
     """A tool of a name with a space is found on either network; nothing of other tools is printed."""
-    done = await run("echo", "--component", "6d/Tool 2", "--count", "3", *options(lab, side))
-    assert (done.status, done.stderr) == (0, "")
-    name = "MOCAP_LAB_6D_TOOL_2" if side == "lcm" else "mocap/lab/6d/Tool%202"
-    assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [name] * 3
+    ended = await lab.run("echo", "--component", "6d/Tool 2", "--count", "3")
+    for name, done in zip(("mocap/lab/6d/Tool%202", "MOCAP_LAB_6D_TOOL_2"), ended, strict=True):
+        assert (done.status, done.stderr) == (0, "")
+        assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [name] * 3
 
 
-@sides
-async def test_rates_count_the_messages_of_the_component(lab: Place, side: str) -> None:
+async def test_rates_count_the_messages_of_the_component(lab: Lab) -> None:
     """Ten messages end the command however slow the machine is; only those of 3d are in the figures."""
-    done = await run("echo", "--hz", "--json", "--count", "10", "--component", "3d", *options(lab, side))
-    assert (done.status, done.stderr) == (0, "")
-    last = json.loads(done.stdout.splitlines()[-1])
-    assert last["window"] == 10
-    assert last["rate_hz"] > 0
+    for done in await lab.run("echo", "--hz", "--json", "--count", "10", "--component", "3d"):
+        assert (done.status, done.stderr) == (0, "")
+        last = json.loads(done.stdout.splitlines()[-1])
+        assert last["window"] == 10
+        assert last["rate_hz"] > 0
 
 
-async def test_on_a_terminal_the_table_of_rates_is_refreshed_in_place(lab: Place) -> None:
+async def test_on_a_terminal_the_table_of_rates_is_refreshed_in_place(lab: Lab) -> None:
     """The cursor goes up to write the table again."""
     with in_terminal("echo", "--hz", "--connect", lab.endpoint) as terminal:
         await asyncio.to_thread(terminal.wait_for, lambda text: "mocap/lab/3d" in text and "\x1b[1A" in text)
 
 
-async def test_fewer_messages_than_count_are_status_1_with_hz_too(lab: Place) -> None:
+async def test_fewer_messages_than_count_are_status_1_with_hz_too(lab: Lab) -> None:
     """A script notices that the data did not come."""
-    arguments = ("--component", "status", "--count", "1000", "--seconds", "1", *options(lab, "zenoh"))
+    arguments = ("--component", "status", "--count", "1000", "--seconds", "1", *lab.options("zenoh"))
     done = await run("echo", "--hz", *arguments)
     assert done.status == 1
     assert "of 1000 messages arrived within 1 s" in done.stderr

@@ -1,4 +1,4 @@
-"""``--quiet`` of the commands that show their progress on a terminal, and of the doctor."""
+"""``--quiet`` of the commands that show their progress on a terminal."""
 
 import os
 import pty
@@ -8,7 +8,6 @@ from typing import Final
 
 import pytest
 
-from tests.command_process import Completed, run_command
 from tests.gateway_process import PROGRAM
 from tests.takes import description, markers, write_take
 
@@ -46,29 +45,8 @@ def written_to_the_terminal(folder: Path, *arguments: str) -> bytes:
     ],
 )
 def test_quiet_commands_show_no_progress(tmp_path: Path, arguments: tuple[str, ...]) -> None:
-    write_take(
-        tmp_path / "take.lcmlog",
-        [description(), *(markers(3, sequence) for sequence in range(10))],
-    )
+    write_take(tmp_path / "take.lcmlog", [description(), *(markers(3, sequence) for sequence in range(10))])
     assert HIDDEN_CURSOR not in written_to_the_terminal(tmp_path, *arguments, "--quiet")
     for file in tmp_path.glob("take*.csv"):
         file.unlink()
     assert HIDDEN_CURSOR in written_to_the_terminal(tmp_path, *arguments)
-
-
-def doctor(*arguments: str) -> Completed:
-    return run_command("doctor", "--server", "127.0.0.1:1", "--seconds", "0.1", *arguments)
-
-
-@pytest.mark.netns
-def test_options_of_the_doctor_for_less_and_for_more_text() -> None:
-    """-q prints only what needs attention, -v logs what is done, and neither is the default."""
-    shown = doctor("-q")
-    assert shown.status == 1
-    marks = {
-        line.split()[0] for line in shown.stdout.splitlines() if line.startswith("  ") and line[2] != " "
-    }
-    assert "FAIL" in marks
-    assert marks <= {"FAIL", "warn"}
-    assert "DEBUG" in doctor("-v").stderr
-    assert not doctor().stderr

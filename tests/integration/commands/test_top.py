@@ -15,7 +15,6 @@ import pytest
 import yaml
 
 from gateway.top.pages import TWO_GATEWAYS
-from tests.command_in_process import run_in_process
 from tests.command_process import Completed, run_command
 from tests.gateway_process import program, simulator
 from tests.networks import free_endpoint, lcm_url, open_zenoh, zenoh_keys
@@ -183,14 +182,6 @@ def test_a_source_that_nobody_serves_is_named_with_those_that_exist(lab: Lab) ->
     for ended in partly:
         assert (ended.status, ended.stderr) == (STATUS_3, error)
         assert "Marker 12" in ended.stdout
-
-
-@pytest.mark.parametrize(
-    "options", [("--lcm", "--connect", "tcp/127.0.0.1:1"), ("--url", "udpm://239.255.76.67:7667")]
-)
-def test_options_of_the_other_network_are_status_2(options: tuple[str, ...]) -> None:
-    """An option that would have no effect is a mistake."""
-    assert run_in_process("top", *options).returncode == 2
 
 
 def test_a_locale_other_than_utf_8_gets_tables_without_escapes(lab: Lab) -> None:

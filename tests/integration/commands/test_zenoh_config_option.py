@@ -27,34 +27,21 @@ def router(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iter
         yield secure_router
 
 
-def test_echo_and_params_work_with_a_viewers_certificate(router: SecureRouter, tmp_path: Path) -> None:
-    file = tmp_path / "viewer.json5"
-    file.write_text(router.client("viewer"), encoding="utf-8")
-    echo = run_command(
-        "echo", "--zenoh-config", str(file), "--component", "3d", "--count", "2", "--seconds", "9"
-    )
-    assert (echo.status, echo.stderr) == (0, "")
-    assert len(echo.stdout.splitlines()) == 2
-    params = run_command("params", "3d", "--zenoh-config", str(file), "--json")
-    assert (params.status, params.stderr) == (0, "")
-    assert '"lab"' in params.stdout
-
-
 def test_connect_replaces_the_address_in_the_file(router: SecureRouter, tmp_path: Path) -> None:
+    """With a viewer's certificate, every command works."""
     file = tmp_path / "viewer.json5"
     file.write_text(router.client("viewer", (f"tls/127.0.0.1:{router.port}", "tls/127.0.0.1:9")))
-    arguments = ("params", "3d", "--zenoh-config", str(file))
-    assert run_command(*arguments, "--timeout", "2").status == 3
-    connect = ("--connect", f"tls/127.0.0.1:{router.port}")
-    assert run_command(*arguments, *connect).status == 0
-    assert run_command("list", "--zenoh-config", str(file), *connect).stdout.startswith("lab\t")
-    echo = ("echo", "--zenoh-config", str(file), "--component", "3d", "--count", "1", "--seconds", "20")
-    assert run_command(*echo, *connect).status == 0
-    unknown = run_command(*echo, *connect, "--source", "hall")
-    assert (unknown.status, unknown.stderr) == (
-        3,
-        "no gateway serves source 'hall'; sources found: lab\n",
-    )
+    config, connect = ("--zenoh-config", str(file)), ("--connect", f"tls/127.0.0.1:{router.port}")
+    assert run_command("params", *config, "--timeout", "2").status == 3
+    params = run_command("params", "3d", *config, *connect, "--json")
+    assert (params.status, params.stderr) == (0, "")
+    assert '"lab"' in params.stdout
+    assert run_command("list", *config, *connect).stdout.startswith("lab\t")
+    echo = ("echo", *config, *connect, "--component", "3d", "--count", "2", "--seconds", "20")
+    printed = run_command(*echo)
+    assert (printed.status, printed.stderr, len(printed.stdout.splitlines())) == (0, "", 2)
+    unknown = run_command(*echo, "--source", "hall")
+    assert unknown == (3, "", "no gateway serves source 'hall'; sources found: lab\n")
 
 
 def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:

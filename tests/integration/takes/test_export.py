@@ -1,24 +1,28 @@
 """``rtc3d-gateway export`` as a user types it: what it prints, and which files are there afterwards."""
 
+import os
 import resource
 import signal
 import subprocess
+from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.simulator.synthetic import SyntheticScene
-from tests.command_in_process import Ended, run_in_process
+from tests.command_in_process import run_in_process
 from tests.gateway_process import PROGRAM
+from tests.networks import free_endpoint, free_port, zenoh_keys
 from tests.recorded_scenes import record_scene
 from tests.takes import frame, parameters, write_take
 from tests.unit.export.exported import read_ezc3d
 from tests.waiting import wait_until
 
 SCENE = SyntheticScene(markers=20, tools=0, analog=8, plates=1, rate_hz=100, analog_rate_hz=1000)
-EXTENSIONS = (".c3d", ".trc", ".csv", ".mcap")
 
 
 @pytest.fixture(scope="module")
@@ -26,118 +30,76 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_scene(tmp_path_factory.mktemp("take") / "walk.lcmlog", SCENE, 500)
 
 
-def export(*arguments: Path | str, max_file_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
-    def limit_files() -> None:
-        if max_file_bytes is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (max_file_bytes, max_file_bytes))
-
-    return subprocess.run(
-        [*PROGRAM, "export", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        preexec_fn=limit_files,
-    )
-
-
-def refused(*arguments: Path | str) -> Ended:
-    """Run an export that is refused before it writes."""
-    return run_in_process("export", *arguments)
-
-
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
 def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -> None:
-    done = export(take, tmp_path / "walk.c3d")
-    assert (done.returncode, done.stderr) == (0, "")
+    done = run_in_process("export", take, tmp_path / "walk.c3d")
     size = (tmp_path / "walk.c3d").stat().st_size
-    assert done.stdout == f"{tmp_path}/walk.c3d ({size / 1e6:.1f} MB)\n"
-    done = export(take, tmp_path / "part.C3D", "--from", "1.001", "--to", "2.001")
-    assert done.returncode == 0
-    assert "note: " in done.stderr
-    assert read_ezc3d(tmp_path / "part.C3D")["data"]["points"].shape[2] in {99, 100}
-
-
-def test_an_unknown_extension_is_an_error_that_lists_the_known_ones(take: Path, tmp_path: Path) -> None:
-    for name in ("walk.xyz", "walk"):
-        done = refused(take, tmp_path / name)
-        assert (done.returncode, done.stdout) == (1, "")
-        assert done.stderr.endswith(f"{name} has no known extension; choose .c3d, .trc, .csv or .mcap\n")
-    assert names(tmp_path) == []
-
-
-@pytest.mark.parametrize("extension", EXTENSIONS)
-def test_what_exists_is_never_overwritten(take: Path, tmp_path: Path, extension: str) -> None:
-    existing = tmp_path / ("walk-analog.csv" if extension == ".csv" else f"walk{extension}")
-    existing.write_text("mine")
-    done = refused(take, tmp_path / f"walk{extension}")
-    assert (done.returncode, done.stdout) == (1, "")
-    assert f"{existing} exists already, and nothing is overwritten" in done.stderr
-    assert names(tmp_path) == [existing.name]
-    assert existing.read_text() == "mine"
-
-
-def test_an_export_that_is_stopped_leaves_no_file(tmp_path: Path) -> None:
-    scene = SyntheticScene(markers=300, tools=0, analog=200, plates=0, rate_hz=100, analog_rate_hz=1000)
-    record_scene(tmp_path / "long.lcmlog", scene, 1000)
-    process = subprocess.Popen([*PROGRAM, "export", tmp_path / "long.lcmlog", tmp_path / "long.csv"])
-    wait_until(lambda: len(names(tmp_path)) > 1)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=30) == 130
-    assert names(tmp_path) == ["long.lcmlog"]
-
-
-def test_a_full_disk_leaves_no_file(take: Path, tmp_path: Path) -> None:
-    """Half a file would be taken for the whole one."""
-    done = export(take, tmp_path / "walk.csv", max_file_bytes=50_000)
-    assert (done.returncode, done.stdout) == (1, "")
-    [*notes, error] = done.stderr.splitlines()
-    assert error.endswith("cannot be written: File too large; nothing was written")
-    assert all(note.startswith("note: ") for note in notes)
-    assert names(tmp_path) == []
-
-
-def test_bad_input_is_a_sentence(tmp_path: Path) -> None:
-    """The user learns which file is meant, without a traceback."""
-    foreign, empty, folder = tmp_path / "a.lcmlog", tmp_path / "b.lcmlog", tmp_path / "folder"
-    foreign.write_bytes(b"no event log" * 1000)
-    empty.touch()
-    folder.mkdir()
-    for take in (foreign, empty, folder, tmp_path / "missing.lcmlog"):
-        done = refused(take, tmp_path / "walk.c3d")
-        assert (done.returncode, done.stdout) == (1, "")
-        assert str(take) in done.stderr
-        assert len(done.stderr.splitlines()) == 1
-    assert not list(tmp_path.glob("*walk*"))
-
-
-def test_a_damaged_take_is_exported_with_a_note(take: Path, tmp_path: Path) -> None:
-    """What can be read is worth having; the user must know that it is not all."""
+    assert done == (0, f"{tmp_path}/walk.c3d ({size / 1e6:.1f} MB)\n", "")
     content = bytearray(take.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 3000] = bytes(3000)
-    damaged = tmp_path / "damaged.lcmlog"
-    damaged.write_bytes(content[:-100])
-    done = run_in_process("export", damaged, tmp_path / "walk.mcap")
+    (tmp_path / "damaged.lcmlog").write_bytes(content[:-100])
+    done = run_in_process("export", tmp_path / "damaged.lcmlog", tmp_path / "DAMAGED.MCAP")
     assert done.returncode == 0
     assert "note: the take is damaged at 2 places: " in done.stderr
 
 
-def test_a_wrong_source_or_time_is_an_error(take: Path, tmp_path: Path) -> None:
-    for options, text in (
-        (("--source", "studio"), "has no source 'studio'; its sources are: lab"),
-        (("--from", "3", "--to", "2"), "--from 3 is not before --to 2"),
-        (("--from", "3000"), "has no markers"),
-    ):
-        assert text in refused(take, tmp_path / "a.trc", *options).stderr
-    assert names(tmp_path) == []
+@pytest.mark.parametrize(
+    ("name", "options", "problem"),
+    [
+        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .csv or .mcap"),
+        ("walk", (), "walk has no known extension"),
+        *((f"walk{each}", (), "exists already, and nothing is overwritten") for each in (".c3d", ".csv")),
+        *((f"walk{each}", (), "exists already, and nothing is overwritten") for each in (".trc", ".mcap")),
+        ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written"),
+        ("a.trc", ("--source", "studio"), "has no source 'studio'; its sources are: lab"),
+        ("a.trc", ("--from", "3", "--to", "2"), "--from 3 is not before --to 2"),
+        ("a.trc", ("--from", "3000"), "has no markers"),
+    ],
+)
+def test_what_cannot_be_exported_leaves_no_file(
+    take: Path, tmp_path: Path, name: str, options: tuple[str, ...], problem: str
+) -> None:
+    existing = [f"walk{extension}" for extension in ("-analog.csv", ".c3d", ".mcap", ".trc")]
+    for each in existing:
+        (tmp_path / each).write_text("mine")
+    done = run_in_process("export", take, tmp_path / name, *options)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert problem in done.stderr
+    assert names(tmp_path) == existing
+    assert {(tmp_path / each).read_text() for each in existing} == {"mine"}
 
 
-def test_a_folder_that_is_missing_is_an_error(take: Path, tmp_path: Path) -> None:
-    done = refused(take, tmp_path / "missing/walk.csv")
-    assert done.stderr.endswith("cannot be written: No such file or directory; nothing was written\n")
+def test_bad_input_is_a_sentence_with_the_name_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "a.lcmlog").write_bytes(b"no event log" * 1000)
+    (tmp_path / "b.lcmlog").touch()
+    (tmp_path / "folder").mkdir()
+    for name in ("a.lcmlog", "b.lcmlog", "folder", "missing.lcmlog"):
+        done = run_in_process("export", tmp_path / name, tmp_path / "walk.c3d")
+        assert (done.returncode, done.stdout) == (1, "")
+        assert str(tmp_path / name) in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.glob("*walk*"))
+
+
+def test_an_export_that_is_stopped_or_whose_disk_is_full_leaves_no_file(tmp_path: Path) -> None:
+    """Half a file would be taken for the whole one."""
+    scene = SyntheticScene(markers=300, tools=0, analog=200, plates=0, rate_hz=100, analog_rate_hz=1000)
+    record_scene(tmp_path / "long.lcmlog", scene, 1000)
+    command = [*PROGRAM, "export", str(tmp_path / "long.lcmlog"), str(tmp_path / "long.csv")]
+    with subprocess.Popen(command) as process:
+        wait_until(lambda: len(names(tmp_path)) > 1)
+        process.send_signal(signal.SIGINT)
+    assert process.returncode == 130
+    assert names(tmp_path) == ["long.lcmlog"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as full:
+        resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
+        _, stderr = full.communicate(timeout=60)
+    assert full.returncode == 1
+    assert stderr.endswith("cannot be written: File too large; nothing was written\n")
+    assert names(tmp_path) == ["long.lcmlog"]
 
 
 def test_names_from_a_server_cannot_leave_the_folder_or_control_the_terminal(tmp_path: Path) -> None:
@@ -148,3 +110,52 @@ def test_names_from_a_server_cannot_leave_the_folder_or_control_the_terminal(tmp
     assert done.returncode == 0
     assert "\x1b" not in done.stderr
     assert names(tmp_path) == ["take.lcmlog", "walk.c3d"]
+
+
+@pytest.mark.netns
+@pytest.mark.takes
+def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export(tmp_path: Path) -> None:
+    """The export of its other fields is proved without processes, in tests/unit/export."""
+    original = Path(os.environ["RTC3D_TAKES"]) / "qualisys.c3d"
+    take, copy, config = (tmp_path / name for name in ("take.lcmlog", "copy.c3d", "lab.yaml"))
+    port, endpoint = free_port(), free_endpoint()
+    reconnect = {"max_delay_s": 0.2}
+    configuration = {
+        "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, "reconnect": reconnect}],
+        "zenoh": {"config": zenoh_keys("peer", listen=endpoint)},
+        "lcm": {"enabled": False},
+        "metrics": {"enabled": False},
+    }
+    config.write_text(yaml.safe_dump(configuration))
+
+    with ExitStack() as stack:
+
+        def start(*arguments: str | Path) -> subprocess.Popen[bytes]:
+            file = stack.enter_context((tmp_path / f"{arguments[0]}.log").open("wb"))
+            process = subprocess.Popen([*PROGRAM, *arguments], stdout=file, stderr=subprocess.STDOUT)
+            stack.callback(process.wait, 30)
+            stack.callback(process.send_signal, signal.SIGINT)
+            return process
+
+        def wait_for(command: str, text: str) -> None:
+            wait_until(lambda: text in (tmp_path / f"{command}.log").read_text())
+
+        start("run", "--config", config)
+        wait_for("run", "zenoh: the session is open")
+        record = start("record", take, "--connect", endpoint)
+        wait_for("record", "gets no frames")  # it receives the gateway's status
+        start("simulate", "--c3d", original, "--once", "--port", str(port))
+        expected_counts = {b"MOCAP_LAB_3D": 340, b"MOCAP_LAB_ANALOG": 3400}
+        for channel, count in expected_counts.items():
+            wait_until(lambda: take.exists() and take.read_bytes().count(channel) == count, 60)  # noqa: B023
+        record.send_signal(signal.SIGINT)
+        assert record.wait(30) == 0
+    assert run_in_process("export", take, copy).stderr == ""
+    expected, found = (read_ezc3d(path) for path in (original, copy))
+    for group in ("POINT", "ANALOG"):
+        for name in ("LABELS", "RATE"):
+            values = (each["parameters"][group][name]["value"] for each in (found, expected))
+            assert np.array_equal(*values), name
+    for key in ("points", "analogs"):
+        ours, theirs = (np.float32(each["data"][key]) for each in (found, expected))
+        assert np.array_equal(ours, theirs, equal_nan=True)

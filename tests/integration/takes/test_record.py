@@ -1,11 +1,15 @@
-"""``record`` beside gateways on real Zenoh and LCM: what it writes, with a full disk and a restart, too."""
+"""``record`` as a program of its own, beside a gateway or a publisher of the test, on real Zenoh and LCM."""
 
+import os
+import pty
 import re
 import resource
 import signal
 import subprocess
+import sys
+import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,26 +20,100 @@ import yaml
 import zenoh
 
 from gateway.messages.decode import decode, prefix_of
+from gateway.messages.stamp import PREFIX
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
-from gateway.takes.reader import TakeReader
-from tests.gateway_process import program, simulator
-from tests.integration.takes.record_process import (
-    by_channel,
-    events,
-    num_recorded,
-    recording,
-    size,
-)
-from tests.networks import free_endpoint, lcm_url, wait_for_zenoh, zenoh_keys
+from tests.gateway_process import PROGRAM, program, simulator
+from tests.networks import free_endpoint, lcm_url, open_zenoh, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 
-SCENE: Final = ("--rate", "100", "--analog-rate", "500", "--markers", "20", "--analog", "8")
+SCENE: Final = ("--rate", "100", "--analog-rate", "500", "--markers", "20", "--analog", "8", "--tools", "2")
 COMPONENTS: Final = ("3d", "6d", "analog", "force", "event")
+
+
+class Ended(NamedTuple):
+    status: int
+    stdout: str
+    stderr: str
+
+
+class RecordProcess:
+    """A running ``record``."""
+
+    def __init__(self, process: subprocess.Popen[str], stderr: Path) -> None:
+        self.process = process
+        self._stderr = stderr
+
+    def wait_for(self, text: str) -> None:
+        wait_until(lambda: text in self._stderr.read_text())
+
+    def limit_files(self, num_bytes: int) -> None:
+        """Let the kernel refuse longer files, as on a full disk."""
+        _, hard = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (num_bytes, hard))
+
+    def end(self, number: signal.Signals | None = signal.SIGINT) -> Ended:
+        """Wait for the end of the program, after a signal if given."""
+        if number is not None:
+            self.process.send_signal(number)
+        stdout, _ = self.process.communicate(timeout=60)
+        stderr = self._stderr.read_text()
+        assert "Traceback" not in stderr + stdout
+        assert "defect" not in stderr
+        return Ended(self.process.returncode, stdout, stderr)
+
+
+@contextmanager
+def recording(target: Path, *options: str, command: tuple[str, ...] = PROGRAM) -> Iterator[RecordProcess]:
+    """Run ``record`` to a file or folder until the end of the block; its messages are beside it."""
+    stderr = target.parent / "stderr"
+    environment = os.environ | {"COLUMNS": "200"}
+    with (
+        stderr.open("w") as file,
+        subprocess.Popen(
+            [*command, "record", str(target), *options],
+            stdout=subprocess.PIPE,
+            stderr=file,
+            text=True,
+            env=environment,
+        ) as process,
+    ):
+        try:
+            yield RecordProcess(process, stderr)
+        finally:
+            process.kill()
+
+
+def size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def num_recorded(path: Path, channel: str) -> int:
+    """Return how many messages of a channel a recording has so far."""
+    return path.read_bytes().count(channel.encode()) if path.exists() else 0
+
+
+def events(path: Path) -> list[tuple[str, bytes]]:
+    """Return the channels and messages of a file, which must not be damaged."""
+    reader = EventLogReader(path)
+    found = [(event.channel, event.message) for event in reader.events()]
+    assert not reader.damage
+    return found
+
+
+def by_channel(path: Path) -> dict[str, list[bytes]]:
+    found: defaultdict[str, list[bytes]] = defaultdict(list)
+    for channel, message in events(path):
+        found[channel].append(message)
+    return found
+
+
+# A gateway -----------------------------------------------------------------------------------
 
 
 class Lab(NamedTuple):
@@ -43,12 +121,10 @@ class Lab(NamedTuple):
 
     options: tuple[str, ...]
     published: dict[str, list[bytes]]
-    start: Callable[[], None]
-    stop: Callable[[], None]
 
 
 @contextmanager
-def lab(tmp_path: Path, side: str, *scene: str, **source: Any) -> Iterator[Lab]:
+def lab(folder: Path, side: str = "zenoh", *scene: str, **source: Any) -> Iterator[Lab]:
     endpoint, url = free_endpoint(), lcm_url()
     published: defaultdict[str, list[bytes]] = defaultdict(list)
 
@@ -59,46 +135,28 @@ def lab(tmp_path: Path, side: str, *scene: str, **source: Any) -> Iterator[Lab]:
         published[lcm_channel("MOCAP", "Lab-1", *names)].append(sample.payload.to_bytes())
 
     with ExitStack() as stack:
-        port, _ = stack.enter_context(simulator("--tools", "2", *SCENE, *scene))
+        port, _ = stack.enter_context(simulator(*SCENE, *scene))
+        keys = zenoh_keys("peer", listen=endpoint)
         configuration = {
             "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port, **source}],
-            "zenoh": {
-                "enabled": side == "zenoh",
-                "tool_poses": True,
-                "config": zenoh_keys("peer", listen=endpoint),
-            },
+            "zenoh": {"enabled": side == "zenoh", "tool_poses": True, "config": keys},
             "lcm": {"enabled": side == "lcm", "tool_poses": True, "url": url},
             "metrics": {"enabled": False},
         }
-        (tmp_path / "gateway.yaml").write_text(yaml.safe_dump(configuration))
-
-        running: list[Any] = []
-
-        def start() -> None:
-            gateway = program("run", "--config", str(tmp_path / "gateway.yaml"), stderr=subprocess.DEVNULL)
-            running.append(stack.enter_context(gateway))
-
-        def stop() -> None:
-            process = running.pop()
-            process.kill()
-            process.wait()
-
-        start()
+        (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
+        gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
+        stack.enter_context(gateway)
         if side == "zenoh":
             session = wait_for_zenoh(endpoint)
             stack.callback(session.close)
             session.declare_subscriber("mocap/Lab-1/**", receive_zenoh)
             options: tuple[str, ...] = ("--connect", endpoint)
         else:
-            subscriber = LcmSubscriber(
-                open_lcm(receiving_url(url)),
-                "MOCAP_.+",
-                lambda channel, data: published[channel].append(data),
-            )
-            stack.callback(subscriber.close)
+            receive = lambda channel, data: published[channel].append(data)  # noqa: E731
+            stack.callback(LcmSubscriber(open_lcm(receiving_url(url)), "MOCAP_.+", receive).close)
             options = ("--lcm", "--url", url)
         wait_until(lambda: len(published[lcm_channel("MOCAP", "Lab-1", "3d")]) > 10)
-        yield Lab(options, published, start, stop)
+        yield Lab(options, published)
 
 
 def assert_same_bytes(path: Path, published: dict[str, list[bytes]]) -> None:
@@ -114,45 +172,28 @@ def assert_same_bytes(path: Path, published: dict[str, list[bytes]]) -> None:
 
 
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])
-def test_a_recording_has_what_was_published_and_begins_with_its_description(
-    tmp_path: Path, side: str
-) -> None:
+def test_a_recording_has_what_was_published_with_parameters_first(tmp_path: Path, side: str) -> None:
+    """It begins with its description; the parameters, which LCM repeats every 5 s, are there once each."""
     path = tmp_path / "walk.lcmlog"
-    with lab(tmp_path, side) as gateway, recording(tmp_path, str(path), *gateway.options) as record:
-        wait_until(lambda: size(path) > 500_000)
-        ended = record.end(signal.SIGTERM)
+    renames = ("--fault", "rename,every_s=3,for_s=1.5")
+    with lab(tmp_path, side, *renames, parameters_interval_s=0.3) as gateway:
+        with recording(path, *gateway.options) as record:
+            wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_PARAMETERS") > 3, 60)
+            ended = record.end(signal.SIGTERM)
         assert_same_bytes(path, gateway.published)
     assert ended.status == 0, ended
     assert f"{path}: " in ended.stdout
     assert ended.stdout.endswith("complete: no gaps\n")
     for row in (*COMPONENTS, r"6d/\*", "status", "clock"):
         assert re.search(rf"^Lab-1 +{row} +\d+ .* Hz +- +- +-$", ended.stdout, re.MULTILINE), row
-    (take_channel, take_message), (parameters_channel, parameters_message), *_ = events(path)
-    take, parameters = decode(take_message), decode(parameters_message)
-    assert (take_channel, parameters_channel) == ("MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_PARAMETERS")
+    found = events(path)
+    assert [channel for channel, _ in found[:2]] == ["MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_PARAMETERS"]
+    take = decode(found[0][1])
     assert (take.name, take.source, take.channels) == ("walk", "Lab-1", "MOCAP_LAB_1")
     assert take.server.startswith("127.0.0.1:")
     assert take.gateway_version
-    assert "Marker" in parameters.xml
-    assert parameters.parameters_version == 1
-    assert len(by_channel(path)["MOCAP_LAB_1_PARAMETERS"]) == 1
-    assert {message.source for message in TakeReader(path).messages()} == {"Lab-1"}
-
-
-@pytest.mark.parametrize("side", ["zenoh", "lcm"])
-def test_parameters_are_recorded_when_they_change_and_before_the_frames_they_describe(
-    tmp_path: Path, side: str
-) -> None:
-    path = tmp_path / "walk.lcmlog"
-    # The parameters on LCM are repeated every 5 s.
-    with (
-        lab(tmp_path, side, "--fault", "rename,every_s=3,for_s=1.5", parameters_interval_s=0.3) as gateway,
-        recording(tmp_path, str(path), *gateway.options) as record,
-    ):
-        wait_until(lambda: size(path) and path.read_bytes().count(b"MOCAP_LAB_1_PARAMETERS") > 3, 60)
-        assert record.end().status == 0
     version, known = 0, {}
-    for _, message in events(path)[1:]:
+    for _, message in found[1:]:
         match decode(message):
             case rtc3d.parameters_t() as parameters:
                 assert parameters.parameters_version == version + 1 or not version
@@ -166,7 +207,7 @@ def test_parameters_are_recorded_when_they_change_and_before_the_frames_they_des
 def test_kill_9_costs_at_most_the_last_second(tmp_path: Path) -> None:
     """What the thread has written is in the file, without any end of the program."""
     path = tmp_path / "walk.lcmlog"
-    with lab(tmp_path, "zenoh") as gateway, recording(tmp_path, str(path), *gateway.options) as record:
+    with lab(tmp_path) as gateway, recording(path, *gateway.options) as record:
         wait_until(lambda: size(path) > 600_000)
         killed_utime = prefix_of(gateway.published["MOCAP_LAB_1_3D"][-1]).utime
         record.process.kill()
@@ -181,48 +222,29 @@ def test_kill_9_costs_at_most_the_last_second(tmp_path: Path) -> None:
     assert sequences == [*range(sequences[0], sequences[0] + len(sequences))]
 
 
-def set_largest_file(process: subprocess.Popen[str], num_bytes: int) -> None:
-    _, hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (num_bytes, hard))
-
-
-def test_a_full_disk_is_reported_at_once_and_costs_nothing_if_it_has_room_again(tmp_path: Path) -> None:
+def test_a_full_disk_costs_nothing_if_it_has_room_again_and_is_counted_otherwise(tmp_path: Path) -> None:
     path = tmp_path / "walk.lcmlog"
-    with lab(tmp_path, "zenoh") as gateway, recording(tmp_path, str(path), *gateway.options) as record:
-        set_largest_file(record.process, 300_000)
-        wait_until(lambda: f"{path} cannot be written: File too large" in record.stderr)
-        set_largest_file(record.process, resource.RLIM_INFINITY)
-        wait_until(lambda: "the disk accepts what is written again" in record.stderr)
+    with lab(tmp_path) as gateway, recording(path, *gateway.options) as record:
+        record.limit_files(300_000)
+        record.wait_for(f"{path} cannot be written: File too large")
+        record.limit_files(resource.RLIM_INFINITY)
+        record.wait_for("the disk accepts what is written again")
         wait_until(lambda: size(path) > 600_000)
+        record.limit_files(300_000)
+        wait_until(lambda: (tmp_path / "stderr").read_text().count("File too large") == 2)
         ended = record.end()
         assert_same_bytes(path, gateway.published)
-    assert ended.status == 0, ended
-    assert "the disk did not accept what was written for a while (once)" in ended.stdout
-
-
-def test_what_does_not_fit_on_the_disk_is_counted(tmp_path: Path) -> None:
-    path = tmp_path / "walk.lcmlog"
-    with lab(tmp_path, "zenoh") as gateway, recording(tmp_path, str(path), *gateway.options) as record:
-        set_largest_file(record.process, 300_000)
-        wait_until(lambda: "File too large" in record.stderr)
-        ended = record.end()
     assert ended.status == 1
     assert re.search(r"^\d+ messages were not written: .*: File too large$", ended.stdout, re.MULTILINE)
     assert re.search(r"^Lab-1 +3d .* Hz +- +- +[1-9]\d*$", ended.stdout, re.MULTILINE)
-    assert events(path)
 
 
 def test_the_first_messages_are_recorded_with_the_seconds_given(tmp_path: Path) -> None:
-    (tmp_path / "takes").mkdir()
-    with (
-        lab(tmp_path, "zenoh") as gateway,
-        recording(
-            tmp_path, str(tmp_path / "takes"), "--seconds", "2", "--component", "3d", *gateway.options
-        ) as record,
-    ):
-        ended = record.end(None)
-    assert ended.status == 0
-    [path] = (tmp_path / "takes").iterdir()
+    (folder := tmp_path / "takes").mkdir()
+    options = ("--seconds", "2", "--component", "3d")
+    with lab(tmp_path) as gateway, recording(folder, *options, *gateway.options) as record:
+        assert record.end(None).status == 0
+    [path] = folder.iterdir()
     assert re.fullmatch(r"Lab-1-\d{8}-\d{6}\.lcmlog", path.name)
     recorded = by_channel(path)
     assert recorded.keys() == {"MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_PARAMETERS", "MOCAP_LAB_1_3D"}
@@ -230,15 +252,154 @@ def test_the_first_messages_are_recorded_with_the_seconds_given(tmp_path: Path) 
     assert 0.5e6 < utimes[-1] - utimes[0] < 30e6  # on a busy computer, the end comes late
 
 
-def test_a_restart_of_the_gateway_is_told_from_loss(tmp_path: Path) -> None:
+# A publisher of the test, which can do what a gateway does not -------------------------------
+
+
+class Publisher:
+    """Publishes markers of sources on Zenoh, as a gateway would; ``record`` connects to it."""
+
+    def __init__(self) -> None:
+        self.endpoint = free_endpoint()
+        self.session = open_zenoh("peer", listen=self.endpoint)
+
+    def publish(self, source: str, *sequences: int, key: str = "3d") -> None:
+        for sequence in sequences:
+            utime = time.time_ns() // 1000
+            message = FINGERPRINTS[key] + PREFIX.pack(utime, utime, sequence, 1, 1) + bytes(16)
+            self.session.put(f"mocap/{source}/{key}", message)
+
+    def wait_for_subscriber(self) -> None:
+        publisher: Any = self.session.declare_publisher("mocap/lab/3d")
+        wait_until(lambda: publisher.matching_status.matching)
+        publisher.undeclare()
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publisher]:
+    publisher = Publisher()
+    yield publisher
+    publisher.session.close()
+
+
+@contextmanager
+def recording_of(publisher: Publisher, path: Path, **options: Any) -> Iterator[RecordProcess]:
+    with recording(path, "--connect", publisher.endpoint, **options) as record:
+        publisher.wait_for_subscriber()
+        yield record
+
+
+def test_gaps_two_gateways_and_hostile_publishers_are_reported(tmp_path: Path, publisher: Publisher) -> None:
+    """All messages of known sources are recorded; what is reported is bounded."""
     path = tmp_path / "walk.lcmlog"
-    with lab(tmp_path, "lcm") as gateway, recording(tmp_path, str(path), *gateway.options) as record:
-        wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_STATUS") >= 1)
-        gateway.stop()
-        wait_until(lambda: "Lab-1: nothing has arrived for 2 s" in record.stderr)
-        before = num_recorded(path, "MOCAP_LAB_1_STATUS")
-        gateway.start()
-        wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_STATUS") >= before + 2)
+    names = ("lab/3d", "lab/status", "lab/parameters", "lab/6d/x", "lab/6d/x/y/z", "l%b/3d", "x" * 200)
+    with recording_of(publisher, path) as record:
+        publisher.publish("lab", *range(500, 600), *range(605, 700), *range(703, 720))
+        record.wait_for("8 messages were lost on the way")
+        for number in range(40):
+            publisher.publish("twice", 1000 + number, 50 + number)
+        record.wait_for("two gateways publish the source twice")
+        for number in range(300):
+            publisher.publish(f"source-{number}", 0)
+        for name in names:
+            for payload in (b"", b"\x1b[2J", bytes(1000)):
+                publisher.session.put(f"mocap/{name}", payload, attachment=b"[[[")
+        publisher.publish("hall", 2**62, -(2**63), 10)
+        publisher.publish("lab", 1, key="analog")
+        wait_until(lambda: num_recorded(path, "MOCAP_LAB_ANALOG"))
+        ended = record.end()
+    assert ended.status == 1
+    assert re.search(r"^lab +3d +212 .* 2 +8 +-$", ended.stdout, re.MULTILINE)
+    recorded = by_channel(path)
+    assert (len(recorded["MOCAP_LAB_3D"]), len(recorded["MOCAP_TWICE_3D"])) == (212, 80)
+    for text in (
+        "two gateways publish the source twice",
+        "messages were not recorded: there are more than 64 sources",
+        "messages on these keys or channels were not recorded",
+    ):
+        assert text in ended.stdout
+    assert ended.stdout.endswith("INCOMPLETE\n")
+    assert "\x1b" not in ended.stdout + ended.stderr
+    assert len(ended.stdout.splitlines()) < 100
+
+
+def test_a_restart_of_the_gateway_is_told_from_loss(tmp_path: Path, publisher: Publisher) -> None:
+    with recording_of(publisher, tmp_path / "walk.lcmlog") as record:
+        publisher.publish("lab", *range(10))
+        record.wait_for("lab: nothing has arrived for 2 s")
+        publisher.publish("lab", *range(5))
+        wait_until(lambda: num_recorded(tmp_path / "walk.lcmlog", "MOCAP_LAB_3D") == 15)
         ended = record.end()
     assert ended.status == 0, ended
-    assert "Lab-1: its gateway was started again (once)" in ended.stdout
+    assert "lab: its gateway was started again (once)" in ended.stdout
+
+
+def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Publisher) -> None:
+    """A file that is deleted meanwhile is reported at the end."""
+    reading, terminal = pty.openpty()
+    command = [*PROGRAM, "record", str(tmp_path / "walk"), "--connect", publisher.endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=terminal, text=True) as process:
+        publisher.wait_for_subscriber()
+        publisher.publish("lab", *range(10), *range(12, 20))
+        shown = ""
+        while not re.search(r"\r.*\d:\d\d  2 kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown):
+            shown += os.read(reading, 65536).decode()
+        (tmp_path / "walk.lcmlog").unlink()
+        process.send_signal(signal.SIGINT)
+        stdout, _ = process.communicate(timeout=30)
+    os.close(terminal)
+    os.close(reading)
+    assert process.returncode == 1
+    assert "2 messages were lost on the way; 2 so far\r\n" in shown
+    assert "the file was moved or deleted while it was recorded" in stdout
+
+
+@pytest.mark.parametrize(
+    ("side", "problem"),
+    [
+        ("zenoh", "no gateway found on Zenoh"),
+        ("lcm", "no gateway found on LCM"),
+        ("", "no Zenoh session to tcp/"),
+    ],
+)
+def test_without_a_gateway_there_is_no_file(
+    tmp_path: Path, publisher: Publisher, side: str, problem: str
+) -> None:
+    options = ("--lcm", "--url", lcm_url()) if side == "lcm" else ("--connect", free_endpoint())
+    if side == "zenoh":
+        options = ("--connect", publisher.endpoint)
+    with recording(tmp_path / "walk", *options) as record:
+        record.wait_for(problem)
+        ended = record.end(signal.SIGINT if side else None)
+    assert ended.status == 1
+    if side:
+        assert ended.stdout == "nothing was recorded, and there is no file: no message has arrived\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"stderr"}
+
+
+HANGING: Final = """
+import sys, threading
+from gateway.cli.main import main
+from gateway.recorder.take_recording import TakeRecording
+from gateway.takes.recording import LogFile
+
+def hang(*_):
+    print("the disk hangs", file=sys.stderr, flush=True)
+    threading.Event().wait()
+
+def stop(recording, stop=TakeRecording.stop):
+    print("it ends", file=sys.stderr, flush=True)
+    stop(recording)
+
+LogFile.append, TakeRecording.stop = hang, stop
+main()
+"""
+
+
+def test_a_second_ctrl_c_ends_at_once_although_the_disk_hangs(tmp_path: Path, publisher: Publisher) -> None:
+    with recording_of(publisher, tmp_path / "walk", command=(sys.executable, "-c", HANGING)) as record:
+        publisher.publish("lab", *range(10))
+        record.wait_for("the disk hangs")
+        record.process.send_signal(signal.SIGINT)
+        record.wait_for("it ends")
+        assert record.process.poll() is None
+        assert record.end().status == 130

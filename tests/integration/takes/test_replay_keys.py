@@ -43,24 +43,14 @@ def terminal(take: Path) -> Iterator[PseudoTerminal]:
         yield terminal
 
 
-def test_space_pauses_and_continues_and_q_quits(terminal: PseudoTerminal) -> None:
-    terminal.press(" ")
-    terminal.wait_for(lambda text: "paused" in text)
-    terminal.press(" ")
-    terminal.wait_for(lambda text: "messages/s" in text)
+def test_space_pauses_arrows_go_back_and_forth_and_q_quits(terminal: PseudoTerminal) -> None:
+    for keys, shown in ((" ", "paused"), (" ", "messages/s"), ("\x1b[C" * 3, "0:00:3"), ("\x1b[D", "0:00:2")):
+        terminal.press(keys)
+        terminal.wait_for(lambda text: shown in text)  # noqa: B023
     terminal.press("xyzq")
     assert terminal.wait_for_end() == 0
     assert "component" in terminal.text
     assert terminal.shows_keys()
-
-
-def test_arrows_go_back_and_forth(terminal: PseudoTerminal) -> None:
-    terminal.press("\x1b[C" * 3)
-    terminal.wait_for(lambda text: "0:00:3" in text)
-    terminal.press("\x1b[D")
-    terminal.wait_for(lambda text: "0:00:2" in text)
-    terminal.press("q")
-    assert terminal.wait_for_end() == 0
 
 
 def test_every_signal_restores_the_terminal(take: Path) -> None:
@@ -76,22 +66,15 @@ def test_every_signal_restores_the_terminal(take: Path) -> None:
             assert terminal.shows_keys()
 
 
-@pytest.mark.parametrize("end", ["q", signal.SIGTERM], ids=["q", "SIGTERM"])
-def test_a_replay_that_ends_before_the_first_message_says_so(
-    tmp_path: Path, end: str | signal.Signals
-) -> None:
+def test_a_replay_that_ends_before_the_first_message_says_so(tmp_path: Path) -> None:
     messages = [description(), markers(1, 0), frame(ComponentType.EVENT, [(1, 0, -1, -1, -1)], 100)]
     take = write_take(tmp_path / "take.lcmlog", messages)
     with replay_in_terminal(take, "--component", "event", "--rate", "0.01") as terminal:  # due after 100 s
         terminal.wait_for(lambda text: " 0 messages/s" in text)
-        if isinstance(end, signal.Signals):
-            terminal.process.send_signal(end)
-        else:
-            terminal.press(end)
+        terminal.press("q")
         assert terminal.wait_for_end() == 0
         assert "nothing was replayed" in terminal.text
         assert "component" not in terminal.text
-        assert terminal.shows_keys()
 
 
 def test_an_error_restores_the_terminal(terminal: PseudoTerminal, take: Path) -> None:

@@ -12,10 +12,8 @@ import pytest
 
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import WIRE_ORDER
-from gateway.simulator.c3d_scene import C3dScene
 from gateway.takes import open_take
 from gateway.takes.reader import TakeReader
-from gateway.takes.take import Take
 from tests.command_in_process import run_in_process
 from tests.documents import ROOT
 from tests.unit.export.exported import read_ezc3d
@@ -24,23 +22,10 @@ TAKE: Final = ROOT / "examples/walk.lcmlog"
 C3D: Final = ROOT / "examples/walk.c3d"
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the samples made again."""
-    folder = tmp_path_factory.mktemp("samples")
-    subprocess.run([sys.executable, str(ROOT / "examples/make_samples.py"), str(folder)], check=True)
-    return folder
-
-
-def run(*arguments: str) -> str:
-    return subprocess.check_output([sys.executable, "-m", "gateway", *arguments], text=True, cwd=ROOT)
-
-
-def test_both_are_small() -> None:
+def test_they_are_small_and_the_take_has_all_components_gaps_in_view_and_plates_with_corners() -> None:
     assert max(TAKE.stat().st_size, C3D.stat().st_size) < 700_000
-
-
-def test_the_take_has_all_components_with_gaps_in_view_and_plates_with_corners() -> None:
+    described = (each.message for each in TakeReader(TAKE).messages() if each.key in {"take", "status"})
+    assert {decode(message).host for message in described} == {"example"}
     source = open_take(TAKE).sources["lab"]
     assert source.markers is not None
     assert source.forces is not None
@@ -75,37 +60,25 @@ def test_the_forces_are_below_the_feet() -> None:
         assert (y_mm < toe[:, 1] + 60)[on_ground].all()
 
 
-def test_nothing_names_the_computer_that_made_them() -> None:
-    hosts = {
-        decode(each.message).host for each in TakeReader(TAKE).messages() if each.key in {"take", "status"}
-    }
-    assert hosts == {"example"}
+def test_making_them_again_gives_the_same_content(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "examples/make_samples.py"), str(tmp_path)]
+    subprocess.run(command, check=True)
 
-
-def test_making_them_again_gives_the_same_content(made: Path) -> None:
-    def content(take: Take) -> dict[str, Any]:
-        source = take.sources["lab"]
+    def content(take: Path) -> list[Any]:
+        source = open_take(take).sources["lab"]
         [entry] = source.parameters
+        components = (source.markers, source.tools, source.analog, source.forces, source.events)
         without_port = replace(entry.parameters, general=None)
-        found: dict[str, Any] = {"parameters": without_port}
-        for key in ("markers", "tools", "analog", "forces", "events"):
-            found[key] = getattr(source, key).items.tobytes()
-        return found
+        return [without_port, *(each and each.items.tobytes() for each in components)]
 
-    assert content(open_take(made / "walk.lcmlog")) == content(open_take(TAKE))
-    again, committed = read_ezc3d(made / "walk.c3d")["data"], read_ezc3d(C3D)["data"]
+    assert content(tmp_path / "walk.lcmlog") == content(TAKE)
+    again, committed = read_ezc3d(tmp_path / "walk.c3d")["data"], read_ezc3d(C3D)["data"]
     assert np.array_equal(again["points"], committed["points"], equal_nan=True)
     assert np.array_equal(again["analogs"], committed["analogs"], equal_nan=True)
 
 
-def test_the_simulator_plays_the_c3d_file() -> None:
-    scene = C3dScene(C3D)
-    assert {component.key for component in scene.rates_hz} == {"3d", "analog", "force"}
-    assert scene.num_frames == 250
-
-
 def test_take_info_describes_the_take() -> None:
-    text = run("take", "info", str(TAKE))
+    text = run_in_process("take", "info", TAKE).stdout
     for component in WIRE_ORDER:
         assert re.search(rf"^ *{component.key} +\d+", text, re.MULTILINE)
     assert "Foot strike (0x101)  9" in text
@@ -114,7 +87,19 @@ def test_take_info_describes_the_take() -> None:
 @pytest.mark.parametrize("option", ["--take", "--c3d"])
 def test_the_simulator_serves_both(option: str) -> None:
     file = TAKE if option == "--take" else C3D
-    text = run("simulate", option, str(file), "--port", "0", "--seconds", "0.5")
+    command = [
+        sys.executable,
+        "-m",
+        "gateway",
+        "simulate",
+        option,
+        str(file),
+        "--port",
+        "0",
+        "--seconds",
+        "0.5",
+    ]
+    text = subprocess.check_output(command, text=True, cwd=ROOT)
     assert text.startswith("RTC3D server on 127.0.0.1:")
 
 

@@ -3,12 +3,12 @@
 import asyncio
 import os
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from gateway.c3d_files import receiving
+from gateway.c3d_files.queue_memory import QueueMemory
 from gateway.c3d_files.receiving import FileReceiver, SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.rtc3d.packets import FilePiece
@@ -41,6 +41,12 @@ class Lab:
         """Send the first bytes of a file."""
         self.receiver.receive(FilePiece(content[:num_bytes], 0, len(content)))
 
+    async def store(self) -> None:
+        """Send a file, and wait until it is stored."""
+        count = len(self.stored)
+        self.send(FILE)
+        await wait_until_async(lambda: len(self.stored) > count)
+
     async def ended(self, count: int) -> None:
         await wait_until_async(lambda: len(self.stored) + len(self.lost) == count)
         await self.files._thread.run(lambda: None)  # lost files are deleted
@@ -50,26 +56,25 @@ class Lab:
         return [path.read_bytes() for path in sorted(self.spool.directory.iterdir())]
 
 
-@pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> "Disk":
-    return Disk(monkeypatch)
-
-
 class Disk:
-    """Stops every write until ``respond``, as a hung disk does."""
+    """Stops every write after ``hang`` until ``respond``, as a hung disk does."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self) -> None:
         self._responds = threading.Event()
-        write = os.write
-
-        def hang(descriptor: int, data: memoryview) -> int:
-            self._responds.wait()
-            return write(descriptor, data)
-
-        self.hang: Callable[[], None] = lambda: monkeypatch.setattr(os, "write", hang)
-
-    def respond(self) -> None:
         self._responds.set()
+        self._write = os.write
+        self.hang, self.respond = self._responds.clear, self._responds.set
+
+    def write(self, descriptor: int, data: memoryview) -> int:
+        self._responds.wait()
+        return self._write(descriptor, data)
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    disk = Disk()
+    monkeypatch.setattr(os, "write", disk.write)
+    return disk
 
 
 @pytest.mark.parametrize("piece_bytes", [1, 2, 3, 511, 5000])
@@ -106,35 +111,27 @@ async def test_other_files_are_refused_and_skipped(tmp_path: Path, content: byte
     for piece_bytes in (1, 5000):
         lab.send(content, piece_bytes=piece_bytes)
     assert lab.lost == [text, text]
-    lab.send(FILE)
-    await lab.ended(3)
+    await lab.store()
     assert lab.contents == [FILE]
 
 
-async def test_a_file_that_breaks_off_is_deleted(tmp_path: Path) -> None:
+async def test_a_file_that_breaks_off_is_deleted_and_its_rest_is_no_other_file(tmp_path: Path) -> None:
+    """The end of a connection between files loses nothing; pieces without a beginning are skipped."""
     lab = Lab(tmp_path)
+    await lab.store()
+    lab.receiver.interrupt("closed")
     lab.begin(FILE, 1000)
     lab.receiver.interrupt("the connection broke")
     lab.receiver.interrupt("again")
-    assert lab.lost == ["a C3D file of 2000 bytes from lab broke off after 1000 bytes: the connection broke"]
-    await lab.ended(1)
-    assert lab.contents == []
-    lab.send(FILE)  # of the next connection
+    lab.receiver.receive(FilePiece(FILE[1000:], 1000, len(FILE)))
     await lab.ended(2)
     assert lab.contents == [FILE]
+    await lab.store()  # of the next connection
+    assert lab.lost == ["a C3D file of 2000 bytes from lab broke off after 1000 bytes: the connection broke"]
+    assert lab.contents == [FILE, FILE]
 
 
-async def test_the_end_of_a_connection_between_files_loses_nothing(tmp_path: Path) -> None:
-    lab = Lab(tmp_path)
-    lab.send(FILE)
-    lab.receiver.interrupt("closed")
-    await lab.ended(1)
-    assert lab.contents == [FILE]
-
-
-async def test_a_file_that_cannot_be_written_is_lost_once_and_later_ones_are_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_file_on_a_full_disk_is_lost_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(tmp_path)
 
     def fail(_descriptor: int, _data: memoryview) -> int:
@@ -149,8 +146,7 @@ async def test_a_file_that_cannot_be_written_is_lost_once_and_later_ones_are_sto
         "check spool.directory and the space on it"
     ]
     assert lab.spool.memory.held_bytes == 0
-    lab.send(FILE)
-    await lab.ended(2)
+    await lab.store()
     assert lab.contents == [FILE]
 
 
@@ -164,8 +160,7 @@ async def test_a_disk_that_hangs_takes_no_more_memory_than_its_share(tmp_path: P
     disk.respond()
     await lab.ended(1)
     assert lab.contents == []
-    lab.send(FILE)
-    await lab.ended(2)
+    await lab.store()
     assert lab.contents == [FILE]
 
 
@@ -207,8 +202,7 @@ async def test_the_files_that_wait_for_a_disk_that_does_not_respond_are_given_up
     assert lab.contents == []
     await wait_until_async(lambda: lab.files._thread.call_age_s == 0)
     lab.files.check()
-    lab.send(FILE)
-    await lab.ended(4)
+    await lab.store()
     assert lab.contents == [FILE]
 
 
@@ -242,14 +236,25 @@ async def test_the_end_of_a_source_waits_for_the_disk_but_not_long(tmp_path: Pat
     await lab.ended(2)
 
 
-async def test_the_rest_of_an_interrupted_file_is_no_other_file(tmp_path: Path) -> None:
-    """Pieces without a beginning are skipped silently; the next file is stored."""
-    lab = Lab(tmp_path)
-    lab.begin(FILE, 1000)
-    lab.receiver.interrupt("the connection broke")
-    lab.receiver.receive(FilePiece(FILE[1000:], 1000, len(FILE)))
-    await lab.ended(1)
-    assert len(lab.lost) == 1
-    lab.send(FILE)
-    await lab.ended(2)
-    assert (lab.contents, len(lab.lost)) == ([FILE], 1)
+# The memory of all sources -------------------------------------------------------------------
+
+PIECE = bytes(800)  # and 200 bytes of overhead
+
+
+def reserved(memory: QueueMemory, source: str, piece: bytes = PIECE) -> int:
+    """Reserve as many pieces as a source can have; return their number."""
+    count = 0
+    while memory.reserve(source, piece):
+        count += 1
+    return count
+
+
+def test_a_source_gets_half_of_the_memory_and_leaves_the_others_their_share() -> None:
+    memory = QueueMemory(120_000)
+    assert [reserved(memory, source) for source in "abca"] == [60, 30, 15, 0]
+    assert memory.held_bytes == 105_000
+    for _ in range(60):
+        memory.release("a", PIECE)
+    assert memory.held_bytes == 45_000
+    assert reserved(memory, "a") == 38
+    assert reserved(QueueMemory(2000), "a", b"") == 5  # pieces without content take memory too

@@ -10,7 +10,23 @@ from pathlib import Path
 
 import pytest
 
+from gateway.c3d_files.format_check import problem_of_c3d
 from gateway.c3d_files.spool import Spool, StoredFile, UnfinishedFile
+
+
+class RefusedCall:
+    """A call of the system that fails with this error."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def __call__(self, *_arguments: object, **_options: object) -> None:
+        raise OSError(self._number, os.strerror(self._number))
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Spool:
+    return spool_in(tmp_path)
 
 
 def spool_in(folder: Path, max_files: int = 100, max_bytes: int = 1_000_000) -> Spool:
@@ -27,8 +43,9 @@ def files_in(spool: Spool) -> list[Path]:
     return sorted(spool.directory.iterdir())
 
 
-def test_a_file_is_kept_whole_under_its_source_and_time(tmp_path: Path) -> None:
-    spool = spool_in(tmp_path)
+def test_a_file_is_kept_whole_under_its_source_and_time(spool: Spool) -> None:
+    assert spool.newest("lab") is None
+    spool.delete_abandoned()  # without a folder, too
     unfinished = spool.begin()
     for piece in (b"con", b"", b"tent"):
         unfinished.write(piece)
@@ -39,13 +56,13 @@ def test_a_file_is_kept_whole_under_its_source_and_time(tmp_path: Path) -> None:
     assert stored.path.read_bytes() == b"content"
     assert files_in(spool) == [stored.path]
     assert spool.newest("lab") == stored.path
-
-
-def test_the_newest_is_the_one_stored_last(tmp_path: Path) -> None:
-    spool = spool_in(tmp_path)
     *_, last = [store(spool, "lab", content).path for content in (b"1", b"2", b"3")]
     assert spool.newest("lab") == last
-    assert spool_in(tmp_path).newest("lab") == last  # after a restart, too
+    assert Spool(spool.directory, 100, 100).newest("lab") == last  # after a restart, too
+    given_up = spool.begin()
+    given_up.write(b"x")
+    given_up.discard()
+    assert len(files_in(spool)) == 4
 
 
 def test_a_clock_that_is_set_back_changes_neither_the_order_nor_what_is_deleted(tmp_path: Path) -> None:
@@ -68,12 +85,6 @@ def test_sources_are_kept_apart_though_one_name_begins_another(tmp_path: Path) -
     for name, path in zip(names, paths, strict=True):
         assert spool.newest(name) == path
     assert spool.newest("la") is None
-
-
-def test_without_a_folder_there_is_nothing(tmp_path: Path) -> None:
-    assert spool_in(tmp_path).newest("lab") is None
-
-    spool_in(tmp_path).delete_abandoned()
 
 
 # Limits --------------------------------------------------------------------------------------
@@ -150,25 +161,16 @@ def test_threads_that_store_files_at_the_same_time_keep_to_the_limit(tmp_path: P
 # Unfinished files ----------------------------------------------------------------------------
 
 
-def test_unfinished_files_of_a_killed_gateway_are_deleted(tmp_path: Path) -> None:
-    spool = spool_in(tmp_path)
+def test_unfinished_files_of_a_killed_gateway_are_deleted(spool: Spool) -> None:
     spool.directory.mkdir()
     (spool.directory / "tmpkilled.c3d.part").write_bytes(b"x")
-    in_progress = spool_in(tmp_path).begin()  # of another gateway, or of another source
+    in_progress = Spool(spool.directory, 1, 1).begin()  # of another gateway, or of another source
     kept = store(spool, "lab", b"x").path
     [_, unfinished] = files_in(spool)
     assert unfinished.name.endswith(".c3d.part")
     in_progress.write(b"y")
     other = spool.keep("hall", in_progress)
     assert files_in(spool) == sorted([kept, other.path])
-
-
-def test_a_file_that_is_given_up_is_deleted(tmp_path: Path) -> None:
-    spool = spool_in(tmp_path)
-    unfinished = spool.begin()
-    unfinished.write(b"x")
-    unfinished.discard()
-    assert files_in(spool) == []
 
 
 # A disk that refuses -------------------------------------------------------------------------
@@ -182,8 +184,7 @@ def test_a_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
         spool_in(tmp_path).newest("lab")
 
 
-def test_a_folder_that_was_removed_meanwhile_loses_one_file(tmp_path: Path) -> None:
-    spool = spool_in(tmp_path)
+def test_a_folder_that_was_removed_meanwhile_loses_one_file(spool: Spool) -> None:
     unfinished = spool.begin()
     for path in files_in(spool):
         path.unlink()
@@ -194,8 +195,7 @@ def test_a_folder_that_was_removed_meanwhile_loses_one_file(tmp_path: Path) -> N
     assert store(spool, "lab", b"x").path.read_bytes() == b"x"
 
 
-def test_a_device_that_is_full_is_an_error(tmp_path: Path) -> None:
-    spool = spool_in(tmp_path)
+def test_a_device_that_is_full_is_an_error(spool: Spool) -> None:
     unfinished = spool.begin()
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full, unfinished._descriptor)
@@ -207,32 +207,18 @@ def test_a_device_that_is_full_is_an_error(tmp_path: Path) -> None:
     assert files_in(spool) == []
 
 
-def test_a_file_that_cannot_be_deleted_is_a_problem_and_the_new_file_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_with_problems_stores_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spool_in(tmp_path, max_files=1)
     old = store(spool, "lab", b"old").path
-
-    def refuse(_path: Path, **_options: bool) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(Path, "unlink", refuse)
-    new = store(spool, "lab", b"new")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", RefusedCall(errno.EPERM))
+        new = store(spool, "lab", b"new")
     assert new == StoredFile(new.path, 3, (), f"{old} cannot be deleted: Operation not permitted")
     assert files_in(spool) == [old, new.path]
-
-
-def test_a_folder_that_cannot_be_listed_is_a_problem_and_the_new_file_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spool = spool_in(tmp_path)
-
-    def refuse(_path: Path) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(os, "scandir", refuse)
-    before = datetime.now(UTC)
-    stored = store(spool, "lab", b"x")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "scandir", RefusedCall(errno.EACCES))
+        before = datetime.now(UTC)
+        stored = store(spool, "lab", b"x")
     assert stored.problem == f"{spool.directory} cannot be listed: Permission denied"
     assert stored.path.read_bytes() == b"x"
     assert stored.path.name > f"lab-{before:%Y%m%dT%H%M%S.%f}"
@@ -247,15 +233,34 @@ def test_a_file_is_locked_while_it_is_written(tmp_path: Path) -> None:
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_drive_without_locks_stores_files_and_deletes_no_unfinished_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(_descriptor: int, _operation: int) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    spool = spool_in(tmp_path)
+def test_a_drive_without_locks_stores_files(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fcntl, "flock", RefusedCall(errno.ENOLCK))
     in_progress = spool.begin()
     assert store(spool, "lab", b"x").path.read_bytes() == b"x"
     in_progress.write(b"y")
     assert spool.keep("hall", in_progress).path.read_bytes() == b"y"
+
+
+# Which files these are -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("head", "file_bytes", "problem"),
+    [
+        (b"\x02\x50", 1024, ""),
+        (b"\x02\x50", 512, ""),
+        (b"\x0a\x50", 5000, ""),
+        (b"\xff\x50", 10**9, ""),
+        (b"", 0, "empty"),
+        (b"\x02\x50", 511, "511 bytes"),
+        (b"\x02\x51", 1024, "first bytes"),
+        (b"PK", 1024, "first bytes"),
+        (b"\x00\x50", 1024, "parameters"),
+        (b"\x01\x50", 1024, "parameters"),
+        (b"\x04\x50", 1024, "parameters"),
+    ],
+)
+def test_what_is_no_c3d_file_is_refused_with_a_reason(head: bytes, file_bytes: int, problem: str) -> None:
+    found = problem_of_c3d(head, file_bytes)
+    assert problem in found
+    assert bool(found) == bool(problem)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import typer.core
+from typer.core import TyperCommand
 
 from gateway.cli.gateway_queries import EXIT_STATUSES
 from gateway.cli.main import app
@@ -14,16 +15,14 @@ from gateway.cli.main import app
 REFERENCE = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text(encoding="utf-8")
 
 
-def commands(
-    command: object = None, name: str = "rtc3d-gateway"
-) -> Iterator[tuple[str, typer.core.TyperCommand]]:
+def commands(command: object = None, name: str = "rtc3d-gateway") -> Iterator[tuple[str, TyperCommand]]:
     """Yield every command that is not a group, with its full name."""
     command = typer.main.get_command(app) if command is None else command
     if isinstance(command, typer.core.TyperGroup):
         for subcommand_name, subcommand in command.commands.items():
             yield from commands(subcommand, f"{name} {subcommand_name}")
     else:
-        assert isinstance(command, typer.core.TyperCommand)
+        assert isinstance(command, TyperCommand)
         yield name, command
 
 
@@ -43,7 +42,7 @@ def row(parameter: object) -> str:
     return f"| {', '.join(f'`{name}`' for name in names)} | {shown} | {parameter.help} |"
 
 
-def table(command: typer.core.TyperCommand) -> str:
+def table(command: TyperCommand) -> str:
     """Return the table of a command's arguments and options."""
     rows = [row(parameter) for parameter in command.params if parameter.name != "context"]
     return "\n".join(["| option | default | what |", "|---|---|---|", *rows]) + "\n"

@@ -34,21 +34,35 @@ def offered(line: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return result.stdout.split()
 
 
-def test_commands_and_options_are_offered(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert offered("rtc3d-gateway ech", monkeypatch) == ["echo"]
-    assert offered("rtc3d-gateway take st", monkeypatch) == ["start", "stop"]
-    assert offered("rtc3d-gateway run --ser", monkeypatch) == ["--server"]
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("ech", "echo"),
+        ("take st", "start stop"),
+        ("run --ser", "--server"),
+        ("params 3d a", "analog"),
+        *(
+            (f"{command} --component e", "event")
+            for command in ("echo", "record x.lcmlog", "replay x.lcmlog")
+        ),
+        ("--version take sto", "stop"),
+        ("-h take sto", "stop"),
+        ("take -h sto", "stop"),
+        ("simulate --list-faults --por", "--port"),
+        ("run --nosuch ", ""),
+        ("echo --port 'a", ""),
+    ],
+)
+def test_commands_options_and_values_are_offered(
+    line: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options that print something print nothing, and a wrong line offers nothing."""
+    assert offered(f"rtc3d-gateway {line}", monkeypatch) == words.split()
+
+
+def test_hidden_commands_are_not_offered_and_all_components_are(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "check" not in offered("rtc3d-gateway ", monkeypatch)
-
-
-@pytest.mark.parametrize("command", ["echo", "record x.lcmlog", "replay x.lcmlog"])
-def test_components_are_offered(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert offered(f"rtc3d-gateway {command} --component e", monkeypatch) == ["event"]
-    assert set(offered(f"rtc3d-gateway {command} --component ", monkeypatch)) >= {"3d", "6d", "status"}
-
-
-def test_sections_of_parameters_are_offered(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert offered("rtc3d-gateway params 3d a", monkeypatch) == ["analog"]
+    assert set(offered("rtc3d-gateway echo --component ", monkeypatch)) >= {"3d", "6d", "status"}
 
 
 @pytest.mark.parametrize(
@@ -75,18 +89,13 @@ def test_sources_of_the_take_on_the_command_line_are_offered(
     assert sorted(offered(line, monkeypatch)) == ["attic", "hall"]
 
 
+HOSTILE = b"sources: [{name: '$(touch x)', host: a}, {name: \"a'b\", host: b}]"
+
+
 @pytest.mark.parametrize(
     "content",
-    [
-        b"sources: [{name: '$(touch x)', host: a}, {name: \"a'b\", host: b}]",
-        b"sources: [{host: a}]",
-        b"sources: 3",
-        b"sources: [",
-        b"- a",
-        b"",
-        b"\xff",
-        b"x" * 1_000_000,
-    ],
+    [HOSTILE, b"sources: [{host: a}]", b"sources: 3", b"sources: [", b"- a", b"", b"\xff", b"x" * 1_000_000],
+    ids=range(8),
 )
 def test_a_bad_configuration_offers_nothing(
     content: bytes, default_config: Path, monkeypatch: pytest.MonkeyPatch
@@ -100,24 +109,6 @@ def test_a_bad_take_offers_nothing(content: bytes, tmp_path: Path, monkeypatch: 
     (tmp_path / "take.lcmlog").write_bytes(content)
     assert offered(f"rtc3d-gateway replay {tmp_path / 'take.lcmlog'} --source ", monkeypatch) == []
     assert offered(f"rtc3d-gateway replay {tmp_path} --source ", monkeypatch) == []
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "rtc3d-gateway --version take sto",
-        "rtc3d-gateway -h take sto",
-        "rtc3d-gateway take -h sto",
-    ],
-)
-def test_options_that_print_something_print_nothing(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert offered(line, monkeypatch) == ["stop"]
-    assert offered("rtc3d-gateway simulate --list-faults --por", monkeypatch) == ["--port"]
-
-
-@pytest.mark.parametrize("line", ["rtc3d-gateway run --nosuch ", "rtc3d-gateway echo --port 'a"])
-def test_a_wrong_line_offers_nothing(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert offered(line, monkeypatch) == []
 
 
 def test_source_names_need_no_take_and_no_configuration() -> None:
@@ -147,7 +138,6 @@ def test_bash_completes_with_the_script_that_the_program_prints(tmp_path: Path) 
     program.write_text(f'#!/bin/sh\nexec {" ".join(PROGRAM)} "$@"\n')
     program.chmod(0o755)
     environ = {**os.environ, "COMP_TYPE": "9"}
-    run = subprocess.run(
-        ("bash", "-c", SCRIPT, "bash", str(tmp_path)), env=environ, capture_output=True, text=True, check=True
-    )
+    command = ("bash", "-c", SCRIPT, "bash", str(tmp_path))
+    run = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
     assert (run.stdout, run.stderr) == ("analog\n", "")

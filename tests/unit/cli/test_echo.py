@@ -2,6 +2,7 @@
 
 import io
 import json
+from contextlib import nullcontext
 
 import pytest
 import rtc3d
@@ -34,8 +35,8 @@ class Published:
 
 def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
     out = io.StringIO()
-    silence = Silence("example", REQUEST)
     published = Published((name, message))
+    silence = Silence("example", REQUEST)
     assert print_messages(published, REQUEST, Limits(1, 10), silence, out, as_json=as_json) == 1
     return out.getvalue().removesuffix("\n")
 
@@ -61,54 +62,31 @@ def reply(error: str = "") -> bytes:
     return bytes(message.encode())
 
 
+NO_ITEMS = in_root("<The_6D/>", "<Analog/>", "<Force/>", "<Events/>")
+FILE = b'{"name":"lab-1.c3d","bytes":123}'
+PARAMETERS = "MOCAP_LAB_PARAMETERS"
+
+
 @pytest.mark.parametrize(
-    ("name", "message", "line"),
+    ("name", "message", "text"),
     [
+        ("mocap/lab/parameters", spec_xml("3d"), f"{MARKERS_BYTES} bytes of XML: 1 marker"),
+        ("m", NO_ITEMS, "82 bytes of XML: 0 tools, 0 analog channels, 0 force plates, 0 events"),
+        ("mocap/lab/parameters", b"<!-- -->", "8 bytes of XML that cannot be read as parameters"),
+        ("mocap/lab/c3d", FILE, "name lab-1.c3d, bytes 123"),
+        (PARAMETERS, parameters(), f"#4 session 2, version 3: {MARKERS_BYTES} bytes of XML: 1 marker"),
+        (f"{PARAMETERS}_REQUEST", request(), "request 7 from 'viewer': 3d 6d, fresh"),
         (
-            "mocap/lab/parameters",
-            spec_xml("3d"),
-            f"mocap/lab/parameters {MARKERS_BYTES} bytes of XML: 1 marker",
-        ),
-        (
-            "mocap/lab/parameters",
-            in_root("<The_6D/>", "<Analog/>", "<Force/>", "<Events/>"),
-            "mocap/lab/parameters 82 bytes of XML: 0 tools, 0 analog channels, 0 force plates, 0 events",
-        ),
-        (
-            "mocap/lab/parameters",
-            b"<!-- -->",
-            "mocap/lab/parameters 8 bytes of XML that cannot be read as parameters",
-        ),
-        (
-            "mocap/lab/c3d",
-            b'{"name":"lab-20260102T030405.678901Z.c3d","bytes":123}',
-            "mocap/lab/c3d name lab-20260102T030405.678901Z.c3d, bytes 123",
-        ),
-        (
-            "MOCAP_LAB_PARAMETERS",
-            parameters(),
-            f"MOCAP_LAB_PARAMETERS #4 session 2, version 3: {MARKERS_BYTES} bytes of XML: 1 marker",
-        ),
-        (
-            "MOCAP_LAB_PARAMETERS_REQUEST",
-            request(),
-            "MOCAP_LAB_PARAMETERS_REQUEST request 7 from 'viewer': 3d 6d, fresh",
-        ),
-        (
-            "MOCAP_LAB_PARAMETERS_REPLY",
+            f"{PARAMETERS}_REPLY",
             reply(),
-            "MOCAP_LAB_PARAMETERS_REPLY reply 7 to 'viewer': 54 bytes of XML: "
-            "no markers, tools, channels, plates or events, 1.2 s old",
+            "reply 7 to 'viewer': 54 bytes of XML: no markers, tools, channels, plates or events, 1.2 s old",
         ),
-        (
-            "MOCAP_LAB_PARAMETERS_REPLY",
-            reply("the server is \x1b[31maway"),
-            "MOCAP_LAB_PARAMETERS_REPLY reply 7 to 'viewer': the server is \\x1b[31maway",
-        ),
+        (f"{PARAMETERS}_REPLY", reply("it is \x1b[31maway"), "reply 7 to 'viewer': it is \\x1b[31maway"),
     ],
+    ids=range(8),
 )
-def test_a_line_summarises_a_message(name: str, message: bytes, line: str) -> None:
-    assert printed(name, message) == line
+def test_a_line_summarises_a_message(name: str, message: bytes, text: str) -> None:
+    assert printed(name, message) == f"{name} {text}"
 
 
 @pytest.mark.parametrize(
@@ -119,50 +97,30 @@ def test_a_message_of_another_program_is_printed_as_an_error(message: bytes) -> 
     assert "are not a message" in json.loads(printed("mocap/lab/parameters", message, as_json=True))["error"]
 
 
-def test_json_has_xml_as_text() -> None:
+def test_json_has_xml_as_text_and_the_fields_of_other_messages() -> None:
     value = json.loads(printed("mocap/lab/parameters", spec_xml("force"), as_json=True))
     assert value == {"key": "mocap/lab/parameters", "xml": spec_xml("force").decode()}
-
-
-def test_json_has_the_fields_of_a_json_message() -> None:
-    value = json.loads(printed("mocap/lab/c3d", b'{"name":"a.c3d","bytes":1}', as_json=True))
-    assert value == {"key": "mocap/lab/c3d", "name": "a.c3d", "bytes": 1}
-
-
-def test_json_has_the_fields_of_a_request() -> None:
+    value = json.loads(printed("mocap/lab/c3d", FILE, as_json=True))
+    assert value == {"key": "mocap/lab/c3d", "name": "lab-1.c3d", "bytes": 123}
     value = json.loads(printed("MOCAP_LAB_PARAMETERS_REQUEST", request(), as_json=True))
     assert (value["request_id"], value["requester"], value["sections"]) == (7, "viewer", ["3d", "6d"])
 
 
+class Interrupted(io.StringIO):
+    def write(self, _text: str) -> int:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("is_interrupted", [False, True])
 def test_messages_that_come_faster_than_they_are_printed_are_counted(
-    capsys: pytest.CaptureFixture[str],
+    is_interrupted: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    messages = [("mocap/lab/c3d", b'{"n": 1}')] * (MAX_WAITING + 5)
-    out = io.StringIO()
-    silence = Silence("example", REQUEST)
-    assert print_messages(Published(*messages), REQUEST, Limits(7, 10), silence, out, as_json=False) == 7
-    assert out.getvalue().count("\n") == 7
-    assert capsys.readouterr().err.startswith("5 messages were not printed, because they came faster than")
-
-
-def test_nothing_is_said_if_everything_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     printed("mocap/lab/c3d", b'{"n": 1}')
     assert capsys.readouterr().err == ""
-
-
-def test_what_was_not_printed_is_said_at_ctrl_c_too(capsys: pytest.CaptureFixture[str]) -> None:
-    class Interrupted(io.StringIO):
-        def write(self, _text: str) -> int:
-            raise KeyboardInterrupt
-
-    messages = [("mocap/lab/c3d", b'{"n": 1}')] * (MAX_WAITING + 5)
-    with pytest.raises(KeyboardInterrupt):
-        print_messages(
-            Published(*messages),
-            REQUEST,
-            Limits(None, None),
-            Silence("example", REQUEST),
-            Interrupted(),
-            as_json=False,
-        )
-    assert capsys.readouterr().err.startswith("5 messages were not printed")
+    published = Published(*[("mocap/lab/c3d", b'{"n": 1}')] * (MAX_WAITING + 5))
+    out = Interrupted() if is_interrupted else io.StringIO()
+    with pytest.raises(KeyboardInterrupt) if is_interrupted else nullcontext():
+        silence = Silence("example", REQUEST)
+        assert print_messages(published, REQUEST, Limits(7, 10), silence, out, as_json=False) == 7
+        assert out.getvalue().count("\n") == 7
+    assert capsys.readouterr().err.startswith("5 messages were not printed, because they came faster than")

@@ -89,61 +89,42 @@ def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
 def test_json_has_the_fields_of_the_reference() -> None:
     found = found_of(status())
     found.add_silent(["hall"])
+    stream: dict[str, Any] = {
+        "components": ["3d", "6d"],
+        "text": "streaming 200.0 Hz",
+        "state": "streaming",
+        "problem": "",
+    }
+    stream |= {"rate_hz": 200.0, "tries": 0}
+    silent = {"source": "hall", "gateway": None, "problem": "its gateway does not answer", "server": None}
+    lab = {"source": "lab", "gateway": None, "problem": "", "server": "192.0.2.20:3020", "host": "mocap-pc"}
     assert json.loads(sources_json(found)) == {
         "sources": [
-            {
-                "source": "hall",
-                "gateway": None,
-                "problem": "its gateway does not answer",
-                "server": None,
-                "host": None,
-                "version": None,
-                "streams": [],
-            },
-            {
-                "source": "lab",
-                "gateway": None,
-                "problem": "",
-                "server": "192.0.2.20:3020",
-                "host": "mocap-pc",
-                "version": "1.2.3",
-                "streams": [
-                    {
-                        "components": ["3d", "6d"],
-                        "text": "streaming 200.0 Hz",
-                        "state": "streaming",
-                        "problem": "",
-                        "rate_hz": 200.0,
-                        "tries": 0,
-                    }
-                ],
-            },
+            silent | {"host": None, "version": None, "streams": []},
+            lab | {"version": "1.2.3", "streams": [stream]},
         ],
         "num_left_out": 0,
     }
 
 
-def test_two_gateways_with_the_same_source_are_both_listed_and_noted() -> None:
-    found = found_of(status(host="a"), status(host="b"), status(host="b"))
-    assert [source.host for source in found.sources] == ["a", "b"]
-    assert notes(found) == [
-        "2 gateways serve a source 'lab', and their messages mix; rename one, or change a prefix"
-    ]
+def test_two_gateways_with_the_same_source_are_listed_and_the_newest_status_of_each_counts() -> None:
+    found = found_of(status(host="a"), status(host="b"), status(host="b", gateway_version="2"))
+    assert [(source.host, source.version) for source in found.sources] == [("a", "1.2.3"), ("b", "2")]
+    [note] = notes(found)
+    assert note.startswith("2 gateways serve a source 'lab', and their messages mix; rename one")
 
 
-def test_the_newest_status_counts() -> None:
-    found = found_of(status(gateway_version="1"), status(gateway_version="2"))
-    assert [source.version for source in found.sources] == ["2"]
+OTHER_VERSION = "its status is of another version of rtc3d-gateway"
 
 
 @pytest.mark.parametrize(
     ("message", "problem"),
     [
-        (b"", "its status is of another version of rtc3d-gateway"),
-        (b"x" * 100, "its status is of another version of rtc3d-gateway"),
-        (rtc3d.take_t().encode(), "its status is of another version of rtc3d-gateway"),
-        (status_of()[:-7], "its status cannot be read: a status_t message of"),
-        (status_of() + bytes(MAX_STATUS_BYTES), f"its status is too long: {MAX_STATUS_BYTES + 293} bytes"),
+        (b"", OTHER_VERSION),
+        (b"x" * 100, OTHER_VERSION),
+        (rtc3d.take_t().encode(), OTHER_VERSION),
+        (status_of()[:-7], "its status cannot be read"),
+        (status_of() + bytes(MAX_STATUS_BYTES), "its status is too long"),
     ],
     ids=["empty", "other program", "other type", "truncated", "too long"],
 )
@@ -152,8 +133,8 @@ def test_a_status_that_cannot_be_read_is_said(message: bytes, problem: str) -> N
     found.add_status(message, "lab", "abc")
     [source] = found.sources
     assert (source.name, source.gateway) == ("lab", "abc")
-    assert source.problem.startswith(problem.partition(":")[0])
-    assert source.problem.partition(":")[0] in printed(found, columns=300)
+    assert source.problem.startswith(problem)
+    assert problem in printed(found, columns=300)
 
 
 def test_hostile_texts_do_not_reach_the_terminal() -> None:
@@ -162,13 +143,10 @@ def test_hostile_texts_do_not_reach_the_terminal() -> None:
     message.streams[0].components = message.streams[1].state = evil
     message.streams[0].frame_rate_hz = math.nan
     found = found_of(message)
-    for is_terminal in (True, False):
-        text = printed(found, is_terminal=is_terminal)
-        assert not {"\x1b", "\r"} & set(text)
-    assert printed(found, is_terminal=False).count("\n") == 1
-    assert printed(found, is_terminal=False).count("\t") == len(COLUMNS) - 1
-    content = json.loads(sources_json(found))
-    assert content["sources"][0]["streams"][0]["rate_hz"] is None
+    line = printed(found, is_terminal=False)
+    assert not {"\x1b", "\r"} & set(line + printed(found))
+    assert (line.count("\n"), line.count("\t")) == (1, len(COLUMNS) - 1)
+    assert json.loads(sources_json(found))["sources"][0]["streams"][0]["rate_hz"] is None
 
 
 def test_thousands_of_sources_and_streams_are_bounded_and_said() -> None:

@@ -34,7 +34,6 @@ def _process_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "setswitchinterval", lambda _seconds: None)
 
 
-SOURCES = "RTC3D_GATEWAY__SOURCES"
 DEMO = Path(__file__).parents[3] / "config/demo.yaml"
 
 
@@ -74,31 +73,19 @@ def test_port_must_be_a_number_in_range(server: str) -> None:
         configuration_from_options(None, server)
 
 
-def test_config_and_server_exclude_each_other() -> None:
+def test_config_and_server_exclude_each_other_and_one_is_needed(default_config: Path) -> None:
     with pytest.raises(typer.BadParameter, match="either --config FILE or --server"):
         configuration_from_options(DEMO, "lab")
-
-
-def test_without_options_and_default_it_says_what_was_looked_for(default_config: Path) -> None:
     with pytest.raises(typer.BadParameter) as raised:
         configuration_from_options(None, None)
-    assert str(raised.value) == (
-        f"give either --config FILE or --server HOST[:PORT]; the default, {default_config}, does not exist"
-    )
+    assert str(raised.value).endswith(f"; the default, {default_config}, does not exist")
 
 
-@pytest.mark.parametrize(
-    ("command", "wanted"),
-    [
-        (("run",), "either --config FILE or --server HOST[:PORT]"),
-        (("doctor",), "either --config FILE or --server HOST[:PORT]"),
-        (("config", "show"), "either --config FILE or --server HOST[:PORT]"),
-        (("config", "check"), "FILE"),
-    ],
-)
-def test_commands_without_a_configuration_end_with_status_2(command: tuple[str, ...], wanted: str) -> None:
-    result = CliRunner().invoke(app, command, env={"COLUMNS": "300"})
+@pytest.mark.parametrize("command", ["run", "doctor", "config show", "config check"])
+def test_commands_without_a_configuration_end_with_status_2(command: str) -> None:
+    result = CliRunner().invoke(app, command.split(), env={"COLUMNS": "300"})
     assert result.exit_code == 2
+    wanted = "FILE" if command == "config check" else "either --config FILE or --server HOST[:PORT]"
     assert f"give {wanted}; the default, " in result.output
 
 
@@ -114,21 +101,17 @@ def test_the_default_file_is_read_and_environment_variables_override_it(
     assert printed("config", "check") == f"{default_config}: valid; 1 source: hall\n"
 
 
-@pytest.mark.parametrize(
-    "command", [("record", "walk"), ("view",), ("top",), ("list",), ("take", "list")], ids=" ".join
-)
+@pytest.mark.parametrize("command", ["record walk", "view", "top", "list", "take list"])
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--lcm", "--connect", "tcp/127.0.0.1:1"), "--connect and --zenoh-config are for Zenoh"),
-        (("--lcm", "--zenoh-config", "viewer.json5"), "--connect and --zenoh-config are for Zenoh"),
-        (("--url", "memq://"), "--url is for LCM; add --lcm"),
+        ("--lcm --connect tcp/127.0.0.1:1", "--connect and --zenoh-config are for Zenoh"),
+        ("--lcm --zenoh-config viewer.json5", "--connect and --zenoh-config are for Zenoh"),
+        ("--url memq://", "--url is for LCM; add --lcm"),
     ],
 )
-def test_options_for_another_transport_end_with_status_2(
-    command: tuple[str, ...], options: tuple[str, ...], text: str
-) -> None:
-    result = CliRunner().invoke(app, [*command, *options], env={"COLUMNS": "300"})
+def test_options_for_another_transport_end_with_status_2(command: str, options: str, text: str) -> None:
+    result = CliRunner().invoke(app, f"{command} {options}".split(), env={"COLUMNS": "300"})
     assert result.exit_code == 2
     assert text in result.output
 
@@ -161,41 +144,34 @@ def test_check_takes_the_file_as_argument_or_option_and_can_be_quiet(tmp_path: P
         printed("config", "check", "--quiet", str(tmp_path / "lab.yaml"))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "level"),
-    [
-        ((), "INFO"),
-        (("-v",), "DEBUG"),
-        (("--verbose",), "DEBUG"),
-        (("-q",), "WARNING"),
-        (("--quiet",), "WARNING"),
-        (("--log-level", "error"), "ERROR"),
-    ],
-)
-@pytest.mark.parametrize("command", [("run", "-c"), ("simulate", "--scenario")])
-def test_v_and_q_are_log_levels(
-    command: tuple[str, ...], arguments: tuple[str, ...], level: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("command", ["run -c /nowhere", "simulate --scenario /nowhere"])
+def test_v_and_q_are_log_levels(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     levels: list[str] = []
     monkeypatch.setattr(logging, "basicConfig", lambda **settings: levels.append(settings["level"]))
-    CliRunner().invoke(app, [*command, "/nowhere", *arguments])
-    assert levels == [level]
+    for options in ("", "-v", "--verbose", "-q", "--quiet", "--log-level error"):
+        CliRunner().invoke(app, f"{command} {options}".split())
+    assert levels == ["INFO", "DEBUG", "DEBUG", "WARNING", "WARNING", "ERROR"]
 
 
-@pytest.mark.parametrize(
-    "arguments", [("-v", "-q"), ("-v", "--log-level", "error"), ("-q", "--log-level", "debug")]
-)
+@pytest.mark.parametrize("options", ["-v -q", "-v --log-level error", "-q --log-level debug"])
 @pytest.mark.parametrize("command", ["run", "simulate"])
-def test_contradicting_log_levels_are_a_mistake(command: str, arguments: tuple[str, ...]) -> None:
-    result = CliRunner().invoke(app, [command, *arguments], env={"COLUMNS": "200"})
+def test_contradicting_log_levels_are_a_mistake(command: str, options: str) -> None:
+    result = CliRunner().invoke(app, [command, *options.split()], env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert "give only one of --log-level, --verbose and --quiet" in result.output
 
 
-def test_environment_variables_alone_are_a_configuration(
+def test_environment_variables_are_a_configuration_and_override_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv(SOURCES, "[{name: lab, host: lab-pc}]")
+    monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIX", "HALL2")
+    assert prefix_of(configuration_from_options(DEMO, None)) == "HALL2"
+    assert prefix_of(configuration_from_options(None, "lab")) == "HALL2"
+    lines = [" ".join(line.split()) for line in printed("config", "show", "--config", str(DEMO)).splitlines()]
+    assert f"host: 127.0.0.1 # {DEMO}:9" in lines
+    assert "prefix: HALL2 # RTC3D_GATEWAY__LCM__PREFIX" in lines
+    assert "- name: lab # --server" in " ".join(printed("config", "show", "--server", "lab-pc").split())
+    monkeypatch.setenv("RTC3D_GATEWAY__SOURCES", "[{name: lab, host: lab-pc}]")
     assert configuration_from_options(None, None).settings.sources[0].host == "lab-pc"
 
 
@@ -203,20 +179,6 @@ def prefix_of(configuration: Configuration) -> str:
     lcm = configuration.settings.outputs["lcm"]
     assert isinstance(lcm, LcmSettings)
     return lcm.prefix
-
-
-def test_environment_variables_override_config_and_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIX", "HALL2")
-    assert prefix_of(configuration_from_options(DEMO, None)) == "HALL2"
-    assert prefix_of(configuration_from_options(None, "lab")) == "HALL2"
-
-
-def test_show_prints_values_and_origins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIX", "HALL2")
-    lines = [" ".join(line.split()) for line in printed("config", "show", "--config", str(DEMO)).splitlines()]
-    assert f"host: 127.0.0.1 # {DEMO}:9" in lines
-    assert "prefix: HALL2 # RTC3D_GATEWAY__LCM__PREFIX" in lines
-    assert "- name: lab # --server" in " ".join(printed("config", "show", "--server", "lab-pc").split())
 
 
 def test_schema_prints_the_schema() -> None:

@@ -1,5 +1,7 @@
 """What ``echo`` says while it hears nothing; tests/integration/commands has the tests of the command."""
 
+from collections.abc import Callable
+
 import pytest
 
 from gateway.cli import silence as silence_module
@@ -25,71 +27,61 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(silence_module, "SAY_S", 0.0)
 
 
-def said(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    found: FoundSources | Exception,
-    absence: str = "",
-    component: str | None = None,
-) -> str:
-    """Return what is said within the time of many checks; raises QueryError if ``check`` does."""
-
-    def find(*_: object) -> tuple[FoundSources, str]:
-        if isinstance(found, Exception):
-            raise found
-        return found, absence
-
-    monkeypatch.setattr(silence_module, "find_sources", find)
-    silence = Silence("zenoh", SubscriptionRequest(component=component))
-    texts: list[str] = []
-
-    def is_said() -> bool:
-        silence.check()
-        texts.append(capsys.readouterr().err)
-        return any(texts)
-
-    wait_until(is_said)
-    for _ in range(100):
-        silence.check()
-    return "".join(texts) + capsys.readouterr().err
+Said = Callable[..., str]
 
 
-def test_without_a_gateway_the_reason_is_said_once(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert said(monkeypatch, capsys, FoundSources(), "no gateway found") == "no gateway found\n"
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
+    """Return a function that returns what is said within the time of many checks, or raises what they do."""
+
+    def say(found: FoundSources | Exception, absence: str = "", component: str | None = None) -> str:
+        def find(*_: object) -> tuple[FoundSources, str]:
+            if isinstance(found, Exception):
+                raise found
+            return found, absence
+
+        monkeypatch.setattr(silence_module, "find_sources", find)
+        silence = Silence("zenoh", SubscriptionRequest(component=component))
+        texts: list[str] = []
+
+        def is_said() -> bool:
+            silence.check()
+            texts.append(capsys.readouterr().err)
+            return any(texts)
+
+        wait_until(is_said)
+        for _ in range(100):
+            silence.check()
+        return "".join(texts) + capsys.readouterr().err
+
+    return say
 
 
-def test_a_source_that_none_of_the_gateways_has_is_an_error(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_gateway_the_reason_is_said_once(said: Said) -> None:
+    assert said(FoundSources(), "no gateway found") == "no gateway found\n"
+
+
+def test_a_source_that_none_of_the_gateways_has_is_an_error(said: Said) -> None:
     with pytest.raises(QueryError, match="no gateway serves source 'hall'"):
-        said(monkeypatch, capsys, found_of("3d"), "no gateway serves source 'hall'; sources found: lab")
+        said(found_of("3d"), "no gateway serves source 'hall'; sources found: lab")
 
 
-def test_a_component_is_looked_for_in_all_streams(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = said(monkeypatch, capsys, found_of("3d 6d", "analog"), component="analog")
+def test_a_component_is_looked_for_in_all_streams(said: Said) -> None:
+    text = said(found_of("3d 6d", "analog"), component="analog")
     assert text == "nothing heard of analog although a gateway runs (lab: streaming 200.0 Hz)\n"
     with pytest.raises(QueryError, match=r"^no force from lab; accepted for --component: 3d, 6d, analog, "):
-        said(monkeypatch, capsys, found_of("3d 6d", "analog"), component="force")
+        said(found_of("3d 6d", "analog"), component="force")
 
 
-def test_a_gateway_that_does_not_answer_proves_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gateway_that_does_not_answer_proves_nothing(said: Said) -> None:
     found = found_of("3d")
     found.add_silent(["hall"])
-    text = said(monkeypatch, capsys, found, component="force")
-    assert "hall: its gateway does not answer" in text
+    assert "hall: its gateway does not answer" in said(found, component="force")
 
 
 @pytest.mark.parametrize("problem", [RuntimeError("odd"), OutputError("odd", cause="not open")])
-def test_a_search_that_fails_ends_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], problem: Exception
-) -> None:
-    assert said(monkeypatch, capsys, problem).endswith("odd\n")
+def test_a_search_that_fails_ends_nothing(said: Said, problem: Exception) -> None:
+    assert said(problem).endswith("odd\n")
 
 
 def test_outputs_that_cannot_be_searched_stay_silent(capsys: pytest.CaptureFixture[str]) -> None:

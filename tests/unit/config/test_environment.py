@@ -24,7 +24,7 @@ zenoh: {config: {mode: client, connect: {endpoints: [tcp/192.0.2.10:7447]}}}
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     path = tmp_path / "lab.yaml"
-    path.write_text(FILE, encoding="utf-8")
+    path.write_text(FILE)
     return path
 
 
@@ -36,8 +36,7 @@ def refused(path: Path | None, **variables: str) -> list[str]:
     """Return the lines of the error, the file as its last part only and the variables without prefix."""
     with pytest.raises(ConfigError) as caught:
         load(path, with_prefix(variables))
-    text = str(caught.value).replace("RTC3D_GATEWAY__", "")
-    return (text if path is None else text.replace(f"{path}:", f"{path.name}:")).splitlines()
+    return str(caught.value).replace("RTC3D_GATEWAY__", "").replace(f"{path}:", "lab.yaml:").splitlines()
 
 
 def test_a_variable_stands_over_the_file(file: Path) -> None:
@@ -55,51 +54,37 @@ def test_the_processes_own_environment_counts(file: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "location", "expected"),
+    ("name", "value", "expected"),
     [
-        ("LCM__ENABLED", "false", ("lcm", "enabled"), False),
-        ("LCM__URL", "", ("lcm", "url"), None),
-        ("LCM__URL", "null", ("lcm", "url"), None),
-        ("LCM__MAX_RATE_HZ", "{3d: 60}", ("lcm", "max_rate_hz"), {"3d": 60}),
-        ("LCM__MAX_RATE_HZ__6D", "60", ("lcm", "max_rate_hz"), {"6d": 60}),
-        ("SOURCES__0__NAME", "2026-06-01", ("sources", 0, "name"), "2026-06-01"),
-        ("SOURCES__0__NAME", "'7'", ("sources", 0, "name"), "7"),
-        ("SOURCES__0__RECONNECT__MAX_DELAY_S", "60", ("sources", 0, "reconnect", "max_delay_s"), 60),
-        ("SOURCES__0__STREAMS__1__RATE__DIVISOR", "5", ("sources", 0, "streams", 1, "rate"), {"divisor": 5}),
-        ("SOURCES__0__STREAMS__1__RATE", "all", ("sources", 0, "streams", 1, "rate"), "all"),
-        (
-            "SOURCES__0__STREAMS__0__COMPONENTS__1",
-            "6d",
-            ("sources", 0, "streams", 0, "components"),
-            ["3d", "6d"],
-        ),
-        ("ZENOH__CONFIG__MODE", "peer", ("zenoh", "config", "mode"), "peer"),
-        ("ZENOH__CONFIG", "{mode: peer}", ("zenoh", "config"), {"mode": "peer"}),
+        ("LCM__ENABLED", "false", False),
+        ("LCM__URL", "", None),
+        ("LCM__URL", "null", None),
+        ("LCM__MAX_RATE_HZ", "{3d: 60}", {"3d": 60}),
+        ("LCM__MAX_RATE_HZ__6D", "60", 60),
+        ("SOURCES__0__NAME", "2026-06-01", "2026-06-01"),
+        ("SOURCES__0__NAME", "'7'", "7"),
+        ("SOURCES__0__RECONNECT__MAX_DELAY_S", "60", 60),
+        ("SOURCES__0__STREAMS__1__RATE__DIVISOR", "5", 5),
+        ("SOURCES__0__STREAMS__1__RATE", "all", "all"),
+        ("SOURCES__0__STREAMS__0__COMPONENTS__1", "6d", "6d"),
+        ("ZENOH__CONFIG__MODE", "peer", "peer"),
+        ("ZENOH__CONFIG", "{mode: peer}", {"mode": "peer"}),
     ],
 )
-def test_values_are_yaml(
-    file: Path, name: str, value: str, location: tuple[str | int, ...], expected: object
-) -> None:
+def test_values_are_yaml(file: Path, name: str, value: str, expected: object) -> None:
     found: Any = load(file, with_prefix({name: value})).model_dump(mode="json")
-    for step in location:
-        found = found[step]
+    for step in name.lower().split("__"):
+        found = found[int(step) if step.isdigit() else step]
     assert found == expected
 
 
 def test_variables_alone_are_a_configuration() -> None:
-    variables = {
-        "SOURCES__0__NAME": "a",
-        "SOURCES__0__HOST": "lab-a",
-        "SOURCES__1__HOST": "lab-b",
-        "SOURCES__1__NAME": "b",
-        "SOURCES__1__STREAMS__0__COMPONENTS": "[6d]",
-        "SOURCES__1__STREAMS__0__RATE__DIVISOR": "2",
-    }
+    variables = {f"SOURCES__{n}__NAME": name for n, name in enumerate("ab")}
+    variables |= {f"SOURCES__{n}__HOST": f"lab-{name}" for n, name in enumerate("ab")}
+    variables |= {"SOURCES__1__STREAMS__0__COMPONENTS": "[6d]", "SOURCES__1__STREAMS__0__RATE__DIVISOR": "2"}
     stream = StreamSettings(components=(ComponentType.TOOLS,), rate=FrequencyDivisor(2))
-    sources = (
-        SourceSettings(name="a", host="lab-a"),
-        SourceSettings(name="b", host="lab-b", streams=(stream,)),
-    )
+    second = SourceSettings(name="b", host="lab-b", streams=(stream,))
+    sources = (SourceSettings(name="a", host="lab-a"), second)
     assert load(None, with_prefix(variables)) == make_settings(sources=sources)
 
 
@@ -115,7 +100,7 @@ def test_variables_are_applied_mappings_first_and_items_in_their_order(file: Pat
 
 def test_relative_paths_count_from_the_files_folder(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zenoh_file = file.parent / "zenoh.json5"
-    zenoh_file.write_text("{mode: 'client'}", encoding="utf-8")
+    zenoh_file.write_text("{mode: 'client'}")
     assert load(file, with_prefix({"ZENOH__CONFIG": "zenoh.json5"})).zenoh.config == zenoh_file
     monkeypatch.chdir(file.parent)
     variables = {"SOURCES": "[{name: lab, host: lab}]", "ZENOH__CONFIG": "zenoh.json5"}
@@ -129,12 +114,13 @@ def test_other_names_are_not_ours(file: Path, name: str) -> None:
     assert load(file, {name: "tcp://10.0.0.1:9464"}) == load(file, {})
 
 
+RATE = "SOURCES__0__STREAMS__0__RATE"
 MISTAKES: list[tuple[str, str, str]] = [
+    # The name and the value of a variable, and how the error's one line begins.
     (
         "LCM__ULR",
         "memq://",
-        "LCM__ULR: lcm.ulr: unknown key (did you mean 'url'?); known keys: enabled, prefix, url, "
-        "queries, queries_url, max_rate_hz, tool_poses",
+        "LCM__ULR: lcm.ulr: unknown key (did you mean 'url'?); known keys: enabled, prefix, ",
     ),
     ("LMC__URL", "memq://", "LMC__URL: lmc: unknown key (did you mean 'lcm'?); known keys: sources, "),
     ("SOURCES__0__PORT", "abc", "SOURCES__0__PORT: sources[0].port: found 'abc'; expected a whole number"),
@@ -142,7 +128,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "SOURCES__0__NAME",
         "7",
-        "SOURCES__0__NAME: sources[0].name: found 7 (use quotes to make it text); expected",
+        "SOURCES__0__NAME: sources[0].name: found 7 (use quotes to make it text); expect",
     ),
     ("SOURCES__1__NAME", "b", "SOURCES__1__NAME: sources[1].host: missing; this key is required"),
     (
@@ -150,30 +136,25 @@ MISTAKES: list[tuple[str, str, str]] = [
         "c",
         "SOURCES__2__NAME: sources: found the index '2'; expected a number from 0 to 1",
     ),
+    ("SOURCES__HOST", "c", "SOURCES__HOST: sources: found the index 'host'; expected a number from 0 to 1"),
     (
-        "SOURCES__HOST",
-        "c",
-        "SOURCES__HOST: sources: found the index 'host'; expected a number from 0 to 1",
-    ),
-    (
-        "SOURCES__0__STREAMS__0__RATE__DIVISOR",
+        f"{RATE}__DIVISOR",
         "2",
-        "SOURCES__0__STREAMS__0__RATE__DIVISOR: sources[0].streams[0].rate: this value is "
-        "'all' (lab.yaml:5:34), which has no keys; set the whole value with SOURCES__0__STREAMS__0__RATE",
+        f"{RATE}__DIVISOR: sources[0].streams[0].rate: this value is 'all' (lab.yaml:5:34), which has no "
+        f"keys; set the whole value with {RATE}",
     ),
     (
         "LCM",
         "{url: [",
-        "LCM: not YAML: while parsing a flow node from line 1: expected the node content, but found "
-        "'<stream end>'; check indentation, colons, quotes and brackets here",
+        "LCM: not YAML: while parsing a flow node from line 1: expected the node content, but ",
     ),
     ("LCM__URL", "\udcff", "LCM__URL: found the character U+DCFF, which YAML does not allow"),
     ("", "1", ": does not name a key; expected a name such as LCM__URL"),
     ("LCM__", "1", "LCM__: does not name a key; expected a name such as LCM__URL"),
     (
         "ZENOH__CONFIG__MODES",
-        "peer",
-        "lab.yaml:7:17: zenoh.config: Zenoh refuses these keys: unknown field `modes`, expected one of ",
+        "x",
+        "lab.yaml:7:17: zenoh.config: Zenoh refuses these keys: unknown field `modes`",
     ),
 ]
 
@@ -185,23 +166,19 @@ def test_a_mistake_is_told_with_the_variable(file: Path, name: str, value: str, 
 
 
 def test_mistakes_of_the_file_come_first(file: Path) -> None:
-    file.write_text(FILE + "spool: {max_files: 0}\n", encoding="utf-8")
+    file.write_text(FILE + "spool: {max_files: 0}\n")
     lines = refused(file, SPOOL__MAX_BYTES="0", LCM__PREFIX="Ä")
     assert [line.partition(": ")[0] for line in lines] == ["lab.yaml:8:20", "LCM__PREFIX", "SPOOL__MAX_BYTES"]
 
 
-def test_one_server_has_the_defaults() -> None:
-    settings = read_server("::1", 3030, {}).settings
-    assert settings == make_settings(sources=(SourceSettings(name="lab", host="::1", port=3030),))
-
-
-def test_one_servers_mistakes_are_told() -> None:
+def test_one_server_has_the_defaults_and_its_mistakes_are_told() -> None:
+    source = SourceSettings(name="lab", host="::1", port=3030)
+    assert read_server("::1", 3030, {}).settings == make_settings(sources=(source,))
     with pytest.raises(ConfigError) as caught:
         read_server("two words", 0, {})
-    assert str(caught.value).splitlines() == [
-        "--server: sources[0].host: found 'two words'; expected a host name or an IP address; "
-        "the port has its own key",
-        "--server: sources[0].port: found 0; expected a whole number from 1 to 65535",
+    assert [line.partition(";")[0] for line in str(caught.value).splitlines()] == [
+        "--server: sources[0].host: found 'two words'",
+        "--server: sources[0].port: found 0",
     ]
 
 

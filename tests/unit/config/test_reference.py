@@ -1,17 +1,23 @@
-"""docs/reference/configuration.md says of every key what the program says of it."""
+"""The shipped description of the configuration, in words and as a JSON schema, is that of the program."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
+from gateway.config.schema import schema_text
 from gateway.config.section import Section
 from gateway.config.settings import (
     MetricsSettings,
     ReconnectSettings,
+    Settings,
     SourceSettings,
     SpoolSettings,
     StreamSettings,
@@ -26,6 +32,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.configurations import MODEL
+from tests.property.test_config_properties import SETTINGS
 
 REFERENCE = (Path(__file__).parents[3] / "docs/reference/configuration.md").read_text(encoding="utf-8")
 
@@ -110,3 +117,48 @@ def test_the_reference_has_every_section() -> None:
 @pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", REFERENCE, re.DOTALL))
 def test_the_examples_are_valid_configurations(block: str) -> None:
     assert MODEL.model_validate(yaml.safe_load(block)).sources
+
+
+SHIPPED = Path(__file__).parents[3] / "config"
+VALIDATOR = Draft202012Validator(json.loads(schema_text(MODEL)))
+
+
+def test_the_shipped_schema_is_current() -> None:
+    shipped = (SHIPPED / "gateway.schema.json").read_text(encoding="utf-8")
+    assert shipped == schema_text(MODEL), "rtc3d-gateway config schema > config/gateway.schema.json"
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.name)
+def test_shipped_configurations_name_and_match_the_schema(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.startswith("# yaml-language-server: $schema=gateway.schema.json\n")
+    VALIDATOR.validate(yaml.safe_load(text))
+
+
+@hypothesis_settings(max_examples=20)  # the validator takes 15 ms for each
+@given(SETTINGS)
+def test_valid_settings_match_the_schema(configuration: Settings) -> None:
+    """An editor must not mark what the gateway accepts."""
+    VALIDATOR.validate(configuration.model_dump(mode="json"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "sources: []",
+        "sources: [{name: lab}]",
+        "sources: [{name: lab, host: lab, prot: 3020}]",
+        "sources: [{name: lab, host: lab, port: 0}]",
+        "sources: [{name: l b, host: lab}]",
+        "sources: [{name: lab, host: lab, streams: []}]",
+        "sources: [{name: lab, host: lab, streams: [{components: [7d]}]}]",
+        "sources: [{name: lab, host: lab, streams: [{rate: fast}]}]",
+        "sources: [{name: lab, host: lab, streams: [{rate: {divisor: 1.5}}]}]",
+        "{sources: [{name: lab, host: lab}], lcm: {max_rate_hz: {3d: 0}}}",
+        "{sources: [{name: lab, host: lab}], lcm: null}",
+        "{sources: [{name: lab, host: lab}], zenoh: {config: 1}}",
+    ],
+)
+def test_the_schema_rejects_mistakes(text: str) -> None:
+    assert list(VALIDATOR.iter_errors(yaml.safe_load(text) or {}))

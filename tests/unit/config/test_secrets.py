@@ -1,8 +1,10 @@
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from gateway.config.environment import variable_name
 from gateway.config.secrets import find_secrets, mask_secrets
@@ -17,9 +19,6 @@ from tests.waiting import wait_until
 SERVER = "sources: [{name: lab, host: 192.0.2.20}]\n"
 PASSWORD = variable_name(("zenoh", "config", "transport", "auth", "usrpwd", "password"))
 PEM = "-----BEGIN EC PRIVATE KEY-----\ngeheim\n-----END EC PRIVATE KEY-----\n"
-JSON5 = (
-    "the environment variable {}, or zenoh.config as the path of a JSON5 file that only the gateway may read"
-)
 
 
 @pytest.fixture
@@ -27,41 +26,30 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "lab.yaml"
 
 
-SECRETS: list[tuple[dict[str, Any], dict[str, Any]]] = [
-    # Zenoh's keys, and what may be seen of them.
-    (
-        {"transport": {"auth": {"usrpwd": {"user": "me", "password": "geheim"}}}},
-        {"transport": {"auth": {"usrpwd": {"user": "me", "password": "***"}}}},
-    ),
-    (
-        {"transport": {"auth": {"pubkey": {"public_key_pem": "P", "private_key_pem": PEM}}}},
-        {"transport": {"auth": {"pubkey": {"public_key_pem": "P", "private_key_pem": "***"}}}},
-    ),
-    (
-        {
-            "transport": {
-                "link": {"tls": {"listen_private_key_base64": "geheim", "connect_private_key": "/k"}}
-            }
-        },
-        {"transport": {"link": {"tls": {"listen_private_key_base64": "***", "connect_private_key": "/k"}}}},
-    ),
-    (
-        {"connect": {"endpoints": ["tcp/a:1", "tls/a:1#connect_private_key_raw=geheim;so_sndbuf=1"]}},
-        {"connect": {"endpoints": ["tcp/a:1", "tls/a:1#connect_private_key_raw=***;so_sndbuf=1"]}},
-    ),
-    (
-        {"plugins": {"storage_manager": {"volumes": {"influx": {"private": {"username": "geheim"}}}}}},
-        {"plugins": {"storage_manager": {"volumes": {"influx": {"private": "***"}}}}},
-    ),
-    (
-        {"plugins": {"x": {"url": "https://me:geheim@lab:1/geheim.txt", "token_secret": "geheim"}}},
-        {"plugins": {"x": {"url": "https://me:***@lab:1/geheim.txt", "token_secret": "***"}}},
-    ),
-    ({"plugins": {"x": {"pem": PEM}}}, {"plugins": {"x": {"pem": "***\n"}}}),
+SECRETS = [
+    # Zenoh's keys in YAML, with the word SECRET for what is masked.
+    "{transport: {auth: {usrpwd: {user: me, password: 'SECRET'}}}}",
+    "{transport: {auth: {pubkey: {public_key_pem: P, private_key_pem: 'SECRET'}}}}",
+    "{transport: {link: {tls: {listen_private_key_base64: 'SECRET', connect_private_key: /k}}}}",
+    "{connect: {endpoints: ['tcp/a:1', 'tls/a:1#connect_private_key_raw=SECRET;so_sndbuf=1']}}",
+    "{plugins: {x: {url: 'https://me:SECRET@lab:1/geheim.txt', token_secret: 'SECRET'}}}",
 ]
 
 
-@pytest.mark.parametrize(("config", "seen"), SECRETS)
+@pytest.mark.parametrize(
+    ("config", "seen"),
+    [
+        *(
+            (yaml.safe_load(re.sub("SECRET", "geheim", text)), yaml.safe_load(re.sub("SECRET", "***", text)))
+            for text in SECRETS
+        ),
+        (
+            {"plugins": {"influx": {"private": {"username": "me"}}}},
+            {"plugins": {"influx": {"private": "***"}}},
+        ),
+        ({"plugins": {"x": {"pem": PEM}}}, {"plugins": {"x": {"pem": "***\n"}}}),
+    ],
+)
 def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> None:
     assert mask_secrets(config) == seen
     assert list(find_secrets(config))
@@ -69,77 +57,73 @@ def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> Non
 
 
 @pytest.mark.parametrize(
-    "config",
+    "text",
     [
-        {},
-        {
-            "transport": {
-                "auth": {"usrpwd": {"user": "me", "password": None, "dictionary_file": "/etc/users"}}
-            }
-        },
-        {"transport": {"link": {"tls": {"listen_private_key": "/k", "root_ca_certificate_base64": "x"}}}},
-        {
-            "connect": {"endpoints": ["tcp/lab:7447", "tcp/[::1]:7447#so_sndbuf=1"]},
-            "metadata": {"name": "a:b@c"},
-        },
+        "{}",
+        "{transport: {auth: {usrpwd: {user: me, password: null, dictionary_file: /etc/users}}}}",
+        "{transport: {link: {tls: {listen_private_key: /k, root_ca_certificate_base64: x}}}}",
+        "{connect: {endpoints: ['tcp/lab:7447', 'tcp/[::1]:7447#so_sndbuf=1']}, metadata: {name: 'a:b@c'}}",
     ],
 )
-def test_what_is_no_secret_stays(config: dict[str, Any]) -> None:
+def test_what_is_no_secret_stays(text: str) -> None:
+    config = yaml.safe_load(text)
     assert mask_secrets(config) == config
     assert list(find_secrets(config)) == []
 
 
+KEY_FILE = " with the path of the key's file, "
+
+
 @pytest.mark.parametrize(
-    ("config", "position", "accepted"),
+    ("config", "column", "path", "instead"),
     [
+        ("auth: {usrpwd: {user: me, password: geheim}}", 66, "auth.usrpwd.password", ""),
+        ("auth: {usrpwd: {user: me, password: 1234567}}", 66, "auth.usrpwd.password", ""),
         (
-            "{transport: {auth: {usrpwd: {user: me, password: geheim}}}}",
-            "2:66: zenoh.config.transport.auth.usrpwd.password",
-            JSON5.format(PASSWORD),
+            "link: {tls: {connect_private_key_base64: geheim}}",
+            71,
+            "link.tls.connect_private_key_base64",
+            f"connect_private_key{KEY_FILE}",
         ),
         (
-            "{transport: {auth: {usrpwd: {user: me, password: 1234567}}}}",
-            "2:66: zenoh.config.transport.auth.usrpwd.password",
-            JSON5.format(PASSWORD),
-        ),
-        (
-            "{transport: {link: {tls: {connect_private_key_base64: geheim}}}}",
-            "2:71: zenoh.config.transport.link.tls.connect_private_key_base64",
-            "connect_private_key with the path of the key's file, "
-            + JSON5.format("RTC3D_GATEWAY__ZENOH__CONFIG__TRANSPORT__LINK__TLS__CONNECT_PRIVATE_KEY_BASE64"),
-        ),
-        (
-            "{transport: {auth: {pubkey: {private_key_pem: geheim}}}}",
-            "2:63: zenoh.config.transport.auth.pubkey.private_key_pem",
-            "private_key_file with the path of the key's file, "
-            + JSON5.format("RTC3D_GATEWAY__ZENOH__CONFIG__TRANSPORT__AUTH__PUBKEY__PRIVATE_KEY_PEM"),
-        ),
-        (
-            "{connect: {endpoints: ['tls/lab:7447#connect_private_key_raw=geheim']}}",
-            "2:40: zenoh.config.connect.endpoints[0]",
-            JSON5.format("RTC3D_GATEWAY__ZENOH__CONFIG__CONNECT__ENDPOINTS__0"),
+            "auth: {pubkey: {private_key_pem: geheim}}",
+            63,
+            "auth.pubkey.private_key_pem",
+            f"private_key_file{KEY_FILE}",
         ),
     ],
 )
-def test_a_secret_in_the_file_is_refused(file: Path, config: str, position: str, accepted: str) -> None:
-    file.write_text(f"{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
+def test_a_secret_in_the_file_is_refused(
+    file: Path, config: str, column: int, path: str, instead: str
+) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{{config}}}}}}}\n")
     with pytest.raises(ConfigError) as caught:
         load(file, {})
-    text = "found a secret, which does not belong in this file; use"
-    assert str(caught.value) == f"{file}:{position}: {text} {accepted}"
+    variable = f"RTC3D_GATEWAY__ZENOH__CONFIG__TRANSPORT__{path.replace('.', '__').upper()}"
+    assert str(caught.value) == (
+        f"{file}:2:{column}: zenoh.config.transport.{path}: found a secret, which does not belong in this "
+        f"file; use {instead}the environment variable {variable}, "
+        "or zenoh.config as the path of a JSON5 file that only the gateway may read"
+    )
+
+
+def test_a_secret_in_an_endpoint_in_the_file_is_refused(file: Path) -> None:
+    file.write_text(
+        f"{SERVER}zenoh: {{config: {{connect: {{endpoints: ['tls/a:1#x_private_key_raw=geheim']}}}}}}\n"
+    )
+    with pytest.raises(
+        ConfigError, match=r":2:40: zenoh.config.connect.endpoints\[0\]: .*CONNECT__ENDPOINTS__0,"
+    ):
+        load(file, {})
 
 
 def test_a_secret_is_told_with_the_other_mistakes(file: Path) -> None:
     config = "{mode: clint, transport: {auth: {usrpwd: {password: geheim}}}}"
-    file.write_text(f"lcm: 1\n{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
+    file.write_text(f"lcm: 1\n{SERVER}zenoh: {{config: {config}}}\n")
     with pytest.raises(ConfigError) as caught:
         load(file, {})
-    lines = str(caught.value).splitlines()
-    assert [line.split(": ")[1] for line in lines] == [
-        "lcm",
-        "zenoh.config",
-        "zenoh.config.transport.auth.usrpwd.password",
-    ]
+    places = [line.split(": ")[1] for line in str(caught.value).splitlines()]
+    assert places == ["lcm", "zenoh.config", "zenoh.config.transport.auth.usrpwd.password"]
     assert "geheim" not in str(caught.value)
 
 
@@ -147,21 +131,15 @@ def test_a_secret_is_told_with_the_other_mistakes(file: Path) -> None:
 def test_a_password_from_the_environment_is_text_as_it_stands(file: Path, password: str) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{auth: {{usrpwd: {{user: me}}}}}}}}}}\n")
     configuration = read(file, {PASSWORD: password})
-    assert configuration.settings.model_dump()["zenoh"]["config"]["transport"]["auth"]["usrpwd"] == {
-        "user": "me",
-        "password": password,
-    }
+    usrpwd = configuration.settings.model_dump()["zenoh"]["config"]["transport"]["auth"]["usrpwd"]
+    assert usrpwd == {"user": "me", "password": password}
     shown = [" ".join(line.split()) for line in shown_configuration(configuration).splitlines()]
     assert f"password: '***' # {PASSWORD}" in shown
-
-
-def test_settings_in_a_log_line_show_no_password(file: Path) -> None:
-    file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{auth: {{usrpwd: {{user: me}}}}}}}}}}\n")
-    assert "geheim" not in repr(load(file, {PASSWORD: "geheim"}))
+    assert "geheim" not in repr(configuration.settings)
 
 
 def test_half_a_character_in_a_password_is_refused(file: Path) -> None:
-    file.write_text(SERVER, encoding="utf-8")
+    file.write_text(SERVER)
     with pytest.raises(ConfigError, match="found bytes that are not UTF-8; expected text"):
         load(file, {PASSWORD: "\udcff"})
 
@@ -176,8 +154,8 @@ def test_half_a_character_in_a_password_is_refused(file: Path) -> None:
     ],
 )
 def test_zenohs_errors_quote_no_secrets(file: Path, content: str) -> None:
-    (file.parent / "zenoh.json5").write_text(content, encoding="utf-8")
-    file.write_text(f"{SERVER}zenoh: {{config: zenoh.json5}}\n", encoding="utf-8")
+    (file.parent / "zenoh.json5").write_text(content)
+    file.write_text(f"{SERVER}zenoh: {{config: zenoh.json5}}\n")
     with pytest.raises(ConfigError) as caught:
         load(file, {})
     assert "Zenoh refuses the file" in str(caught.value)
@@ -189,11 +167,13 @@ def test_zenohs_reasons_keep_what_helps() -> None:
     drawing = (
         " --> 2:7\n  |\n2 |  mode: 'geheim',,\n  |       ^---\n  |\n  = expected identifier\n at src/a.rs:1."
     )
-    assert zenoh_reason(ValueError(drawing)) == "line 2, column 7: expected identifier"
     message = r'Message { msg: "no field `a\"b`", location: Some(Location { line: 2, column: 7 }) }'
-    assert zenoh_reason(ValueError(message)) == 'line 2, column 7: no field `a"b`'
     text = 'invalid type: string "ge\\"heim", expected a boolean at /x/y.rs:615.'
-    assert zenoh_reason(ValueError(text)) == "invalid type: string, expected a boolean"
+    assert [zenoh_reason(ValueError(each)) for each in (drawing, message, text)] == [
+        "line 2, column 7: expected identifier",
+        'line 2, column 7: no field `a"b`',
+        "invalid type: string, expected a boolean",
+    ]
 
 
 def test_a_link_that_fails_is_told_without_its_key(caplog: pytest.LogCaptureFixture, file: Path) -> None:

@@ -23,7 +23,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("LCM_DEFAULT_URL", "STATE_DIRECTORY", "XDG_STATE_HOME"):
         monkeypatch.delenv(name, raising=False)
     path = tmp_path / "lab.yaml"
-    path.write_text(FILE, encoding="utf-8")
+    path.write_text(FILE)
     return path
 
 
@@ -62,7 +62,7 @@ def test_a_variable_is_the_origin_of_a_whole_list_that_it_sets(file: Path) -> No
 
 
 def test_values_from_the_environment_are_shown_as_used(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file.write_text(FILE.replace("lcm: {url: memq://}", ""), encoding="utf-8")
+    file.write_text(FILE.replace("lcm: {url: memq://}", ""))
     assert "url: udpm://239.255.76.67:7667?ttl=0 # default" in shown(file)
     monkeypatch.setenv("LCM_DEFAULT_URL", "udpm://239.255.76.68:7667?ttl=1")
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/lab")
@@ -74,7 +74,7 @@ def test_values_from_the_environment_are_shown_as_used(file: Path, monkeypatch: 
 def test_the_output_is_an_equivalent_configuration(file: Path) -> None:
     configuration = read(file, {})
     again = file.with_name("again.yaml")
-    again.write_text(shown_configuration(configuration), encoding="utf-8")
+    again.write_text(shown_configuration(configuration))
     [source] = configuration.settings.sources
     sources = (source.model_copy(update={"frame_id": source.name}),)
     directory = configuration.settings.spool.effective_directory
@@ -91,6 +91,6 @@ def test_the_output_is_an_equivalent_configuration(file: Path) -> None:
 def test_unusual_keys_and_values_are_quoted(file: Path) -> None:
     metadata = {"on": "off", "12": "1e3", "a: b": "x # y", "lines": "a\nb", "list": [{}, {"a": []}, "x"]}
     inline = f"mode: client, metadata: {json.dumps(metadata)}"
-    file.write_text(FILE.replace("mode: client", inline), encoding="utf-8")
+    file.write_text(FILE.replace("mode: client", inline))
     values = yaml.safe_load(shown_configuration(read(file, {})))
     assert values["zenoh"]["config"]["metadata"] == metadata

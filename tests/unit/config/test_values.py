@@ -9,7 +9,7 @@ from gateway.config.settings import MetricsSettings, SourceSettings, SpoolSettin
 from gateway.config.words import describe
 from gateway.outputs.lcm.settings import DEFAULT_LCM_URL, LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
+from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from tests.settings import mistakes, source
 
@@ -24,68 +24,54 @@ def of_source(**values: Any) -> list[tuple[str, str]]:
     return mistakes(SourceSettings, source(**values))
 
 
+SECONDS = [0, 0.0009, -1, True, "2", float("nan"), float("inf"), 10**400, 86401, None]
+BYTES = [1023, 2**32, 1e6, True, "16 MiB"]
+PORTS = ["abc", "3020", 0, -1, 65536, True, 3020.0, None, [], {"a": 1}]
+INTERVALS = [0.05, 0.0999, -1, 86401, True, float("nan")]
+
+
 @pytest.mark.parametrize(
-    ("key", "accepted", "refused", "expected"),
+    ("keys", "accepted", "refused", "expected"),
     [
+        ("port", [1, 65535], PORTS, "a whole number from 1 to 65535"),
         (
-            "port",
-            [1, 65535],
-            ["abc", "3020", 0, -1, 65536, True, 3020.0, None, [], {"a": 1}],
-            "a whole number from 1 to 65535",
+            "connect_timeout_s reply_timeout_s stall_timeout_s",
+            [0.001, 5, 86400],
+            SECONDS,
+            "a number of seconds from 0.001 to 86400",
         ),
-        *(
-            (
-                key,
-                [0.001, 5, 86400],
-                [0, 0.0009, -1, True, "2", float("nan"), float("inf"), 10**400, 86401, None],
-                "a number of seconds from 0.001 to 86400",
-            )
-            for key in ("connect_timeout_s", "reply_timeout_s", "stall_timeout_s")
-        ),
-        *(
-            (
-                key,
-                [1024, 2**32 - 1],
-                [1023, 2**32, 1e6, True, "16 MiB"],
-                "a whole number of bytes from 1024 to 4294967295",
-            )
-            for key in ("max_packet_bytes", "max_c3d_bytes")
+        (
+            "max_packet_bytes max_c3d_bytes",
+            [1024, 2**32 - 1],
+            BYTES,
+            "a whole number of bytes from 1024 to 4294967295",
         ),
         (
             "parameters_interval_s",
             [0, 0.1, 86400],
-            [0.05, 0.0999, -1, 86401, True, float("nan")],
+            INTERVALS,
             "0 for never, or a number of seconds from 0.1 to 86400",
         ),
     ],
 )
 def test_numbers_within_their_limits(
-    key: str, accepted: list[float], refused: list[object], expected: str
+    keys: str, accepted: list[float], refused: list[object], expected: str
 ) -> None:
     """The limits protect from typing errors, and a number in quotes or a switch is no number."""
-    for value in accepted:
-        assert getattr(SourceSettings.model_validate(source(**{key: value})), key) == value
-    for other in refused:
-        assert of_source(**{key: other}) == [(key, f"found {describe(other)}; expected {expected}")]
+    for key in keys.split():
+        for value in accepted:
+            assert getattr(SourceSettings.model_validate(source(**{key: value})), key) == value
+        for other in refused:
+            assert of_source(**{key: other}) == [(key, f"found {describe(other)}; expected {expected}")]
 
 
-def test_a_switch_must_be_true_or_false() -> None:
-    """YAML has many words for both; a wrong one must not switch anything."""
-    for value in (1, 0, "yes", None):
-        error = f"found {describe(value)}; expected true or false"
-        assert mistakes(ZenohSettings, {"express": value}) == [("express", error)]
-
-
-@pytest.mark.parametrize(
-    "host",
-    [
-        *("lab", "ndi-3.example.org.", "192.0.2.20", "2001:db8::1", "fe80::1%eth0", "fe80::1%2", "rt_server"),
-        *("bücher.example", "3d.lab", "a" * 63, ".".join(["a" * 63] * 3 + ["a" * 61])),  # 253 characters
-    ],
-)
-def test_host_names_and_addresses_are_accepted(host: str) -> None:
-    """Whatever a name server or the system takes for a host."""
-    assert SourceSettings.model_validate(source(host=host)).host == host
+def test_host_names_and_addresses_are_accepted() -> None:
+    """Whatever a name server or the system takes for a host; the last one has 253 characters."""
+    hosts = (
+        "lab ndi-3.example.org. 192.0.2.20 2001:db8::1 fe80::1%eth0 fe80::1%2 rt_server bücher.example 3d.lab"
+    )
+    for host in (*hosts.split(), "a" * 63, ".".join(["a" * 63] * 3 + ["a" * 61])):
+        assert SourceSettings.model_validate(source(host=host)).host == host
 
 
 @pytest.mark.parametrize(
@@ -111,26 +97,16 @@ def test_names_that_do_not_fit_keys_and_channels_are_refused() -> None:
     """A name is part of Zenoh keys and LCM channels; the hint helps who writes a number."""
     for name in ("", "a b", "a/b", "a.b", "é", "lab\n", "a" * 25):
         assert [location for location, _ in of_source(name=name)] == ["name"]
-    [(_, text)] = of_source(name=5)
-    assert text == (
-        "found 5 (use quotes to make it text); "
-        "expected 1 to 24 of the letters A to Z and a to z, digits, '_' and '-'"
+    assert of_source(name=5)[0][1].startswith(
+        "found 5 (use quotes to make it text); expected 1 to 24 of the "
     )
 
 
-@pytest.mark.parametrize(
-    ("value", "rate"),
-    [
-        ("all", AllFrames()),
-        ({"frequency_hz": 60}, Frequency(60.0)),
-        ({"frequency_hz": 0.5}, Frequency(0.5)),
-        ({"divisor": 4}, FrequencyDivisor(4)),
-        (Frequency(60.0), Frequency(60.0)),
-    ],
-)
-def test_rates_are_accepted_in_three_forms(value: object, rate: Rate) -> None:
+def test_rates_are_accepted_in_three_forms() -> None:
     """They are those of StreamFrames (§5.3.5)."""
-    assert StreamSettings.model_validate({"rate": value}).rate == rate
+    values = ["all", {"frequency_hz": 60}, {"frequency_hz": 0.5}, {"divisor": 4}, Frequency(60.0)]
+    rates = [AllFrames(), Frequency(60.0), Frequency(0.5), FrequencyDivisor(4), Frequency(60.0)]
+    assert [StreamSettings.model_validate({"rate": value}).rate for value in values] == rates
 
 
 @pytest.mark.parametrize(
@@ -146,36 +122,22 @@ def test_rates_are_accepted_in_three_forms(value: object, rate: Rate) -> None:
         ({"divisor": 0}, "rate.divisor", f"found 0; {WHOLE}"),
         ({"divisor": 1.5}, "rate.divisor", f"found 1.5; {WHOLE}"),
         ({"divisor": True}, "rate.divisor", f"found true; {WHOLE}"),
-        (
-            {"divisor": 2, "divisors": 2},
-            "rate.divisors",
-            "unknown key (did you mean 'divisor'?); known keys: divisor",
-        ),
-        (
-            {"divisor": 2, "frequency_hz": 2},
-            "rate",
-            "found frequency_hz and divisor together; expected one of them",
-        ),
+        ({"divisor": 2, "divisors": 2}, "rate.divisors", "unknown key (did you mean 'divisor'?)"),
+        ({"divisor": 2, "frequency_hz": 2}, "rate", "found frequency_hz and divisor together; expected one"),
     ],
 )
 def test_other_rates_are_refused(value: object, location: str, text: str) -> None:
     """The error is at the innermost key that is wrong."""
-    assert mistakes(StreamSettings, {"rate": value}) == [(location, text)]
+    [(found, message)] = mistakes(StreamSettings, {"rate": value})
+    assert found == location
+    assert message.startswith(text)
 
 
-@pytest.mark.parametrize(
-    ("value", "components"),
-    [
-        (["all"], WIRE_ORDER),
-        (["3d"], (MARKERS,)),
-        (["event", "force", "analog", "6d", "3d"], WIRE_ORDER),
-        (["analog", "3d"], (MARKERS, ANALOG)),
-        ((TOOLS, MARKERS), (MARKERS, TOOLS)),
-    ],
-)
-def test_components_are_kept_in_wire_order(value: object, components: tuple[ComponentType, ...]) -> None:
+def test_components_are_kept_in_wire_order() -> None:
     """So that equal choices are equal, however they are written."""
-    assert StreamSettings.model_validate({"components": value}).components == components
+    values = [["all"], ["3d"], ["event", "force", "analog", "6d", "3d"], ["analog", "3d"], (TOOLS, MARKERS)]
+    found = [StreamSettings.model_validate({"components": value}).components for value in values]
+    assert found == [WIRE_ORDER, (MARKERS,), WIRE_ORDER, (MARKERS, ANALOG), (MARKERS, TOOLS)]
 
 
 @pytest.mark.parametrize(
@@ -198,11 +160,8 @@ def test_other_components_are_refused(value: object, location: str, text: str) -
 
 def test_max_rates_are_those_of_components() -> None:
     """A limit for a component that does not exist would do nothing, unnoticed."""
-    assert LcmSettings(max_rate_hz={MARKERS: 60.0}).max_rate_hz == {MARKERS: 60.0}
-    assert LcmSettings.model_validate({"max_rate_hz": {"3d": 60, "analog": 0.5}}).max_rate_hz == {
-        MARKERS: 60.0,
-        ANALOG: 0.5,
-    }
+    rates = LcmSettings.model_validate({"max_rate_hz": {"3d": 60, "analog": 0.5, TOOLS: 1.0}}).max_rate_hz
+    assert rates == {MARKERS: 60.0, ANALOG: 0.5, TOOLS: 1.0}
     for value, error in (
         ({"3d": 0}, ("max_rate_hz.3d", f"found 0; {HERTZ}")),
         ({"3D": 60}, ("max_rate_hz", f"found '3D' (did you mean '3d'?); expected {COMPONENTS}")),
@@ -211,30 +170,25 @@ def test_max_rates_are_those_of_components() -> None:
         assert mistakes(LcmSettings, {"max_rate_hz": value}) == [error]
 
 
+KEYS = ["mocap", "a/b", "hall-2/mocap.x", "überlab", "a" * 128]
+NO_KEYS = ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb", "a\x07b", "a" * 129]
+URLS = [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x@y"]
+NO_URLS = ["", "udpm://a b", "udpm://\n", "udpm", "udpm:", "239.255.76.67:7667", "UDPM://", "zmq://x"]
+NO_URLS += ["tcpq://me@lab", "tcpq://a..b:7700", "tcpq://127.1:7700"]
+URL = "a URL that begins with udpm://, mpudpm://, memq://, tcpq:// or file://, without a user"
+PORT = "a whole number from 1 to 65535"
+
+
 @pytest.mark.parametrize(
     ("section", "key", "accepted", "refused", "expected"),
     [
-        (
-            ZenohSettings,
-            "prefix",
-            ["mocap", "a/b", "hall-2/mocap.x", "überlab", "a" * 128],
-            ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb", "a\x07b", "a" * 129],
-            "expected a Zenoh key of at most 128 characters",
-        ),
-        (
-            LcmSettings,
-            "url",
-            [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x@y"],
-            [
-                *("", "udpm", "udpm:", "239.255.76.67:7667", "UDPM://", "zmq://x", "udpm://a b", "udpm://\n"),
-                *("tcpq://me@lab", "tcpq://a..b:7700", "tcpq://127.1:7700"),
-            ],
-            "expected a URL that begins with udpm://, mpudpm://, memq://, tcpq:// or file://, without a user",
-        ),
-        (LcmSettings, "prefix", ["MOCAP", "a_1", "A" * 16], ["", "A-B", "Ä", "A" * 17], "expected "),
-        (SpoolSettings, "max_files", [1, 100_000], [0, 100_001, 1.0], "expected a whole number of files"),
-        (SpoolSettings, "directory", ["/var/lib"], ["", "var", "/a\nb"], "expected a folder's absolute path"),
-        (MetricsSettings, "port", [1, 65535], [0, 65536, "9464"], "expected a whole number from 1 to 65535"),
+        (ZenohSettings, "prefix", KEYS, NO_KEYS, "a Zenoh key of at most 128 characters"),
+        (LcmSettings, "url", URLS, NO_URLS, URL),
+        (LcmSettings, "prefix", ["MOCAP", "a_1", "A" * 16], ["", "A-B", "Ä", "A" * 17], ""),
+        (SpoolSettings, "max_files", [1, 100_000], [0, 100_001, 1.0], "a whole number of files"),
+        (SpoolSettings, "directory", ["/var/lib"], ["", "var", "/a\nb"], "a folder's absolute path"),
+        (MetricsSettings, "port", [1, 65535], [0, 65536, "9464"], PORT),
+        (ZenohSettings, "express", [True, False], [1, 0, "yes", None], "true or false"),
     ],
 )
 def test_values_of_other_sections(
@@ -246,7 +200,7 @@ def test_values_of_other_sections(
     for value in refused:
         [(location, text)] = mistakes(section, {key: value})
         assert location == key
-        assert text.startswith(f"found {describe(value)}; {expected}")
+        assert text.startswith(f"found {describe(value)}; expected {expected}")
 
 
 def test_keys_of_zenoh_itself_are_accepted() -> None:
@@ -254,20 +208,24 @@ def test_keys_of_zenoh_itself_are_accepted() -> None:
     assert ZenohSettings.model_validate({"config": config}).config == config
 
 
+ZENOH_REFUSES = "Zenoh refuses these keys: "
+PATH_OR_KEYS = "expected a JSON5 file's path or a mapping with Zenoh's own keys"
+
+
 @pytest.mark.parametrize(
     ("config", "text"),
     [
         (
             {"mode": "per"},
-            "Zenoh refuses these keys: unknown variant `per`, expected one of `router`, `peer`, `client`",
+            f"{ZENOH_REFUSES}unknown variant `per`, expected one of `router`, `peer`, `client`",
         ),
-        ({"connect": {"endpoints": ["nowhere"]}}, "Zenoh refuses these keys: Endpoints must be of the form"),
-        ({"mode": float("nan")}, "Zenoh refuses these keys: Out of range float"),
-        ({"mode": b"peer"}, "Zenoh refuses these keys: Object of type bytes"),
-        ([], "found an empty list; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
-        ("a\nb", "found 'a\\nb'; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
-        ("", "found ''; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
-        (True, "found true; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
+        ({"connect": {"endpoints": ["nowhere"]}}, f"{ZENOH_REFUSES}Endpoints must be of the form"),
+        ({"mode": float("nan")}, f"{ZENOH_REFUSES}Out of range float"),
+        ({"mode": b"peer"}, f"{ZENOH_REFUSES}Object of type bytes"),
+        ([], f"found an empty list; {PATH_OR_KEYS}"),
+        ("a\nb", f"found 'a\\nb'; {PATH_OR_KEYS}"),
+        ("", f"found ''; {PATH_OR_KEYS}"),
+        (True, f"found true; {PATH_OR_KEYS}"),
     ],
 )
 def test_configurations_that_zenoh_refuses_are_refused(config: object, text: str) -> None:

@@ -48,32 +48,23 @@ def test_a_plate_needs_four_corners_that_span_a_surface(corners: tuple[Point, ..
 
 
 def test_positions_have_the_unit_of_the_points() -> None:
-    geometry = geometry_of(replace(PLATE, origin=Point(0.1, 0.2, -0.3, "m")), "mm")
-    assert geometry
-    assert geometry.origin.tolist() == pytest.approx([100, 200, -300])
-    in_metres = geometry_of(replace(PLATE, origin=None), "m")
-    assert in_metres
-    assert in_metres.corners[0].tolist() == pytest.approx([0.508, 0.464, 0])
-    assert in_metres.origin.tolist() == [0, 0, 0]
-
-
-def test_a_plate_may_be_in_any_unit_that_markers_have() -> None:
-    geometry = geometry_of(replace(PLATE, origin=Point(1, 2, -3, "Feet")), "dm")
-    assert geometry
-    assert geometry.origin.tolist() == pytest.approx([3.048, 6.096, -9.144])
+    """A plate may be in any unit that markers have."""
+    for origin, unit, expected, corner in (
+        (Point(0.1, 0.2, -0.3, "m"), "mm", [100, 200, -300], [508, 464, 0]),
+        (Point(1, 2, -3, "Feet"), "dm", [3.048, 6.096, -9.144], [5.08, 4.64, 0]),
+        (None, "m", [0, 0, 0], [0.508, 0.464, 0]),
+    ):
+        geometry = geometry_of(replace(PLATE, origin=origin), unit)
+        assert geometry
+        assert geometry.origin.tolist() == pytest.approx(expected)
+        assert geometry.corners[0].tolist() == pytest.approx(corner)
 
 
 @pytest.mark.parametrize(
     ("moment_unit", "position_unit", "factor"),
     [
-        ("Nm", "mm", 1000),
-        ("Nmm", "mm", 1),
-        ("N.m", "mm", 1000),
-        ("N·mm", "m", 0.001),
-        ("N*m", "m", 1),
-        ("", "mm", 1),
-        ("lbf", "mm", 1),
-        ("Nm", "furlong", 1),
+        *(("Nm", "mm", 1000), ("Nmm", "mm", 1), ("N.m", "mm", 1000), ("N·mm", "m", 0.001)),
+        *(("N*m", "m", 1), ("", "mm", 1), ("lbf", "mm", 1), ("Nm", "furlong", 1)),
     ],
 )
 def test_moments_have_the_unit_of_the_points(moment_unit: str, position_unit: str, factor: float) -> None:

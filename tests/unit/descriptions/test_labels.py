@@ -31,25 +31,16 @@ def test_labels_are_those_of_the_keys_of_tools(labels: list[str]) -> None:
     assert found.labels == tuple(names)
 
 
-def test_items_beyond_the_parameters_are_called_by_their_position() -> None:
-    parameters = Parameters(
-        analog=ParametersAnalog((AnalogChannel("1", "EMG", unit="V", frequency_hz=1000.0),))
-    )
-    found = describe(ComponentType.ANALOG, parameters, 2)
-    assert (found.labels, found.units, found.unit, found.rate_hz) == (
-        ("EMG", "channel 2"),
-        ("V", "mV"),
-        "",
-        1000,
-    )
+def test_items_without_labels_are_called_by_their_position_and_other_labels_left_out() -> None:
+    channels = (AnalogChannel("1", "EMG", unit="V", frequency_hz=1000.0),)
+    found = describe(ComponentType.ANALOG, Parameters(analog=ParametersAnalog(channels)), 2)
+    assert (found.labels, found.units) == (("EMG", "channel 2"), ("V", "mV"))
+    assert (found.unit, found.rate_hz) == ("", 1000)
     assert describe(ComponentType.MARKERS, None, 2).labels == ("marker 1", "marker 2")
     assert describe(ComponentType.FORCE, None, 1).labels == ("plate 1",)
     assert describe(ComponentType.EVENT, None, 1).labels == ()
-
-
-def test_more_labels_than_items_are_left_out() -> None:
-    parameters = Parameters(tools=Parameters6D(100.0, (Tool("1", "a"), Tool("2", "b"))))
-    assert describe(ComponentType.TOOLS, parameters, 1).labels == ("a",)
+    tools = Parameters(tools=Parameters6D(100.0, (Tool("1", "a"), Tool("2", "b"))))
+    assert describe(ComponentType.TOOLS, tools, 1).labels == ("a",)
 
 
 def test_positions_of_tools_have_the_unit_of_the_markers() -> None:
@@ -73,7 +64,7 @@ def test_ids_of_events_are_decimal_or_hexadecimal() -> None:
         ("0xFFFFFFFF", "c"),
         ("abc", "d"),
         ("3", ""),
-        ("17", "second"),
+        ("17", "x"),
         ("0X12", "e"),
     )
     events = tuple(EventDefinition(event_id, label) for event_id, label in ids)

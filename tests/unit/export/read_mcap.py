@@ -3,7 +3,7 @@
 import json
 from collections import defaultdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment
 from mcap_protobuf.decoder import DecoderFactory
 
-from gateway.takes import Series, open_take
+from gateway.takes import open_take
 
 
 class Logged(NamedTuple):
@@ -58,15 +58,15 @@ def read_mcap(path: Path) -> McapContent:
 def points_of(cloud: Any) -> npt.NDArray[Any]:
     """Return the points of a PointCloud as its own fields describe them."""
     formats = {7: "<f4", 5: "<u4"}  # FLOAT32, UINT32
-    dtype = np.dtype(
-        {
-            "names": [field.name for field in cloud.fields],
-            "formats": [formats[field.type] for field in cloud.fields],
-            "offsets": [field.offset for field in cloud.fields],
-            "itemsize": cloud.point_stride,
-        }
+    fields = cloud.fields
+    dtype: dict[str, Any] = {
+        "names": [field.name for field in fields],
+        "formats": [formats[field.type] for field in fields],
+    }
+    offsets = [field.offset for field in fields]
+    return np.frombuffer(
+        cloud.data, np.dtype(cast(Any, {**dtype, "offsets": offsets, "itemsize": cloud.point_stride}))
     )
-    return np.frombuffer(cloud.data, dtype)
 
 
 def floats_of(record: Any) -> dict[str, float]:
@@ -74,50 +74,36 @@ def floats_of(record: Any) -> dict[str, float]:
     return {field.name: getattr(record, field.name) for field in record.DESCRIPTOR.fields}
 
 
-def assert_equals_take(content: McapContent, path: Path, source: str = "lab") -> None:
+def assert_equals_take(content: McapContent, path: Path) -> None:
     """The file has every value and every time of capture of a take whose labels do not change."""
-    recorded = open_take(path).sources[source]
+    recorded = open_take(path).sources["lab"]
     topics = content.topics
     for key, topic in (("3d", "markers"), ("analog", "analog"), ("force", "loads"), ("force", "forces")):
-        times = [log.time_ns // 1000 for log in topics.get(f"/{source}/{topic}", [])]
+        times = [log.time_ns // 1000 for log in topics.get(f"/lab/{topic}", [])]
         assert times == (recorded.series[key].capture_utime.tolist() if key in recorded.series else [])
-    if recorded.markers is not None:
-        assert_equal_markers(topics[f"/{source}/markers"], recorded.markers)
-    if recorded.tools is not None:
-        assert_equal_tools(topics.get(f"/{source}/tools", []), recorded.tools, source)
-    for key, topic in (("analog", "analog"), ("force", "loads")):
-        if key in recorded.series:
-            values = recorded.series[key].values.reshape(len(recorded.series[key]), -1)
-            logged = [list(floats_of(log.content).values()) for log in topics[f"/{source}/{topic}"]]
-            assert np.array_equal(np.array(logged, np.float32), values, equal_nan=True)
-    num_events = 0 if recorded.events is None else len(recorded.events)
-    assert len(topics.get(f"/{source}/events", [])) == num_events
-
-
-def assert_equal_markers(logged: list[Logged], recorded: Series) -> None:
-    metres = {"mm": 1e-3, "m": 1.0}[recorded.unit]
-    for row, log in zip(recorded.items, logged, strict=True):
+    assert recorded.markers is not None
+    metres = {"mm": 1e-3, "m": 1.0}[recorded.markers.unit]
+    for row, log in zip(recorded.markers.items, topics["/lab/markers"], strict=True):
         points = points_of(log.content)
         visible = row[points["marker"]]
         for axis in "xyz":
             assert np.allclose(points[axis], visible[axis] * metres, rtol=2e-7, atol=0)
             assert np.isnan(np.delete(row[axis], points["marker"])).all()
         assert np.array_equal(points["reliability"], visible["reliability"])
-
-
-def assert_equal_tools(logged: list[Logged], recorded: Series, source: str) -> None:
-    visible_frames = ~np.isnan(recorded.items["q0"]).all(axis=1)
-    rows = recorded.items[visible_frames]
-    for row, log in zip(rows, logged, strict=True):
-        found = {transform.child_frame_id: transform for transform in log.content.transforms}
-        for label, tool in zip(recorded.labels, row, strict=True):
-            transform = found.pop(f"{source}/{label}", None)
-            assert (transform is None) == np.isnan(tool["q0"])
-            if transform is not None:
-                p, q = transform.translation, transform.rotation
-                assert np.allclose((p.x, p.y, p.z), [tool[axis] * 1e-3 for axis in "xyz"], rtol=2e-7)
-                assert (q.w, q.x, q.y, q.z) == tuple(tool[name] for name in ("q0", "qx", "qy", "qz"))
-        assert not found
+    if recorded.tools is not None:
+        rows = recorded.tools.items[~np.isnan(recorded.tools.items["q0"]).all(axis=1)]
+        for row, log in zip(rows, topics["/lab/tools"], strict=True):
+            shown = [
+                f"lab/{label}"
+                for label, tool in zip(recorded.tools.labels, row, strict=True)
+                if not np.isnan(tool["q0"])
+            ]
+            assert [transform.child_frame_id for transform in log.content.transforms] == shown
+    for key, topic in (("analog", "analog"), ("force", "loads")):
+        if key in recorded.series:
+            values = recorded.series[key].values.reshape(len(recorded.series[key]), -1)
+            logged = [list(floats_of(log.content).values()) for log in topics[f"/lab/{topic}"]]
+            assert np.array_equal(np.array(logged, np.float32), values, equal_nan=True)
 
 
 def rotated(quaternion: Any, vector: tuple[float, float, float]) -> npt.NDArray[Any]:

@@ -4,7 +4,7 @@ import math
 import os
 import struct
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -82,9 +82,8 @@ def plates(*described: Plate, version: int = 1) -> Message:
 
 
 @pytest.mark.takes
-@pytest.mark.parametrize("name", ["qualisys", "optotrak"])
-def test_every_value_of_a_real_recording_is_exported(tmp_path: Path, name: str) -> None:
-    scene = C3dScene(Path(os.environ["RTC3D_TAKES"]) / f"{name}.c3d")
+def test_every_value_of_a_real_recording_is_exported(tmp_path: Path) -> None:
+    scene = C3dScene(Path(os.environ["RTC3D_TAKES"]) / "qualisys.c3d")
     messages = [description(), parameters(scene.parameters), *scene_messages(scene, scene.num_frames or 0)]
     content = export(tmp_path, messages)
     assert_equals_take(content, tmp_path / "take.lcmlog")
@@ -111,9 +110,7 @@ def test_every_value_of_a_computed_scene_is_exported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "metres"), [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0), ("", 1e-3)])
-def test_markers_are_in_metres_and_missing_ones_are_left_out(
-    tmp_path: Path, name: str, metres: float
-) -> None:
+def test_markers_are_in_metres_without_missing_ones(tmp_path: Path, name: str, metres: float) -> None:
     rows: list[list[tuple[Any, ...]]] = [
         [(1, 2, 3, 0.5), NO_MARKER, (-4, 5, math.nan, 1), (7, 8, 9, 2)],
         [NO_MARKER],
@@ -142,12 +139,11 @@ def test_visible_tools_are_transforms_from_the_source_to_their_labels(tmp_path: 
         markers=Parameters3D(100.0, "cm"),
         tools=Parameters6D(100.0, tuple(Tool("1", x) for x in ("cup", "a b"))),
     )
-    rows: list[list[tuple[Any, ...]]] = [
-        [(0.5, 0.5, -0.5, 0.5, 100, 200, 300, 0.1), (0, 0, 0, 0, 1, 2, 3, 0)],
-        [NO_TOOL, NO_TOOL],
-        [NO_TOOL, (1, 0, 0, 0, 4, 5, 6, 0), (1, 0, 0, 0, 7, 8, 9, 0)],
+    messages = [
+        frame(ComponentType.TOOLS, [(0.5, 0.5, -0.5, 0.5, 100, 200, 300, 0.1), (0, 0, 0, 0, 1, 2, 3, 0)]),
+        frame(ComponentType.TOOLS, [NO_TOOL, NO_TOOL], 1),
+        frame(ComponentType.TOOLS, [NO_TOOL, (1, 0, 0, 0, 4, 5, 6, 0), (1, 0, 0, 0, 7, 8, 9, 0)], 2),
     ]
-    messages = [frame(ComponentType.TOOLS, row, number) for number, row in enumerate(rows)]
     first, last = export(tmp_path, [parameters(described), *messages]).topics["/lab/tools"]
     [cup] = first.content.transforms
     assert (cup.parent_frame_id, cup.child_frame_id) == ("lab", "lab/cup")
@@ -184,37 +180,29 @@ def test_a_force_is_an_arrow_at_the_centre_of_pressure(tmp_path: Path) -> None:
     assert outline.texts[0].text == "left"
     assert [deletion.type for deletion in scene.content.deletions] == [1]  # all
     loads = floats_of(content.topics["/lab/loads"][0].content)
-    assert loads == pytest.approx(
-        dict(
-            zip(
-                ("left_fx", "left_fy", "left_fz", "left_mx", "left_my", "left_mz"),
-                (*force, *moment),
-                strict=True,
-            )
-        )
-    )
+    assert list(loads) == [f"left_{name}" for name in ("fx", "fy", "fz", "mx", "my", "mz")]
+    assert list(loads.values()) == pytest.approx([*force, *moment])
 
 
 @pytest.mark.parametrize(
-    ("units", "force_factor", "moment_factor"),
+    ("units", "factors"),
     [
-        (("kN", "Nm"), 1e-3, 1.0),
-        (("N", "Nmm"), 1.0, 1e3),
-        (("n", "N.mm"), 1.0, 1e3),
-        (("kN", "kNm"), 1e-3, 1e-3),
+        (("kN", "Nm"), (1e-3, 1.0)),
+        (("N", "Nmm"), (1.0, 1e3)),
+        (("n", "N.mm"), (1.0, 1e3)),
+        (("kN", "kNm"), (1e-3, 1e-3)),
     ],
 )
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (-1, 0, 0.03), (0, 1, 1)])
 def test_arrows_know_the_units_of_forces_and_moments(
     tmp_path: Path,
     units: tuple[str, str],
-    force_factor: float,
-    moment_factor: float,
+    factors: tuple[float, float],
     direction: tuple[float, float, float],
 ) -> None:
     force = np.array(direction) * 1000
     moment = np.cross([-0.2, 0.1, 0.0], force)
-    message = frame(ComponentType.FORCE, [(*force * force_factor, *moment * moment_factor)])
+    message = frame(ComponentType.FORCE, [(*force * factors[0], *moment * factors[1])])
     content = export(tmp_path, [plates(plate(*units)), message])
     [arrow] = content.topics["/lab/forces"][0].content.entities[0].arrows
     assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((1.1, 0.3), abs=1e-5)
@@ -233,22 +221,15 @@ def test_a_plate_whose_place_is_not_known_has_numbers_but_no_arrow(tmp_path: Pat
 
 def test_plates_that_are_renamed_replace_the_earlier_ones(tmp_path: Path) -> None:
     load = [(0, 0, 100, 0, 0, 0)]
-    messages = [
-        plates(plate()),
-        frame(ComponentType.FORCE, load),
-        plates(version=2),
-        frame(ComponentType.FORCE, load, 1, version=2),
-        frame(ComponentType.FORCE, load, 2, version=2),
-    ]
+    messages = [plates(plate()), frame(ComponentType.FORCE, load), plates(version=2)]
+    messages += [frame(ComponentType.FORCE, load, number, version=2) for number in (1, 2)]
     content = export(tmp_path, messages)
     first, second = content.topics["/lab/plates"]
     assert [len(update.content.entities) for update in (first, second)] == [1, 0]
     assert second.time_ns == content.topics["/lab/forces"][1].time_ns
     assert [entry.content["version"] for entry in content.topics["/lab/parameters"]] == [1, 2]
-    assert [attachment.name for attachment in content.attachments] == [
-        "lab-parameters-1.xml",
-        "lab-parameters-2.xml",
-    ]
+    names = [attachment.name for attachment in content.attachments]
+    assert names == ["lab-parameters-1.xml", "lab-parameters-2.xml"]
 
 
 def test_events_are_logged_with_their_labels_and_parameters(tmp_path: Path) -> None:
@@ -263,11 +244,8 @@ def test_events_are_logged_with_their_labels_and_parameters(tmp_path: Path) -> N
         frame(ComponentType.EVENT, [], 2),
     ]
     logs = export(tmp_path, messages).topics["/lab/events"]
-    assert [log.content.message for log in logs] == [
-        "Button (number: 3; state: ON)",
-        "event 7",
-        "Button (number: 4; state: 0)",
-    ]
+    expected = ["Button (number: 3; state: ON)", "event 7", "Button (number: 4; state: 0)"]
+    assert [log.content.message for log in logs] == expected
     captured_ns = (START_UTIME - 2000) * 1000
     # The first is 1 ms older than its frame; the others have no plausible time stamp.
     assert [log.time_ns for log in logs] == [captured_ns - 1_000_000, captured_ns, captured_ns + 10_000_000]
@@ -301,20 +279,15 @@ def test_other_labels_get_another_topic_because_viewers_decode_a_topic_in_one_wa
         ]
     content = export(tmp_path, [description(), description("lab-2"), *messages])
     for source, package in (("lab", "lab"), ("lab-2", "lab_2")):
-        assert [floats_of(log.content) for log in content.topics[f"/{source}/analog"]] == [
-            {"a": 1, "b": 2}
-        ] * 3
-        assert [floats_of(log.content) for log in content.topics[f"/{source}/analog_2"]] == [
-            {"x": 1, "b": 2}
-        ] * 2
-        assert content.schemas[f"/{source}/analog"] == f"rtc3d.{package}.Analog"
-        assert content.schemas[f"/{source}/analog_2"] == f"rtc3d.{package}.Analog_2"
+        for end, expected in (("", [{"a": 1, "b": 2}] * 3), ("_2", [{"x": 1, "b": 2}] * 2)):
+            topic = f"/{source}/analog{end}"
+            assert [floats_of(log.content) for log in content.topics[topic]] == expected
+            assert content.schemas[topic] == f"rtc3d.{package}.Analog{end}"
 
 
 def test_frames_with_very_many_channels_are_left_out_and_reported(tmp_path: Path) -> None:
     values = np.arange(10_001).tolist()
-    rows = [values[1:], values]
-    messages = [frame(ComponentType.ANALOG, row, number) for number, row in enumerate(rows)]
+    messages = [frame(ComponentType.ANALOG, values[1:]), frame(ComponentType.ANALOG, values, 1)]
     job = export_messages(tmp_path, messages, "walk.mcap")
     assert job.notes[1:] == ["messages with more than 10000 numbers in analog of lab were left out: 1"]
     [log] = read_mcap(tmp_path / "walk.mcap").topics["/lab/analog"]
@@ -340,13 +313,6 @@ def test_only_the_chosen_time_and_source_are_exported(tmp_path: Path) -> None:
     assert set(content.metadata) == {"lab"}
 
 
-def test_a_take_without_frames_is_an_error(tmp_path: Path) -> None:
-    for options in ({}, {"from_s": 0.0, "to_s": 1.0}):
-        with pytest.raises(TakeError, match="has no frames"):
-            export_messages(tmp_path, [description(), unit("mm")], "walk.mcap", **options)
-    assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
-
-
 def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
     channel, message = markers(2, 3)
     truncated = message[:-1]
@@ -368,33 +334,17 @@ def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
 
 def test_versions_that_start_again_have_the_newest_parameters_before_the_message(tmp_path: Path) -> None:
     late = START_UTIME + 1_000_000
-    messages = [
-        channels("old"),
-        frame(ComponentType.ANALOG, [1]),
-        (channels("new")[0], channels("new")[1][:8] + struct.pack(">q", late) + channels("new")[1][16:]),
-        frame(ComponentType.ANALOG, [2], 1, utime=late + 1),
-        frame(ComponentType.ANALOG, [3], 2, version=5, utime=late + 2),
-    ]
+    new = Parameters(analog=ParametersAnalog((AnalogChannel("0", "new"),)))
+    messages = [channels("old"), frame(ComponentType.ANALOG, [1]), parameters(new, utime=late)]
+    messages.append(frame(ComponentType.ANALOG, [2], 1, utime=late + 1))
+    messages.append(frame(ComponentType.ANALOG, [3], 2, version=5, utime=late + 2))
     content = export(tmp_path, messages)
-    found = [
-        floats_of(log.content) for topic, logs in content.topics.items() if "analog" in topic for log in logs
-    ]
+    analog = (logs for topic, logs in content.topics.items() if "analog" in topic)
+    found = [floats_of(log.content) for logs in analog for log in logs]
     assert found == [{"old": 1}, {"new": 2}, {"channel_1": 3}]
 
 
-def test_the_progress_reaches_the_end(tmp_path: Path) -> None:
-    shown: list[tuple[str, int, int]] = []
-    messages = [frame(ComponentType.ANALOG, [0.0] * 5000, number) for number in range(300)]
-    export(tmp_path, [unit("mm"), *messages], progress=lambda *values: shown.append(values))
-    written = [done / total for what, done, total in shown if what == "writing walk.mcap"]
-    assert len(written) >= 5
-    assert written == sorted(written)
-    assert 0.8 < written[-1] <= 1.0
-
-
-def test_without_foxglove_sdk_the_error_says_how_to_install_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_foxglove_sdk_the_error_has_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in [name for name in sys.modules if name.startswith("gateway.export.mcap")]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "gateway.foxglove_schemas.float_topics", None)
@@ -407,16 +357,13 @@ def test_a_full_disk_is_its_own_error_whatever_is_written() -> None:
     topic = Topic("/lab/test", "json", "test", "jsonschema", b"{}")
     message = FoxgloveMessage(topic, START_UTIME, os.urandom(2_000_000))
 
-    def attach(file: McapFile) -> None:
-        file.attach(START_UTIME, "large", "application/xml", bytes(2_000_000))
-
-    def write(file: McapFile) -> None:
-        file.write(message)
-
-    def describe_only(file: McapFile) -> None:
-        file.write_metadata("lab", {"server": "192.0.2.20:3020"})
-
-    for use in (attach, write, describe_only, lambda _file: None):
+    uses: list[Callable[[McapFile], object]] = [
+        lambda file: file.attach(START_UTIME, "large", "application/xml", bytes(2_000_000)),
+        lambda file: file.write(message),
+        lambda file: file.write_metadata("lab", {"server": "192.0.2.20:3020"}),
+        lambda _file: None,
+    ]
+    for use in uses:
         with (
             Path("/dev/full").open("wb", buffering=0) as full,
             pytest.raises(OSError, match="No space left on device"),

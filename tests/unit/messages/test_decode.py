@@ -1,9 +1,14 @@
+"""Messages decoded by their fingerprints, and as JSON."""
+
 import json
+import math
 
 import pytest
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, to_json
+from gateway.messages.json_text import json_text
+from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 from tests.unit.messages.samples import (
     command_messages,
     component_message,
@@ -16,16 +21,8 @@ from tests.unit.messages.samples import (
 from tests.vectors import COMPONENTS, LONG_EVENTS, MARKERS
 
 MISSING = [None] * 3
-
-EVERY_MESSAGE = [
-    *map(component_message, COMPONENTS),
-    *tool_pose_messages(),
-    status_of(),
-    unknown_clock(),
-    *parameter_messages(),
-    *command_messages(),
-    take_message(),
-]
+PUBLISHED = [*map(component_message, COMPONENTS), *tool_pose_messages(), status_of(), unknown_clock()]
+EVERY_MESSAGE = [*PUBLISHED, *parameter_messages(), *command_messages(), take_message()]
 
 
 def test_every_message_is_decoded_by_its_fingerprint_and_can_be_written_as_json() -> None:
@@ -36,21 +33,17 @@ def test_every_message_is_decoded_by_its_fingerprint_and_can_be_written_as_json(
         assert decoded.encode() == message
         value = to_json(decoded)
         assert json.loads(json.dumps(value, allow_nan=False)) == value
+        assert json_text(decoded) == json.dumps(value, separators=(",", ":"), ensure_ascii=False)
     assert set(MESSAGE_TYPES_BY_NAME) == {type(decode(message)).__name__ for message in EVERY_MESSAGE}
     assert len(MESSAGE_TYPES_BY_NAME) == 14
 
 
-def test_messages_of_unknown_types_are_rejected_with_their_fingerprint() -> None:
-    """The number tells the versions of a message type apart."""
+def test_messages_that_are_unknown_or_truncated_anywhere_are_rejected() -> None:
+    """lcm-gen's decoders would return a part as if it were whole; the fingerprint tells versions apart."""
     for message in (b"", b"abc", 8 * b"\0", 100 * b"x"):
-        with pytest.raises(
-            ProtocolError, match=f"^{len(message)} bytes with fingerprint {message[:8].hex()} "
-        ):
+        text = f"^{len(message)} bytes with fingerprint {message[:8].hex()} "
+        with pytest.raises(ProtocolError, match=text):
             decode(message)
-
-
-def test_a_message_truncated_anywhere_is_rejected() -> None:
-    """lcm-gen's decoders would return a part of it as if it were whole."""
     for message in EVERY_MESSAGE:
         for length in range(8, len(message)):
             with pytest.raises(ProtocolError, match=f"of {length} bytes is truncated"):
@@ -66,17 +59,26 @@ def test_missing_values_are_null_in_json() -> None:
 
 
 def test_json_has_every_field() -> None:
-    assert to_json(decode(component_message(LONG_EVENTS))) == {
-        "utime": 2_000,
-        "capture_utime": 1_000,
-        "sequence": 41,
-        "session": 3,
-        "parameters_version": 5,
-        "frame_number": 6,
-        "timestamp": 12500,
-        "num_events": 2,
-        "events": [
-            dict(zip(LONG_EVENTS.fields, event, strict=True))
-            for event in zip(*LONG_EVENTS.fields.values(), strict=True)
-        ],
-    }
+    events = zip(*LONG_EVENTS.fields.values(), strict=True)
+    stamp = {"utime": 2_000, "capture_utime": 1_000, "sequence": 41, "session": 3, "parameters_version": 5}
+    content = {"frame_number": 6, "timestamp": 12500, "num_events": 2}
+    items = [dict(zip(LONG_EVENTS.fields, event, strict=True)) for event in events]
+    assert to_json(decode(component_message(LONG_EVENTS))) == stamp | content | {"events": items}
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ([math.inf, -math.inf, math.nan, -0.0, 1e300, 0.1], "[null,null,null,-0.0,1e+300,0.1]"),
+        ({"Käfig": (1, True, False, None)}, '{"Käfig":[1,true,false,null]}'),
+        ('"\\\n\x00\u2028', '"\\"\\\\\\n\\u0000\u2028"'),
+        *(([], "[]"), ({}, "{}")),
+    ],
+)
+def test_values_as_json(value: object, text: str) -> None:
+    assert json_text(value) == text
+
+
+def test_parameters_are_objects_of_their_fields() -> None:
+    parameters = Parameters(force=ParametersForce((Plate("1", corners=(Point(x=1.0),)),)))
+    assert json.loads(json_text(parameters)) == to_json(parameters)

@@ -1,5 +1,8 @@
+"""The clocks of the host: the offset between them, steps and slow corrections."""
+
 import logging
 import time
+from collections.abc import Callable
 
 import pytest
 
@@ -8,41 +11,26 @@ from gateway.messages.host_time import HostClock, now_steady_us, now_utime
 DAY_S = 86_400.0
 
 
-class SetClock:
-    """Sets the wall clock that this process sees."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self._offset_ns = 0
-        real = time.time_ns
-        monkeypatch.setattr(time, "time_ns", lambda: real() + self._offset_ns)
-
-    def by(self, seconds: float) -> None:
-        self._offset_ns += round(1e9 * seconds)
-
-
 @pytest.fixture
-def set_clock(monkeypatch: pytest.MonkeyPatch) -> SetClock:
-    return SetClock(monkeypatch)
+def set_clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Set the wall clock that this process sees, by a number of seconds."""
+    offsets_ns: list[int] = []
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + sum(offsets_ns))
+    return lambda by_s: offsets_ns.append(round(1e9 * by_s))
 
 
-def test_the_hosts_time_is_in_microseconds_since_the_unix_epoch() -> None:
-    before_ns = time.time_ns()
-    utime = now_utime()
-    assert before_ns // 1000 <= utime <= time.time_ns() // 1000
-
-
-def test_a_reading_has_both_clocks() -> None:
+def test_a_reading_has_both_clocks_and_utime_is_in_microseconds_since_the_epoch() -> None:
     clock = HostClock()
-    before_utime, before_us = now_utime(), now_steady_us()
+    before_ns, before_us = time.time_ns(), now_steady_us()
     utime, steady_us = clock.read()
     assert before_us <= steady_us <= now_steady_us()
-    assert before_utime - 1000 <= utime <= now_utime() + 1000
+    assert before_ns // 1000 - 1000 <= utime <= now_utime() + 1000
+    assert now_utime() <= time.time_ns() // 1000
 
 
 @pytest.mark.interpreted
-def test_the_offset_is_that_of_the_reading_that_was_interrupted_least(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_offset_is_that_of_the_reading_interrupted_least(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process may be stopped between the two clocks; such a reading would look like a step."""
     delays_us = iter([500, 40_000, 2, 900, 70])
     now_us = 1_000_000
@@ -68,19 +56,16 @@ def test_the_clocks_do_not_drift_apart_while_nobody_sets_the_wall_clock() -> Non
 @pytest.mark.parametrize(
     ("by_s", "text"),
     [
-        (0.5, "forward by 0.500 s"),
-        (-0.5, "back by 0.500 s"),
-        (DAY_S, "forward by 86400.000 s"),
-        (-DAY_S, "back by 86400.000 s"),
-        (200 * DAY_S, "forward by 17280000.000 s"),
+        *((0.5, "forward by 0.500"), (-0.5, "back by 0.500"), (-DAY_S, "back by 86400.000")),
+        (200 * DAY_S, "forward by 17280000.000"),
     ],
 )
 def test_a_step_is_followed_at_once_and_logged_once(
-    by_s: float, text: str, set_clock: SetClock, caplog: pytest.LogCaptureFixture
+    by_s: float, text: str, set_clock: Callable[[float], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     clock = HostClock()
     utime, steady_us = clock.read()
-    set_clock.by(by_s)
+    set_clock(by_s)
     for _ in range(100):
         utime_after, steady_after_us = clock.read()
         assert utime_after - steady_after_us == pytest.approx(utime - steady_us + 1e6 * by_s, abs=1000)
@@ -89,28 +74,28 @@ def test_a_step_is_followed_at_once_and_logged_once(
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     [message] = caplog.messages
     assert message.startswith("the clock of this computer was set ")
-    assert text[:-6] in message
+    assert text[:-2] in message
 
 
 def test_slow_corrections_are_followed_in_silence(
-    set_clock: SetClock, caplog: pytest.LogCaptureFixture
+    set_clock: Callable[[float], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     clock = HostClock()
     before_us = clock.offset_us
     for _ in range(1000):
-        set_clock.by(0.0005)
+        set_clock(0.0005)
         clock.read()
     assert clock.offset_us - before_us == pytest.approx(500_000, abs=1000)
     assert (clock.steps, caplog.messages) == (0, [])
 
 
 def test_the_log_of_a_clock_that_is_set_all_the_time_is_bounded(
-    set_clock: SetClock, caplog: pytest.LogCaptureFixture
+    set_clock: Callable[[float], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG, "gateway.messages.host_time")
     clock = HostClock()
     for _ in range(25):
-        set_clock.by(1.0)
+        set_clock(1.0)
         clock.read()
     assert clock.steps == 25
     assert [record.levelname for record in caplog.records] == 10 * ["WARNING"] + 15 * ["DEBUG"]

@@ -1,3 +1,5 @@
+"""What a person reads of a message, and the server's XML as text in messages."""
+
 import logging
 
 import pytest
@@ -6,6 +8,7 @@ import rtc3d
 from gateway.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
+from gateway.messages.parameters_text import xml_bytes, xml_text
 from gateway.messages.summary import summarise
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import status_message
@@ -20,48 +23,40 @@ from tests.unit.messages.samples import (
 )
 from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
 
+LAB = "#17 lab at 192.0.2.20:3020: [3d 6d] "
+OUTPUTS = "; outputs: zenoh ok; lcm no multicast: ip route add"
+STREAMING = status_of(state=StreamState.STREAMING, frames_in=600, reconnects=1, last_error="gone")
+
 
 @pytest.mark.parametrize(
     ("message", "line"),
     [
         (
             component_message(MARKERS),
-            "#41 frame 16909060 at 4328.7194 s: 2 markers, 1 missing, first visible at (1, -2.5, 1000)",
+            "16909060 at 4328.7194 s: 2 markers, 1 missing, first visible at (1, -2.5, 1000)",
         ),
-        (
-            component_message(TOOLS),
-            "#41 frame 4 at 0.0075 s: 2 tools, 1 missing, first visible at (100, -200, 1600)",
-        ),
-        (component_message(ANALOG), "#41 frame 2 at 0.0025 s: 3 channels, voltages 0.1, -15000, 0"),
-        (component_message(FORCE), "#41 frame 3 at 0.0050 s: 2 plates, forces (1.5, -0.75, 800); (4, 5, 6)"),
+        (component_message(TOOLS), "4 at 0.0075 s: 2 tools, 1 missing, first visible at (100, -200, 1600)"),
+        (component_message(ANALOG), "2 at 0.0025 s: 3 channels, voltages 0.1, -15000, 0"),
+        (component_message(FORCE), "3 at 0.0050 s: 2 plates, forces (1.5, -0.75, 800); (4, 5, 6)"),
         (
             component_message(LONG_EVENTS),
-            "#41 frame 6 at 0.0125 s: 2 events: id 0x123456 (7, 1, -1); id 0x2 (1065353216, -1, -1)",
+            "6 at 0.0125 s: 2 events: id 0x123456 (7, 1, -1); id 0x2 (1065353216, -1, -1)",
         ),
         (
             tool_pose_messages()[0],
-            "#41 frame 4 at 0.0075 s: position (0.1, -0.2, 1.6) m, orientation xyzw (-0.4, 0.4, 0.2, 0.8)",
+            "4 at 0.0075 s: position (0.1, -0.2, 1.6) m, orientation xyzw (-0.4, 0.4, 0.2, 0.8)",
         ),
         (tool_pose_messages()[1], "#42 frame 4 at 0.0075 s: out of view"),
         (command_messages()[0], "command 7 from 'remote': take set=start name=walk-1"),
         (command_messages()[1], """reply 7 to 'remote': {"source":"lab","name":"walk-1"}"""),
         (unknown_clock(), "#17 the server's time stamps cannot be used as a clock (3d 6d)"),
-        (
-            status_of(state=StreamState.STREAMING, frames_in=600, reconnects=1, last_error="gone"),
-            "#17 lab at 192.0.2.20:3020: "
-            "[3d 6d] streaming 60.0 Hz, 600 frames, 1 reconnects, last error: gone; "
-            "outputs: zenoh ok; lcm no multicast: ip route add",
-        ),
-        (
-            status_of(),
-            "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 60.0 Hz, 0 frames, 0 reconnects; "
-            "outputs: zenoh ok; lcm no multicast: ip route add",
-        ),
+        (STREAMING, f"{LAB}streaming 60.0 Hz, 600 frames, 1 reconnects, last error: gone{OUTPUTS}"),
+        (status_of(), f"{LAB}waiting to reconnect 60.0 Hz, 0 frames, 0 reconnects{OUTPUTS}"),
     ],
     ids=lambda each: each if isinstance(each, str) else "",  # messages have the time
 )
 def test_a_summary_shows_what_matters_first(message: bytes, line: str) -> None:
-    assert summarise(decode(message)) == line
+    assert summarise(decode(message)) == (f"#41 frame {line}" if line[0].isdigit() else line)
 
 
 def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
@@ -106,3 +101,21 @@ def test_a_summary_shows_four_channels_at_most(num_channels: int, shown: str) ->
     message = rtc3d.analog_t()
     message.num_channels, message.voltages = num_channels, [1.0, 2.0, 3.0, 4.0, 5.0][:num_channels]
     assert summarise(message).endswith(f"{num_channels} channels, voltages {shown}")
+
+
+CONTENT = "<RT_Parameters><The_3D><Marker><Label>Fuß</Label></Marker></The_3D></RT_Parameters>"
+
+
+@pytest.mark.parametrize("encoding", ["ISO-8859-1", "latin1", "windows-1252", "UTF-8", "utf8"])
+def test_xml_returns_to_the_encoding_that_it_declares(encoding: str) -> None:
+    """The summary gives the size of the XML as the server sent it."""
+    xml = f"<?xml version='1.0' encoding='{encoding}'?>{CONTENT}".encode(encoding)
+    assert xml_bytes(xml_text(xml)) == xml
+    reply = rtc3d.parameters_reply_t()
+    reply.xml = xml_text(xml + b"\0\0")  # some servers end it in NULs
+    assert f"{len(xml)} bytes of XML" in summarise(reply)
+
+
+def test_xml_without_a_declaration_or_that_does_not_fit_it_is_utf_8() -> None:
+    for text in (CONTENT, f"<?xml version='1.0' encoding='ISO-8859-1'?>{CONTENT.replace('Fuß', '足')}"):
+        assert xml_bytes(text) == text.encode()

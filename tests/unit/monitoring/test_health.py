@@ -19,11 +19,7 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.configurations import make_settings
 
-MARKERS, ANALOG, EVENT = (
-    (ComponentType.MARKERS,),
-    (ComponentType.ANALOG,),
-    (ComponentType.EVENT,),
-)
+MARKERS, ANALOG, EVENT = ((ComponentType.MARKERS,), (ComponentType.ANALOG,), (ComponentType.EVENT,))
 STALL_TIMEOUT_S = 3.0
 
 
@@ -65,40 +61,26 @@ def set_state(status: StreamStatus, state: StreamState, age_s: float | None) -> 
 
 
 @pytest.mark.parametrize("state", StreamState)
-async def test_a_recent_frame_is_healthy_in_every_state(state: StreamState) -> None:
+async def test_a_recent_frame_is_healthy_in_every_state_and_others_only_without_a_measurement(
+    state: StreamState,
+) -> None:
+    """The page turns unhealthy when the gateway gives up the stream, not later."""
     lab = Lab(StreamSettings(components=MARKERS))
     set_state(lab.statuses[0], state, STALL_TIMEOUT_S - 1)
     assert lab.problem() == ""
-
-
-async def test_a_frame_as_old_as_the_limit_is_too_old() -> None:
-    """The page turns unhealthy when the gateway gives up the stream, not later."""
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.STREAMING, STALL_TIMEOUT_S)
-    assert "no frame for" in lab.problem()
+    for age_s, text in (
+        (STALL_TIMEOUT_S, "no frame for"),
+        (None, "no frame so far"),
+        (41.5, "no frame for 41.5 s"),
+    ):
+        set_state(lab.statuses[0], state, age_s)
+        assert lab.problem()[: len(text)] == ("" if state is StreamState.NO_MEASUREMENT else text)
 
 
 async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
     lab = Lab(StreamSettings(components=MARKERS))
     set_state(lab.statuses[0], StreamState.STREAMING, STALL_TIMEOUT_S - 0.5)
     time.sleep(0.8)  # noqa: ASYNC251 - the process stands still
-    assert lab.problem() == ""
-
-
-@pytest.mark.parametrize("state", [state for state in StreamState if state is not StreamState.NO_MEASUREMENT])
-@pytest.mark.parametrize(("age_s", "text"), [(None, "no frame so far"), (41.5, "no frame for 41.5 s")])
-async def test_a_stream_without_a_recent_frame_is_unhealthy(
-    state: StreamState, age_s: float | None, text: str
-) -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], state, age_s)
-    assert lab.problem().startswith(text)
-
-
-@pytest.mark.parametrize("age_s", [None, 41.5])
-async def test_no_measurement_is_healthy(age_s: float | None) -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.NO_MEASUREMENT, age_s)
     assert lab.problem() == ""
 
 
@@ -115,21 +97,15 @@ async def test_the_problem_names_the_reason_and_what_to_check() -> None:
     assert "is a measurement running?" in lab.problem()
 
 
-async def test_an_on_demand_stream_without_subscribers_is_healthy() -> None:
-    lab = Lab(StreamSettings(components=MARKERS, on_demand=True))
-    set_state(lab.statuses[0], StreamState.IDLE, None)
-    assert lab.problem() != ""
-    lab.output.has_subscriber = False
-    assert lab.problem() == ""
-    lab.statuses[0].state = StreamState.WAITING
-    assert lab.problem() != ""
-
-
-async def test_other_streams_without_subscribers_still_need_frames() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    lab.output.has_subscriber = False
-    set_state(lab.statuses[0], StreamState.IDLE, None)
-    assert lab.problem() != ""
+async def test_only_an_idle_on_demand_stream_without_subscribers_needs_no_frames() -> None:
+    for on_demand in (True, False):
+        lab = Lab(StreamSettings(components=MARKERS, on_demand=on_demand))
+        set_state(lab.statuses[0], StreamState.IDLE, None)
+        assert lab.problem() != ""
+        lab.output.has_subscriber = False
+        assert (lab.problem() == "") == on_demand
+        lab.statuses[0].state = StreamState.WAITING
+        assert lab.problem() != ""
 
 
 async def test_a_stream_of_events_needs_no_recent_frame() -> None:
@@ -165,9 +141,6 @@ async def test_an_output_that_cannot_send_is_listed_with_its_problem() -> None:
     assert body["outputs"] == [{"output": "memory", "problem": lab.output.health().problem}]
 
 
-# Loss ----------------------------------------------------------------------------------------
-
-
 async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200() -> None:
     lab = Lab(StreamSettings(components=MARKERS))
     set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
@@ -185,20 +158,18 @@ async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200()
         "lab to memory: lost in the last minute: 1 message (not open)",
     ]
     skipped, unsent = body["losses"]
-    assert skipped == {
+    assert skipped.pop("age_s") >= 0
+    assert skipped.pop("text").startswith("frames arrive late and are skipped")
+    expected: dict[str, Any] = {
         "source": "lab",
         "stream": "3d",
         "output": None,
         "cause": "skipped while behind",
-        "messages": 872,
-        "frames": 436,
-        "messages_last_minute": 872,
-        "frames_last_minute": 436,
-        "age_s": skipped["age_s"],
-        "text": "frames arrive late and are skipped, except for the newest one (backlog: latest)",
     }
-    assert (unsent["source"], unsent["stream"], unsent["output"]) == ("lab", None, "memory")
-    assert (unsent["cause"], unsent["messages"], unsent["frames"]) == ("not open", 1, 0)
+    expected |= {"messages": 872, "frames": 436, "messages_last_minute": 872, "frames_last_minute": 436}
+    assert skipped == expected
+    expected = {"source": "lab", "stream": None, "output": "memory", "cause": "not open"}
+    assert unsent.items() >= (expected | {"messages": 1, "frames": 0}).items()
 
 
 async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:

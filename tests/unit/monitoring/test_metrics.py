@@ -59,6 +59,11 @@ class Lab:
         [value] = [value for found, value in self.samples(name) if found == labels]
         return value
 
+    def values_by(self, name: str, label: str, where: dict[str, str] | None = None) -> dict[str, float]:
+        """Return the values of the series with the labels ``where``, by another label."""
+        wanted = (where or {}).items()
+        return {labels[label]: value for labels, value in self.samples(name) if wanted <= labels.items()}
+
 
 def analog_frame() -> Frame:
     """Return a frame with one analog component of three channels."""
@@ -76,17 +81,19 @@ ANALOG = {"source": "lab", "stream": "analog"}
 
 
 async def test_every_stream_has_its_counters(lab: Lab) -> None:
-    lab.markers.frames_in, lab.analog.frames_in = 7, 70
-    lab.markers.bytes_in = 1000
+    lab.markers.frames_in, lab.analog.frames_in, lab.markers.bytes_in = 7, 70, 1000
     lab.markers.connections, lab.markers.reconnects, lab.markers.restarts = 3, 5, 2
     lab.markers.last_frame_utime = 1_700_000_000_250_000
     lab.markers.lag_s = 0.125
-    assert lab.value("frames_received_total", **MARKERS) == 7
+    totals = {
+        "frames_received": 7,
+        "received_bytes": 1000,
+        "sessions": 3,
+        "reconnects": 5,
+        "server_restarts": 2,
+    }
+    assert {name: lab.value(f"{name}_total", **MARKERS) for name in totals} == totals
     assert lab.value("frames_received_total", **ANALOG) == 70
-    assert lab.value("received_bytes_total", **MARKERS) == 1000
-    assert lab.value("sessions_total", **MARKERS) == 3
-    assert lab.value("reconnects_total", **MARKERS) == 5
-    assert lab.value("server_restarts_total", **MARKERS) == 2
     assert lab.value("lag_seconds", **MARKERS) == 0.125
     assert list(lab.samples("last_frame_timestamp_seconds")) == [(MARKERS, 1_700_000_000.25)]
 
@@ -95,11 +102,7 @@ async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:
     lab.markers.connecting("server")
     lab.markers.connected("server")
     lab.markers.protocol_changed(ProtocolState.STREAMING, "big", "server")
-    states = {
-        labels["state"]: value
-        for labels, value in lab.samples("stream_state")
-        if MARKERS.items() <= labels.items()
-    }
+    states = lab.values_by("stream_state", "state", MARKERS)
     assert states == {state.value: float(state is StreamState.STREAMING) for state in StreamState}
 
 
@@ -107,49 +110,31 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
     for _ in range(2):
         lab.markers.frame_rejected("too short", 3)
     lab.markers.losses.lost("quite unusual", "lost", frames=0)
-    stalled, broken = (output for output, _ in lab.source.fan_out.outputs)
     errors = (OutputError("stalled", cause="queue full"), ValueError("oops"))
-    for output, error in zip((stalled, broken), errors, strict=True):
+    for (output, _), error in zip(lab.source.fan_out.outputs, errors, strict=True):
         assert isinstance(output, ToyOutput)
         output.error = error
     lab.source.fan_out.publish_status(b"message")
-    samples = {
-        labels["cause"]: value
-        for labels, value in lab.samples("stream_drops_total")
-        if MARKERS.items() <= labels.items()
-    }
-    assert samples == {
-        "frame rejected": 2,
-        "unknown component": 0,
-        "skipped while behind": 0,
-        "not sent by the server": 0,
-        "C3D file": 0,
-        "quite unusual": 1,
-    }
-    drops = {
-        (labels["output"], labels["cause"]): value for labels, value in lab.samples("output_drops_total")
-    }
-    assert drops == {
-        (stalled.name, "broken"): 0,
-        (stalled.name, "queue full"): 1,
-        (broken.name, "broken"): 0,
-        (broken.name, "ValueError"): 1,
-    }
+    causes = ("unknown component", "skipped while behind", "not sent by the server", "C3D file")
+    expected = dict.fromkeys(causes, 0) | {"frame rejected": 2, "quite unusual": 1}
+    assert lab.values_by("stream_drops_total", "cause", MARKERS) == expected
+    assert lab.values_by("output_drops_total", "cause", {"output": "zenoh"}) == {"broken": 0, "queue full": 1}
+    assert lab.values_by("output_drops_total", "cause", {"output": "toy"}) == {"broken": 0, "ValueError": 1}
 
 
-async def test_messages_and_bytes_are_counted_by_component_and_output(lab: Lab) -> None:
+async def test_messages_bytes_and_frames_are_counted_by_component(lab: Lab) -> None:
     fan_out = lab.source.fan_out
     for _ in range(4):
         fan_out.publish(analog_frame(), Stamp(2, 1, 1, 1), frozenset({ComponentType.ANALOG}))
     fan_out.publish_status(bytes(50))
-    for name, counted in (
-        ("messages_total", {"analog": 4, "status": 1}),
-        ("message_bytes_total", {"analog": 4 * (56 + 3 * 4), "status": 50}),
-    ):
-        samples = {
-            labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == "toy"
-        }
-        assert samples == {"3d": 0, "6d": 0, "analog": 0} | counted
+    none, toy = {"3d": 0, "6d": 0}, {"output": "toy"}
+    assert lab.values_by("messages_total", "component", toy) == none | {"analog": 4, "status": 1}
+    num_bytes = 4 * (56 + 3 * 4)
+    assert lab.values_by("message_bytes_total", "component", toy) == none | {
+        "analog": num_bytes,
+        "status": 50,
+    }
+    assert lab.values_by("component_frames_total", "component") == none | {"analog": 4}
 
 
 async def test_an_output_of_whole_frames_has_one_series_for_them(lab: Lab) -> None:
@@ -157,16 +142,8 @@ async def test_an_output_of_whole_frames_has_one_series_for_them(lab: Lab) -> No
     example.start()
     lab.source.fan_out.set_outputs([example])
     for count in range(2):
-        samples = {labels["component"]: value for labels, value in lab.samples("messages_total")}
-        assert samples == {"frame": count}
+        assert lab.values_by("messages_total", "component") == {"frame": count}
         lab.source.fan_out.publish(analog_frame(), Stamp(2, 1, 1, 1), frozenset({ComponentType.ANALOG}))
-
-
-async def test_frames_are_counted_by_configured_component(lab: Lab) -> None:
-    for _ in range(12):
-        lab.source.fan_out.publish(analog_frame(), Stamp(2, 1, 1, 1), frozenset({ComponentType.ANALOG}))
-    samples = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
-    assert samples == {"3d": 0, "6d": 0, "analog": 12}
 
 
 async def test_clock_metrics_appear_once_the_clock_is_valid(lab: Lab) -> None:
@@ -193,18 +170,14 @@ async def test_steps_of_the_wall_clock_are_counted(lab: Lab, monkeypatch: pytest
     assert lab.value("host_clock_steps_total") == 1
 
 
-async def test_outputs_loop_delay_and_versions_are_reported(lab: Lab) -> None:
+async def test_outputs_loop_delay_versions_and_the_process_are_reported(lab: Lab) -> None:
     lab.loop_delay.record(0.0, 0.5)
     lab.loop_delay.record(0.1, 0.25)
     assert lab.value("output_connected", output="zenoh") == 1
-    assert lab.value("loop_delay_seconds") == 0.25
-    assert lab.value("loop_delay_max_seconds") == 0.5
+    assert (lab.value("loop_delay_seconds"), lab.value("loop_delay_max_seconds")) == (0.25, 0.5)
     [(versions, one)] = lab.samples("build_info")
     assert (versions["version"], one) == (__version__, 1)
     assert versions.keys() == {"version", "python", "zenoh", "lcm"}
-
-
-async def test_process_metrics_have_their_usual_names(lab: Lab) -> None:
     samples = {sample.name: sample.value for family in lab.families() for sample in family.samples}
     assert samples["process_cpu_seconds_total"] > 0
     assert samples["process_resident_memory_bytes"] > 1_000_000
@@ -212,9 +185,7 @@ async def test_process_metrics_have_their_usual_names(lab: Lab) -> None:
 
 async def test_texts_from_the_network_add_no_series(lab: Lab) -> None:
     def names() -> set[tuple[str, ...]]:
-        return {
-            (sample.name, *sample.labels.values()) for family in lab.families() for sample in family.samples
-        }
+        return {(each.name, *each.labels.values()) for family in lab.families() for each in family.samples}
 
     before = names()
     lab.markers.record_error("a text from a server")

@@ -1,11 +1,15 @@
+"""Calls from threads into an event loop, and the thread that runs one."""
+
 import asyncio
 import logging
 import threading
+from collections.abc import Callable
 from concurrent.futures import CancelledError
 
 import pytest
 
 from gateway.outputs import loop_thread
+from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.loop_thread import LoopThread
 
 
@@ -122,3 +126,21 @@ def test_closing_lets_tasks_finish_and_cancels_those_that_do_not() -> None:
     thread.close(nothing, 5)
     assert finished == ["quick", "endless"]
     assert cancelled.cancelled()
+
+
+async def test_a_call_of_another_thread_is_made_in_the_loop() -> None:
+    made: asyncio.Future[tuple[int, threading.Thread]] = asyncio.get_running_loop().create_future()
+    call = in_this_loop(lambda number: made.set_result((number, threading.current_thread())))
+    await asyncio.to_thread(call, 7)
+    assert await made == (7, threading.current_thread())
+
+
+def test_calls_after_the_end_of_the_loop_do_nothing() -> None:
+    made: list[None] = []
+
+    async def begin() -> Callable[[], None]:
+        return in_this_loop(lambda: made.append(None))
+
+    call = asyncio.run(begin())
+    call()
+    assert made == []

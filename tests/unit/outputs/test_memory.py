@@ -1,25 +1,28 @@
-"""The output in memory: what tests and benchmarks read from it."""
+"""The output in memory, which tests and benchmarks read, and the JSON of answers."""
 
 import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
+from gateway.outputs.encodings import json_bytes
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.status import OutputHealth
 
 TOPIC = Topic("lab", ("3d",), "rtc3d.markers_t")
 
 
-def test_it_stores_the_newest_messages_with_their_topics() -> None:
+def test_it_is_healthy_while_open_and_stores_the_newest_messages_with_their_topics() -> None:
+    assert MemoryOutput().messages.maxlen == 100_000
     output = MemoryOutput(capacity=2)
+    closed = OutputHealth(False, "memory output is not open; start it")
+    assert output.health() == closed
     output.start()
+    assert output.health() == OutputHealth(True, "")
     for message in (b"1", b"2", b"3"):
         output.publisher(TOPIC).publish(message)
     assert list(output.messages) == [(TOPIC, b"2"), (TOPIC, b"3")]
-
-
-def test_it_stores_100000_messages_by_default() -> None:
-    assert MemoryOutput().messages.maxlen == 100_000
+    output.close()
+    assert output.health() == closed
 
 
 def test_it_shows_the_sources_that_are_announced_and_that_stream() -> None:
@@ -31,17 +34,6 @@ def test_it_shows_the_sources_that_are_announced_and_that_stream() -> None:
     output.show_streaming("hall", False)
     output.withdraw("lab")
     assert (output.announced, output.streaming) == ({"hall"}, {"lab"})
-
-
-def test_it_is_healthy_from_start_to_close() -> None:
-    output = MemoryOutput()
-    states = [output.health()]
-    output.start()
-    states.append(output.health())
-    output.close()
-    states.append(output.health())
-    closed = OutputHealth(False, "memory output is not open; start it")
-    assert states == [closed, OutputHealth(True, ""), closed]
 
 
 def test_a_closed_publisher_and_a_closed_output_raise() -> None:
@@ -67,3 +59,15 @@ def test_a_test_decides_whether_there_is_a_subscriber() -> None:
     wanted = [publisher.wanted]
     output.has_subscriber = False
     assert [*wanted, publisher.wanted] == [True, False]
+
+
+def test_json_is_compact_and_in_utf8() -> None:
+    assert json_bytes({"name": "Käfig", "values": [1, 2.5, None]}) == (
+        '{"name":"Käfig","values":[1,2.5,null]}'.encode()
+    )
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_that_json_does_not_have_are_errors(value: float) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        json_bytes([value])

@@ -37,16 +37,6 @@ def test_60_of_100_hz_is_exact_with_gaps_of_one_and_two() -> None:
     assert set(gaps(indices)) == {1, 2}
 
 
-def test_the_frames_nearest_to_the_multiples_are_picked() -> None:
-    # Multiples of 25 ms among frames 10 ms apart; at 25 and 75 ms two are equally near: the first is picked.
-    assert picked(Pacer(40), stamps(100, 0.15)) == [0, 2, 5, 7, 10, 12]
-
-
-@pytest.mark.parametrize("max_rate_hz", [100, 100.5, 1000])
-def test_a_limit_above_the_rate_picks_all_frames(max_rate_hz: float) -> None:
-    assert len(picked(Pacer(max_rate_hz), stamps(100, 10))) == 1000
-
-
 def test_a_fractional_ratio_does_not_drift() -> None:
     indices = picked(Pacer(59.94), stamps(240, 1000))
     assert len(indices) == 59_940
@@ -75,28 +65,6 @@ def test_a_lost_frame_does_not_shift_the_others() -> None:
     assert sent == whole[::2]
 
 
-def test_a_pause_is_not_caught_up_with() -> None:
-    frames = stamps(100, 1) + stamps(100, 1, start_us=60_003_000)
-    assert picked(Pacer(10), frames) == list(range(0, 200, 10))
-
-
-def test_a_pause_after_the_first_frame_is_not_taken_for_the_spacing() -> None:
-    frames = [0, *stamps(100, 1, start_us=60_003_000)]
-    assert picked(Pacer(10), frames) == [0, *range(1, 101, 10)]
-
-
-def test_frames_that_arrive_late_are_picked_by_their_time_stamps() -> None:
-    frames = stamps(100, 2)
-    arrivals = [EPOCH_UTIME + stamp for stamp in frames[:50]] + 150 * [EPOCH_UTIME + 2_000_000]
-    assert picked(Pacer(50), frames, arrivals) == list(range(0, 200, 2))
-
-
-def test_time_stamps_that_go_back_do_not_change_the_gaps() -> None:
-    arrivals = [EPOCH_UTIME + stamp for stamp in stamps(100, 10)]
-    looped = [stamp % 1_690_000 for stamp in stamps(100, 10)]
-    assert picked(Pacer(50), looped, arrivals) == list(range(0, 1000, 2))
-
-
 @pytest.mark.parametrize("stamp", [0, 2**62, None])
 def test_without_a_clock_the_arrival_times_decide(stamp: int | None) -> None:
     arrivals = [EPOCH_UTIME + stamp for stamp in stamps(100, 10)]
@@ -105,21 +73,10 @@ def test_without_a_clock_the_arrival_times_decide(stamp: int | None) -> None:
     assert set(gaps(indices)) == {1, 2}
 
 
-def test_a_clock_that_comes_and_goes_does_not_change_the_gaps() -> None:
-    arrivals = [EPOCH_UTIME + stamp for stamp in stamps(100, 10)]
-    known = [None if 200 <= index < 500 else stamp for index, stamp in enumerate(stamps(100, 10))]
-    assert picked(Pacer(50), known, arrivals) == list(range(0, 1000, 2))
-
-
 def test_a_step_of_the_host_clock_hardly_changes_the_count() -> None:
     arrivals = [EPOCH_UTIME + stamp - 3_600_000_000 * (stamp >= 5_000_000) for stamp in stamps(100, 10)]
     indices = picked(Pacer(50), len(arrivals) * [None], arrivals)
     assert len(indices) == pytest.approx(500, abs=1)
-
-
-def test_a_duplicate_frame_is_picked_once() -> None:
-    doubled = [stamp for stamp in stamps(100, 1) for _ in range(2)]
-    assert picked(Pacer(50), doubled) == list(range(0, 200, 4))
 
 
 def test_the_gaps_follow_a_change_of_the_rate() -> None:
@@ -129,22 +86,52 @@ def test_the_gaps_follow_a_change_of_the_rate() -> None:
     assert set(gaps(indices[260:])) == {8}
 
 
-def test_one_frame_in_1000_seconds_goes_out_when_they_have_passed_to_the_millisecond() -> None:
-    timestamps_us = [0, 1_000, 2_000, 999_999_000, 1_000_000_000]
-    assert picked(Pacer(0.001), timestamps_us) == [0, 4]
+HZ_100 = stamps(100, 10)
+EARLY_PAUSE = [0, *stamps(100, 1, start_us=60_003_000)]
+PAUSE = stamps(100, 1) + stamps(100, 1, start_us=60_003_000)
+DOUBLED = [stamp for stamp in stamps(100, 1) for _ in range(2)]
 
 
-def test_a_frame_may_be_early_by_three_quarters_of_the_spacing() -> None:
-    # The period is 19 us; the frame at 12 us is 7 us early and the one at 16 us exactly 3 of 4 us.
-    assert picked(Pacer(1e6 / 19), [0, 4, 8, 12, 16]) == [0, 4]
+@pytest.mark.parametrize(
+    ("rate_hz", "timestamps_us", "expected"),
+    [
+        # Multiples of 25 ms; at 25 and 75 ms two frames are equally near: the first is picked.
+        pytest.param(40, HZ_100[:15], [0, 2, 5, 7, 10, 12], id="the frames nearest to the multiples"),
+        pytest.param(10, PAUSE, range(0, 200, 10), id="a pause is not caught up with"),
+        pytest.param(10, EARLY_PAUSE, [0, *range(1, 101, 10)], id="an early pause is not the spacing"),
+        pytest.param(50, DOUBLED, range(0, 200, 4), id="a duplicate frame is picked once"),
+        pytest.param(100, HZ_100, range(1000), id="a limit that is the rate picks all frames"),
+        pytest.param(100.5, HZ_100, range(1000), id="a limit just above the rate"),
+        pytest.param(1000, HZ_100, range(1000), id="a limit far above the rate"),
+        pytest.param(0.001, [0, 1_000, 2_000, 999_999_000, 1_000_000_000], [0, 4], id="1000 s to the ms"),
+        # The period is 19 us; the frame at 12 us is 7 us early and the one at 16 us exactly 3 of 4 us.
+        pytest.param(1e6 / 19, [0, 4, 8, 12, 16], [0, 4], id="early by three quarters of the spacing"),
+        pytest.param(1000, [0, 2000, 2100, 2200], [0, 1], id="two periods start a whole one"),
+        pytest.param(1000, [0, 1999, 2099], [0, 1, 2], id="just under two leave the next one on time"),
+    ],
+)
+def test_the_frames_picked_by_time_stamps(
+    rate_hz: float, timestamps_us: list[int], expected: Iterable[int]
+) -> None:
+    assert picked(Pacer(rate_hz), timestamps_us) == list(expected)
 
 
-def test_a_frame_that_ends_a_pause_of_two_periods_starts_a_whole_period() -> None:
-    assert picked(Pacer(1000), [0, 2000, 2100, 2200]) == [0, 1]
+ARRIVALS = [EPOCH_UTIME + stamp for stamp in HZ_100]
+LATE = ARRIVALS[:50] + 950 * [ARRIVALS[-1]]
+LOOPED = [stamp % 1_690_000 for stamp in HZ_100]
+KNOWN_AT_TIMES = [None if 200 <= index < 500 else stamp for index, stamp in enumerate(HZ_100)]
 
 
-def test_a_frame_just_before_the_end_of_the_second_period_leaves_the_next_one_on_time() -> None:
-    assert picked(Pacer(1000), [0, 1999, 2099]) == [0, 1, 2]
+@pytest.mark.parametrize(
+    ("timestamps_us", "arrivals"),
+    [
+        pytest.param(HZ_100, LATE, id="late arrivals"),
+        pytest.param(LOOPED, ARRIVALS, id="time stamps that go back"),
+        pytest.param(KNOWN_AT_TIMES, ARRIVALS, id="a clock that comes and goes"),
+    ],
+)
+def test_the_gaps_stay_even(timestamps_us: list[int | None], arrivals: list[int]) -> None:
+    assert picked(Pacer(50), timestamps_us, arrivals) == list(range(0, 1000, 2))
 
 
 def test_no_time_passes_while_the_hosts_clock_stands_still_or_goes_back() -> None:

@@ -20,13 +20,7 @@ from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import key_patterns
-from tests.networks import (
-    add_multicast_route,
-    free_endpoint,
-    lcm_url,
-    remove_multicast_route,
-    zenoh_keys,
-)
+from tests.networks import add_multicast_route, free_endpoint, lcm_url, remove_multicast_route, zenoh_keys
 from tests.waiting import wait_until
 
 MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")

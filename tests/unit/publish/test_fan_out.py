@@ -1,7 +1,9 @@
+"""What a fan-out publishes on each output, counts and logs, and what happens when outputs change."""
+
 import logging
 from collections import Counter
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from gateway.errors import OutputError
@@ -11,23 +13,32 @@ from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut
-from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.publish.item_counts import ItemCounts
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from tests.losses import amounts
+from tests.server_parameters import in_metres
+from tests.settable_clock import Clock
 from tests.toy_output import ToyOutput
-from tests.vectors import EMPTY_FRAME, FULL_FRAME
+from tests.unit.publish.rig import (
+    ALL,
+    EVENT,
+    FULL,
+    MARKERS,
+    NO_ROUTER,
+    ONLY_MARKERS,
+    STAMP,
+    TOOLS,
+    frame,
+    publish_full,
+    sequences,
+)
+from tests.vectors import EMPTY_FRAME
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
-ALL = frozenset(WIRE_ORDER)
-MARKERS = frozenset({ComponentType.MARKERS})
-FULL = split_frame(FULL_FRAME["big"], "big")
-
-
-@pytest.fixture
-def memory() -> MemoryOutput:
-    output = MemoryOutput()
-    output.start()
-    return output
+PROBES = in_metres(
+    Parameters(tools=Parameters6D(tools=(Tool(id="0", label="Probe"), Tool(id="1", label="H"))))
+)
 
 
 # Components ----------------------------------------------------------------------------------
@@ -35,40 +46,32 @@ def memory() -> MemoryOutput:
 
 def test_every_component_goes_to_every_output_under_its_topic() -> None:
     outputs = [ToyOutput("one"), ToyOutput("two")]
-    FanOut("lab", outputs).publish(FULL, STAMP, ALL)
+    publish_full(FanOut("lab", outputs))
     names = {1: "markers_t", 2: "analog_t", 3: "forces_t", 4: "tools_t", 5: "events_t"}
     expected = [
-        (
-            Topic("lab", (component.type.key,), f"rtc3d.{names[component.type]}"),
-            encode_message(component, STAMP, 0),
-        )
-        for component in FULL.components
+        (Topic("lab", (each.type.key,), f"rtc3d.{names[each.type]}"), encode_message(each, STAMP, 0))
+        for each in FULL.components
     ]
     assert len(expected) == 5
     assert [output.messages for output in outputs] == [expected, expected]
 
 
-def test_all_topics_are_declared_before_the_first_frame() -> None:
-    output = ToyOutput()
-    FanOut("lab", [output])
-    assert {topic.path for topic in output.declared} == {
-        ("3d",), ("6d",), ("analog",), ("force",), ("event",), ("status",), ("clock",),
-    }  # fmt: skip
-    assert {topic.source for topic in output.declared} == {"lab"}
-
-
-def test_the_source_is_announced_on_every_output() -> None:
+def test_all_topics_are_declared_and_the_source_is_announced_before_the_first_frame() -> None:
     outputs = [ToyOutput("one"), ToyOutput("two")]
     FanOut("lab", outputs)
-    assert [output.announced for output in outputs] == [["lab"], ["lab"]]
+    paths = {("3d",), ("6d",), ("analog",), ("force",), ("event",), ("status",), ("clock",)}
+    for output in outputs:
+        assert output.announced == ["lab"]
+        assert {(topic.source, topic.path) for topic in output.declared} == {("lab", path) for path in paths}
 
 
-def test_each_component_has_its_own_numbers_across_sessions(memory: MemoryOutput) -> None:
-    fan_out = FanOut("lab", [memory])
-    fan_out.publish(FULL, STAMP, ALL)
-    fan_out.publish(FULL, STAMP, MARKERS)
+def test_each_component_has_its_own_numbers_across_sessions() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    publish_full(fan_out)
+    publish_full(fan_out, ONLY_MARKERS)
     fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2, 1), ALL)
-    messages = [(topic.path, decode(message)) for topic, message in memory.messages]
+    messages = [(topic.path, decode(message)) for topic, message in output.messages]
     counted = {
         key: [(message.sequence, message.session) for path, message in messages if path == (key,)]
         for key in ("3d", "analog")
@@ -76,77 +79,67 @@ def test_each_component_has_its_own_numbers_across_sessions(memory: MemoryOutput
     assert counted == {"3d": [(0, 1), (1, 1), (2, 2)], "analog": [(0, 1), (1, 2)]}
 
 
-def test_components_that_are_not_wanted_are_not_published(memory: MemoryOutput) -> None:
-    FanOut("lab", [memory]).publish(FULL, STAMP, frozenset({ComponentType.TOOLS, ComponentType.EVENT}))
-    assert [topic.path for topic, _ in memory.messages] == [("6d",), ("event",)]
+def test_only_wanted_components_that_a_frame_has_are_published() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    publish_full(fan_out, {TOOLS, EVENT})
+    fan_out.publish(split_frame(EMPTY_FRAME["big"], "big"), STAMP, ALL)
+    assert [topic.path for topic, _ in output.messages] == [("6d",), ("event",)]
 
 
-def test_an_empty_frame_publishes_nothing(memory: MemoryOutput) -> None:
-    FanOut("lab", [memory]).publish(split_frame(EMPTY_FRAME["big"], "big"), STAMP, ALL)
-    assert not memory.messages
+def test_the_newest_message_of_each_component_can_be_read() -> None:
+    fan_out = FanOut("lab", [ToyOutput()])
+    publish_full(fan_out)
+    publish_full(fan_out, ONLY_MARKERS)
+    newest = [decode(fan_out.newest(kind, "toy") or b"").sequence for kind in WIRE_ORDER]
+    assert newest == [1 if kind is MARKERS else 0 for kind in WIRE_ORDER]
 
 
-def test_the_newest_message_of_each_component_can_be_read(memory: MemoryOutput) -> None:
-    fan_out = FanOut("lab", [memory])
-    fan_out.publish(FULL, STAMP, ALL)
-    fan_out.publish(FULL, STAMP, MARKERS)
-    newest = [decode(fan_out.newest(kind, "memory") or b"").sequence for kind in WIRE_ORDER]
-    assert newest == [1 if kind is ComponentType.MARKERS else 0 for kind in WIRE_ORDER]
-
-
-def test_status_and_clock_messages_have_their_own_topics(memory: MemoryOutput) -> None:
-    fan_out = FanOut("lab", [memory])
-    fan_out.publish(FULL, STAMP, ALL)
+def test_frames_messages_and_bytes_are_counted_by_topic() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    publish_full(fan_out)
+    publish_full(fan_out, ONLY_MARKERS)
     fan_out.publish_status(b"status")
     fan_out.publish_clock(b"clock")
-    assert list(memory.messages)[-2:] == [
+    assert output.messages[-2:] == [
         (Topic("lab", ("status",), "rtc3d.status_t"), b"status"),
         (Topic("lab", ("clock",), "rtc3d.clock_t"), b"clock"),
     ]
-
-
-def test_frames_messages_and_bytes_are_counted_by_component(memory: MemoryOutput) -> None:
-    fan_out = FanOut("lab", [memory])
-    fan_out.publish(FULL, STAMP, ALL)
-    fan_out.publish(FULL, STAMP, MARKERS)
-    assert fan_out.frames == dict.fromkeys(WIRE_ORDER, 1) | {ComponentType.MARKERS: 2}
+    assert fan_out.frames == dict.fromkeys(WIRE_ORDER, 1) | {MARKERS: 2}
     [(_, status)] = fan_out.outputs
     sizes: Counter[str] = Counter()
-    for topic, message in memory.messages:
+    for topic, message in output.messages:
         sizes[topic.path[0]] += len(message)
     assert status.message_bytes == sizes
-    assert min(sizes.values()) > 0
+    assert status.messages == Counter(topic.path[0] for topic, _ in output.messages)
 
 
-# Failing outputs -----------------------------------------------------------------------------
+# Outputs that fail ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("error", "cause"),
-    [(OutputError("no router", cause="no router"), "no router"), (ValueError("a defect"), "ValueError")],
+    ("error", "cause", "text"),
+    [
+        (NO_ROUTER, "no router", str(NO_ROUTER)),
+        (ValueError("a defect"), "ValueError", "ValueError: a defect"),
+    ],
 )
-def test_an_output_that_raises_is_counted_and_does_not_stop_others(error: Exception, cause: str) -> None:
+def test_an_output_that_raises_is_counted_logged_and_does_not_stop_others(
+    error: Exception, cause: str, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
     broken, good = ToyOutput("broken"), ToyOutput("good")
     broken.error = error
     fan_out = FanOut("lab", [broken, good])
     for utime in (1, 2):
         fan_out.publish(FULL, Stamp(utime, utime, 1, 1), ALL)
     fan_out.publish_status(b"status")
-    statuses = {output.name: status for output, status in fan_out.outputs}
-    assert amounts(statuses["broken"].losses) == {cause: (11, 2)}
-    assert not statuses["broken"].messages
-    assert not statuses["good"].losses
+    [(_, of_broken), (_, of_good)] = fan_out.outputs
+    assert (amounts(of_broken.losses), of_broken.messages) == ({cause: (11, 2)}, {})
     each_twice = {"3d": 2, "6d": 2, "analog": 2, "force": 2, "event": 2}
-    assert statuses["good"].messages == each_twice | {"status": 1}
+    assert (of_good.losses, of_good.messages) == ([], each_twice | {"status": 1})
     assert len(good.messages) == 11
-
-
-def test_a_refused_message_uses_up_its_sequence_number() -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output])
-    for output.error in (None, OutputError("no router", cause="no router"), None):
-        fan_out.publish(FULL, STAMP, MARKERS)
-    assert [decode(message).sequence for _, message in output.messages] == [0, 2]
+    assert caplog.messages == [f"lab to broken: {text}"]
 
 
 def test_an_output_failure_is_logged_once_and_its_end_with_the_total(
@@ -155,91 +148,127 @@ def test_an_output_failure_is_logged_once_and_its_end_with_the_total(
     caplog.set_level(logging.DEBUG, "gateway.publish.routes")
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
-    lost = OutputError("no Zenoh router is connected: start zenohd", cause="no router")
-    for output.error in (None, lost, None):
-        fan_out.publish(FULL, STAMP, ALL)
+    for output.error in (None, NO_ROUTER, None):
+        publish_full(fan_out)
     fan_out.check_losses()
     fan_out.close()
-    start, end = caplog.records
-    assert (start.levelno, start.getMessage()) == (logging.WARNING, f"lab to toy: {lost}")
-    assert (end.levelno, end.getMessage()) == (
-        logging.INFO,
-        "lab to toy: lost within 0.0 s: 5 messages of 1 frame (no router)",
-    )
+    assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
+        (logging.WARNING, f"lab to toy: {NO_ROUTER}"),
+        (logging.INFO, "lab to toy: lost within 0.0 s: 5 messages of 1 frame (no router)"),
+    ]
 
 
 def test_messages_that_fail_now_and_then_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
-    for output.error in [OutputError("too large", cause="send failed"), None] * 5:
-        fan_out.publish(FULL, STAMP, MARKERS)
+    for output.error in [NO_ROUTER, None] * 5:
+        publish_full(fan_out, ONLY_MARKERS)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert fan_out.outputs[0][1].messages == {"3d": 5}
 
 
-# Pacing, layouts and subscribers -------------------------------------------------------------
+@pytest.mark.interpreted
+def test_an_output_that_has_just_been_added_may_take_a_moment_to_open(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.routes")
+    clock = Clock(100.0)
+    monkeypatch.setattr("gateway.publish.routes.time", SimpleNamespace(monotonic=clock))
+    output = ToyOutput("lcm")
+    output.error = OutputError("LCM is not open", cause="not open")
+    fan_out = FanOut("lab", [output])
+    for clock.now_s in (101.9, 101.9, 102.1, 102.2):
+        fan_out.publish_status(b"status")
+    assert [record.levelname for record in caplog.records] == ["INFO", "WARNING"]
 
 
-def test_a_paced_component_has_consecutive_numbers_on_each_output() -> None:
-    paced, whole = ToyOutput("paced"), ToyOutput("whole")
-    paced.max_rate_hz = {ComponentType.MARKERS: 50.0}
-    fan_out = FanOut("lab", [paced, whole])
-    for number in range(20):  # 100 Hz
-        frame = markers_frame(number, timestamp_us=10_000 * number, num_markers=1)
-        fan_out.publish(frame, STAMP, ALL)
-    for output, count in ((paced, 10), (whole, 20)):
-        sequences = [decode(message).sequence for _, message in output.messages]
-        assert sequences == list(range(count))
+# Pacing, numbers of items, layouts and subscribers -------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("period_us", "arrival_period_us", "has_clock", "expected"),
+    [
+        pytest.param(10_000, 0, True, [0, 2, 4], id="by the server's clock"),
+        pytest.param(20_000, 10_000, True, [0, 1, 2, 3, 4, 5], id="not by the arrivals"),
+        pytest.param(20_000, 10_000, False, [0, 2, 4], id="without a clock by the arrivals"),
+    ],
+)
+def test_a_paced_component_is_published_at_its_rate(
+    period_us: int, arrival_period_us: int, has_clock: bool, expected: list[int]
+) -> None:
+    output = ToyOutput()
+    output.max_rate_hz = {MARKERS: 50.0}
+    fan_out = FanOut("lab", [output])
+    for number in range(6):
+        utime = arrival_period_us * number
+        stamp = Stamp(utime=utime, capture_utime=utime, session=1, parameters_version=1, has_clock=has_clock)
+        fan_out.publish(frame(number, MARKERS, timestamp_us=period_us * number), stamp, ONLY_MARKERS)
+    assert [decode(message).frame_number for _, message in output.messages] == expected
 
 
 def test_events_are_never_paced() -> None:
     output = ToyOutput()
-    output.max_rate_hz = {ComponentType.EVENT: 0.001}
+    output.max_rate_hz = {EVENT: 0.001}
     fan_out = FanOut("lab", [output])
     for _ in range(3):
-        fan_out.publish(FULL, STAMP, frozenset({ComponentType.EVENT}))
-    assert [decode(message).sequence for _, message in output.messages] == [0, 1, 2]
+        publish_full(fan_out, {EVENT})
+    assert sequences(output, "event") == [0, 1, 2]
 
 
-def test_a_changed_number_of_markers_is_reported_once() -> None:
+@pytest.mark.parametrize(
+    ("component", "num_items", "expected"),
+    [(MARKERS, (2, 2, 3, 3, 2), [0, 0, 1, 1, 2]), (EVENT, (0, 1, 2), [0, 0, 0])],
+)
+def test_a_changed_number_of_items_is_reported_once_and_of_events_never(
+    component: ComponentType, num_items: tuple[int, ...], expected: list[int]
+) -> None:
     changes: list[int] = []
+    reported = []
     fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
-    for num_markers, expected in ((2, 0), (2, 0), (3, 1), (3, 1), (2, 2)):
-        fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=num_markers), STAMP, ALL)
-        assert len(changes) == expected
+    for number in num_items:
+        fan_out.publish(frame(1, component, num_items=number), STAMP, ALL)
+        # The frame of another stream between them is no change.
+        fan_out.publish(FULL, STAMP, frozenset({ComponentType.ANALOG}))
+        reported.append(len(changes))
+    assert reported == expected
 
 
-def test_a_changed_number_of_markers_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.publish.item_counts")
-    fan_out = FanOut("lab", [])
-    for num_markers in (2, 3):
-        fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=num_markers), STAMP, ALL)
-    assert caplog.messages == ["lab: number of items in 3d changed from 2 to 3"]
+def test_numbers_of_items_are_compared_within_a_session() -> None:
+    counts = ItemCounts("lab")
+    updates: list[tuple[dict[ComponentType, int], int]] = [
+        ({MARKERS: 2}, 1), ({MARKERS: 3}, 1), ({MARKERS: 4}, 2), ({TOOLS: 1}, 2), ({MARKERS: 4, TOOLS: 2}, 2),
+        ({MARKERS: 5, TOOLS: 2}, 2),
+    ]  # fmt: skip
+    assert [counts.update(*each) for each in updates] == [False, True, False, False, True, True]
 
 
-def test_frames_of_alternating_streams_are_not_a_change() -> None:
-    changes: list[int] = []
-    fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
-    for _ in range(3):
-        fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=2), STAMP, MARKERS)
-        fan_out.publish(FULL, STAMP, ALL - MARKERS)
-    assert not changes
+def test_a_server_that_changes_its_number_all_the_time_does_not_fill_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    clock = Clock()
+    counts = ItemCounts("lab", clock)
+    for number in range(1001):
+        counts.update({MARKERS: number % 2, TOOLS: 1}, 1)
+    changed = "lab: number of items in 3d changed from"
+    assert caplog.messages == [f"{changed} 0 to 1"]
+    counts.check()
+    clock.now_s += 30
+    counts.check()
+    counts.check()
+    assert caplog.messages[1:] == [f"{changed} 1 to 0, after 999 changes"]
+    clock.now_s += 30
+    counts.update({MARKERS: 7}, 1)
+    assert caplog.messages[2:] == [f"{changed} 0 to 7"]
 
 
-def test_a_changed_number_of_events_is_not_reported() -> None:
-    changes: list[int] = []
-    fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
-    for num_events in range(3):
-        fan_out.publish(events_frame(num_events), STAMP, ALL)
-    assert not changes
-
-
-def test_the_number_of_remembered_layouts_is_bounded(memory: MemoryOutput) -> None:
+def test_the_number_of_remembered_layouts_is_bounded() -> None:
+    memory = MemoryOutput()
+    memory.start()
     fan_out = FanOut("lab", [memory])
-    for num_events in range(300):
-        fan_out.publish(events_frame(num_events), STAMP, ALL)
-    assert fan_out._plan_for.cache_info().currsize == 64
-    assert len(memory.messages) == 300
+    for num_items in range(300):
+        fan_out.publish(frame(1, EVENT, num_items=num_items), STAMP, ALL)
+    assert (fan_out._plan_for.cache_info().currsize, len(memory.messages)) == (64, 300)
     fan_out.forget_layouts()
     assert fan_out._plan_for.cache_info().currsize == 0
 
@@ -247,24 +276,93 @@ def test_the_number_of_remembered_layouts_is_bounded(memory: MemoryOutput) -> No
 def test_a_component_has_subscribers_if_one_output_has_one() -> None:
     without, with_tools = ToyOutput("without"), ToyOutput("with tools", "6d")
     assert not FanOut("lab", [without]).has_subscribers(ALL)
-    assert FanOut("lab", [without, with_tools]).has_subscribers({ComponentType.MARKERS, ComponentType.TOOLS})
-    assert not FanOut("lab", [without, with_tools]).has_subscribers({ComponentType.MARKERS})
+    assert FanOut("lab", [without, with_tools]).has_subscribers({MARKERS, TOOLS})
+    assert not FanOut("lab", [without, with_tools]).has_subscribers({MARKERS})
 
 
-def test_every_output_shows_whether_frames_arrive() -> None:
-    outputs = [ToyOutput("a"), ToyOutput("b")]
-    fan_out = FanOut("lab", outputs)
+# Outputs that are replaced -------------------------------------------------------------------
+
+
+def test_replacing_an_output_does_not_disturb_the_others() -> None:
+    stays, before, after = ToyOutput("stays"), ToyOutput("side"), ToyOutput("side")
+    fan_out = FanOut("lab", [stays, before])
+    declared = list(stays.declared)
+    fan_out.set_outputs([stays, after])
+    publish_full(fan_out)
+    assert (stays.declared, stays.closed_topics, sequences(stays, "3d")) == (declared, [], [0])
+
+
+@pytest.mark.parametrize("is_removed_first", [False, True])
+def test_a_replacement_continues_numbers_and_counters(is_removed_first: bool) -> None:
+    before, after = ToyOutput("side"), ToyOutput("side")
+    fan_out = FanOut("lab", [before])
+    publish_full(fan_out)
+    if is_removed_first:
+        fan_out.set_outputs([])
+    fan_out.set_outputs([after])
+    publish_full(fan_out)
+    assert (sequences(before, "3d"), sequences(after, "3d")) == ([0], [1])
+    if not is_removed_first:
+        [(output, status)] = fan_out.outputs
+        sent = [message for topic, message in (*before.messages, *after.messages) if topic.path == ("3d",)]
+        assert (output, status.messages["3d"]) == (after, 2)
+        assert status.message_bytes["3d"] == sum(map(len, sent))
+
+
+def test_a_replacement_continues_the_counts_of_what_was_lost() -> None:
+    before, after = ToyOutput("side"), ToyOutput("side")
+    before.error = after.error = NO_ROUTER
+    fan_out = FanOut("lab", [before])
+    fan_out.publish_status(b"status")
+    fan_out.set_outputs([after])
+    fan_out.publish_status(b"status")
+    assert amounts(fan_out.outputs[0][1].losses) == {"no router": (2, 0)}
+
+
+def test_removing_an_output_closes_everything_declared_on_it() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    declared = list(output.declared)
+    fan_out.set_outputs([])
+    publish_full(fan_out)
+    assert (output.declared, output.announced, output.messages) == ([], [], [])
+    assert sorted(output.closed_topics) == sorted(declared)
+
+
+def test_every_output_shows_whether_frames_arrive_until_the_fan_out_is_closed() -> None:
+    one, new = ToyOutput("one", "Probe", has_tool_poses=True), ToyOutput("two")
+    fan_out = FanOut("lab", [one])
+    fan_out.set_parameters(PROBES)
     fan_out.show_streaming(True)
+    fan_out.set_outputs([one, new])
+    publish_full(fan_out)
+    assert (new.announced, one.streaming, new.streaming) == (["lab"], [True], [True])
     fan_out.show_streaming(False)
-    assert [output.streaming for output in outputs] == [[True, False], [True, False]]
+    fan_out.show_streaming(True)
+    fan_out.close()
+    for output in (one, new):
+        assert (output.declared, output.announced, output.streaming) == ([], [], [True, False] * 2)
 
 
-def markers_frame(number: int, *, timestamp_us: int, num_markers: int) -> Frame:
-    items = np.zeros(num_markers, ITEM_DTYPES[ComponentType.MARKERS])
-    component = encode_component(ComponentType.MARKERS, number, timestamp_us, items)
-    return split_frame(encode_frame([component]), "big")
+def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
+    outputs = [ToyOutput(name, "Probe", has_tool_poses=True) for name in ("stays", "side", "side")]
+    stays, before, after = outputs
+    fan_out = FanOut("lab", [stays, before])
+    fan_out.set_parameters(PROBES)
+    publish_full(fan_out)
+    fan_out.set_outputs([stays, after])
+    publish_full(fan_out)
+    assert stays.closed_topics == []
+    assert [sequences(output, "6d", "Probe") for output in outputs] == [[0, 1], [0], [1]]
+    assert before.tool_names() == []
 
 
-def events_frame(num_events: int) -> Frame:
-    items = np.zeros(num_events, ITEM_DTYPES[ComponentType.EVENT])
-    return split_frame(encode_frame([encode_component(ComponentType.EVENT, 1, 0, items)]), "big")
+def test_tool_topics_are_closed_where_they_are_switched_off() -> None:
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
+    fan_out.set_parameters(PROBES)
+    publish_full(fan_out)
+    output.has_tool_poses = False
+    fan_out.set_outputs([output])
+    publish_full(fan_out)
+    assert (output.tool_names(), len(output.poses("Probe")), sequences(output, "3d")) == ([], 1, [0, 1])

@@ -1,58 +1,37 @@
 """Sequence numbers: assigned when a frame arrives, so that every gap is loss."""
 
-import numpy as np
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import OutputError
 from gateway.messages.decode import decode
 from gateway.messages.encode import encode_message
-from gateway.messages.stamp import Stamp
 from gateway.publish.fan_out import FanOut
-from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, WIRE_ORDER, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
 from tests.losses import amounts
 from tests.toy_output import ToyOutput
-from tests.unit.publish.test_whole_frames import FrameOutput
+from tests.unit.publish.rig import (
+    ALL,
+    EVENT,
+    MARKERS,
+    NO_ROUTER,
+    PERIOD_US,
+    TOOLS,
+    UTIME,
+    FrameOutput,
+    frame,
+    numbered,
+    publish,
+    sequences,
+    stamp,
+)
 
-MARKERS, TOOLS, EVENT = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT
-ALL = frozenset(WIRE_ORDER)
 SKIPPABLE = ALL - {EVENT}
 EVENTS = frozenset({EVENT})
-PERIOD_US = 10_000
-UTIME = 1_700_000_000_000_000
-
-
-def frame(number: int, *types: ComponentType) -> Frame:
-    """Return frame ``number`` at 100 Hz, with one item of each of these types; by default of 3D and 6D."""
-    components = [
-        encode_component(
-            each, number, PERIOD_US * number, np.zeros(1, LONG_EVENT if each is EVENT else ITEM_DTYPES[each])
-        )
-        for each in types or (MARKERS, TOOLS)
-    ]
-    return split_frame(encode_frame(components), "big")
-
-
-def stamp(number: int) -> Stamp:
-    return Stamp(UTIME + PERIOD_US * number, UTIME + PERIOD_US * number, 1, 1)
-
-
-def publish(fan_out: FanOut, *numbers: int) -> None:
-    for number in numbers:
-        fan_out.publish(frame(number), stamp(number), ALL)
 
 
 def skip(fan_out: FanOut, *numbers: int) -> int:
     return sum(fan_out.skip(frame(number), stamp(number), SKIPPABLE) for number in numbers)
-
-
-def numbered(output: ToyOutput, *path: str) -> list[tuple[int, int]]:
-    """Return (sequence, frame number) of each message of a topic."""
-    messages = [decode(data) for topic, data in output.messages if topic.path == path]
-    return [(message.sequence, message.frame_number) for message in messages]
 
 
 def num_missing(sequences: list[int]) -> int:
@@ -97,8 +76,8 @@ def test_only_the_skipped_components_are_a_gap() -> None:
         fan_out.publish(both, stamp(1), EVENTS)
         assert fan_out.skip(both, stamp(1), SKIPPABLE) == 1
     fan_out.publish(both, stamp(1), ALL)
-    assert [sequence for sequence, _ in numbered(output, "event")] == [0, 1, 2]
-    assert [sequence for sequence, _ in numbered(output, "3d")] == [2]
+    assert sequences(output, "event") == [0, 1, 2]
+    assert sequences(output, "3d") == [2]
 
 
 def test_skipping_a_frame_without_these_components_loses_nothing() -> None:
@@ -133,14 +112,14 @@ def test_a_skipped_message_is_lost_if_one_output_would_have_got_it() -> None:
 def test_paced_and_unpaced_routes_to_replaced_outputs_never_go_back() -> None:
     unpaced, paced, again = ToyOutput(), ToyOutput(), ToyOutput()
     paced.max_rate_hz = {MARKERS: 50.0}
-    sequences: list[int] = []
+    found: list[int] = []
     fan_out = FanOut("lab", [unpaced])
     for first, output in ((0, unpaced), (10, paced), (20, again), (30, paced), (40, unpaced)):
         output.messages.clear()
         fan_out.set_outputs([output])
         publish(fan_out, *range(first, first + 10))
-        sequences += [sequence for sequence, _ in numbered(output, "3d")]
-    assert sequences == [*range(10), *range(10, 15), *range(20, 30), *range(30, 35), *range(40, 50)]
+        found += sequences(output, "3d")
+    assert found == [*range(10), *range(10, 15), *range(20, 30), *range(30, 35), *range(40, 50)]
 
 
 def test_a_paced_route_that_is_replaced_by_a_paced_one_continues_its_numbers() -> None:
@@ -156,28 +135,11 @@ def test_a_paced_route_that_is_replaced_by_a_paced_one_continues_its_numbers() -
 def test_a_refused_message_is_a_gap_only_on_the_output_that_refused_it() -> None:
     refusing, accepting = ToyOutput("refusing"), ToyOutput("accepting")
     fan_out = FanOut("lab", [refusing, accepting])
-    for number, error in ((1, None), (2, OutputError("no router", cause="no router")), (3, None)):
+    for number, error in ((1, None), (2, NO_ROUTER), (3, None)):
         refusing.error = error
         publish(fan_out, number)
     assert numbered(refusing, "3d") == [(0, 1), (2, 3)]
     assert numbered(accepting, "3d") == [(0, 1), (1, 2), (2, 3)]
-
-
-def test_whole_frames_have_one_number_each_and_skipped_ones_are_a_gap() -> None:
-    output = FrameOutput()
-    fan_out = FanOut("lab", [output])
-    publish(fan_out, 1)
-    assert skip(fan_out, 2) == 2
-    publish(fan_out, 3)
-    assert [sequence for _, _, sequence, _ in output.frames] == [0, 2]
-
-
-def test_a_frame_without_wanted_components_has_no_number() -> None:
-    output = FrameOutput()
-    fan_out = FanOut("lab", [output])
-    fan_out.publish(frame(1), stamp(1), EVENTS)
-    publish(fan_out, 2)
-    assert [sequence for _, _, sequence, _ in output.frames] == [0]
 
 
 def test_poses_without_a_subscriber_are_no_gap_and_skipped_ones_are() -> None:
@@ -254,5 +216,5 @@ def test_missing_frames_are_the_gaps_and_the_count_of_skipped_messages(rate_hz: 
     events = numbered(whole, "event")
     assert [sequence for sequence, _ in events] == list(range(len(events)))
     assert len(events) == 29
-    gaps = num_missing([sequence for sequence, _ in numbered(paced, "3d")])
+    gaps = num_missing(sequences(paced, "3d"))
     assert gaps == skipped_frames if rate_hz is None else 0 < gaps < skipped_frames

@@ -58,24 +58,6 @@ async def test_an_idle_output_gets_and_counts_nothing(tmp_path: Path) -> None:
     await asyncio.to_thread(takes.close)
 
 
-async def test_messages_that_do_not_fit_into_the_queue_are_counted(tmp_path: Path) -> None:
-    takes = TakesOutput(settings_in(tmp_path), max_queued_bytes=1000)
-    takes.start()
-    fan_out = FanOut("lab", [takes])
-    await wait_until_async(lambda: _is_open(takes))
-    await takes.takes.start("lab", "walk")
-    for _ in range(100):
-        fan_out.publish(FULL, STAMP, ALL)
-    [(_, status)] = fan_out.outputs
-    [loss] = status.losses
-    assert loss.cause == "disk too slow"
-    assert loss.messages + status.messages.total() == 500
-    stopped = await takes.takes.stop("lab")
-    assert len(frames(tmp_path / "lab" / "walk.lcmlog")) == status.messages.total()
-    assert stopped.num_lost == 0
-    await asyncio.to_thread(takes.close)
-
-
 def _is_open(takes: TakesOutput) -> bool:
     takes.maintain()
     return takes.health().connected

@@ -8,15 +8,13 @@ import pytest
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
-from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import Frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
 from tests.losses import amounts
 from tests.server_parameters import in_metres
 from tests.toy_output import ToyOutput
+from tests.unit.publish.rig import ALL, STAMP
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
-ALL = frozenset(WIRE_ORDER)
 IN_VIEW = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.5)
 
 
@@ -36,6 +34,16 @@ def publish_tools(fan_out: FanOut, count: int) -> None:
     fan_out.publish(tools_frame(*[IN_VIEW] * count), STAMP, ALL)
 
 
+def lab(
+    *labels: str, wanted: tuple[str, ...] = (), unit: str = "mm", has_tool_poses: bool = True
+) -> tuple[ToyOutput, FanOut]:
+    """Return an output with subscribers of these tools, and a fan-out with parameters of these labels."""
+    output = ToyOutput("toy", *wanted, has_tool_poses=has_tool_poses)
+    fan_out = FanOut("lab", [output])
+    fan_out.set_parameters(in_metres(parameters(*labels, unit=unit)))
+    return output, fan_out
+
+
 def test_tools_have_topics_only_where_switched_on() -> None:
     with_tools, without = ToyOutput("with", "Probe", has_tool_poses=True), ToyOutput("without", "Probe")
     fan_out = FanOut("lab", [with_tools, without])
@@ -47,9 +55,7 @@ def test_tools_have_topics_only_where_switched_on() -> None:
 
 
 def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
-    output = ToyOutput("toy", "Probe", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters("Probe", "Head")))
+    output, fan_out = lab("Probe", "Head", wanted=("Probe",))
     publish_tools(fan_out, 2)
     assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 0)
     output.wanted = {"Head"}
@@ -69,29 +75,18 @@ def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
         ([" Probe ", "  ", ""], ["Probe", "tool 2", "tool 3"]),
         (["Probe"], ["Probe", "tool 2"]),
         ([], ["tool 1"]),
+        (["json", "JSON", "json"], ["json_2", "JSON", "json_3"]),
         ([500 * "x", 500 * "x"], [200 * "x", 198 * "x" + "_2"]),
     ],
 )
 def test_topics_are_named_after_the_labels(labels: list[str], names: list[str]) -> None:
-    output = ToyOutput(has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters(*labels)))
+    output, fan_out = lab(*labels)
     publish_tools(fan_out, len(names))
     assert output.tool_names() == names
 
 
-def test_tools_without_parameters_are_numbered() -> None:
-    output = ToyOutput(has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(Parameters()))
-    publish_tools(fan_out, 2)
-    assert output.tool_names() == ["tool 1", "tool 2"]
-
-
 def test_new_labels_replace_the_topics() -> None:
-    output = ToyOutput(has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters("Probe", "Head")))
+    output, fan_out = lab("Probe", "Head")
     publish_tools(fan_out, 2)
     fan_out.set_parameters(in_metres(parameters("Head", "Foot", "Hand")))
     publish_tools(fan_out, 3)
@@ -131,9 +126,7 @@ def test_of_more_than_1024_names_those_that_were_used_last_keep_their_numbers() 
 
 
 def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
-    output = ToyOutput("toy", "A", "B", "C", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters("A", "B", "C")))
+    output, fan_out = lab("A", "B", "C", wanted=("A", "B", "C"))
     publish_tools(fan_out, 3)
     for count in (1, 0, 3, 2):
         publish_tools(fan_out, count)
@@ -142,52 +135,15 @@ def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
     assert counted == {"A": [0, 1, 2, 3], "B": [0, 1, 2], "C": [0, 1]}
 
 
-def test_too_many_tools_get_no_topics_and_are_counted(caplog: pytest.LogCaptureFixture) -> None:
-    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    for _ in range(2):
-        publish_tools(fan_out, 257)
-    assert output.tool_names() == []
-    assert amounts(fan_out.outputs[0][1].losses) == {"too many tools": (514, 2)}
-    assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert fan_out.outputs[0][1].messages == {"6d": 2}
-    publish_tools(fan_out, 256)
-    assert len(output.tool_names()) == 256
-
-
 @pytest.mark.parametrize(
     ("unit", "position_m"), [("mm", (0.1, 0.2, 0.3)), ("m", (100.0, 200.0, 300.0)), ("", (0.1, 0.2, 0.3))]
 )
 def test_poses_are_in_metres_whatever_the_unit_of_the_server(
     unit: str, position_m: tuple[float, ...]
 ) -> None:
-    output = ToyOutput("toy", "Probe", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters("Probe", unit=unit)))
+    output, fan_out = lab("Probe", wanted=("Probe",), unit=unit)
     publish_tools(fan_out, 1)
     assert output.poses("Probe")[0].position_m == pytest.approx(position_m)
-
-
-def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCaptureFixture) -> None:
-    output = ToyOutput("toy", "Probe", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters("Probe", unit="furlong")))
-    publish_tools(fan_out, 1)
-    assert output.poses("Probe") == []
-    assert amounts(fan_out.outputs[0][1].losses) == {"unknown unit": (1, 1)}
-    assert ["furlong" in record.getMessage() for record in caplog.records] == [True]
-
-
-def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCaptureFixture) -> None:
-    FanOut("lab", [ToyOutput()]).set_parameters(in_metres(parameters("Probe", unit="furlong")))
-    assert not caplog.records
-
-
-def test_without_parameters_poses_are_converted_from_millimetres() -> None:
-    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
-    publish_tools(FanOut("lab", [output]), 1)
-    [pose] = output.poses("tool 1")
-    assert pose.position_m == pytest.approx((0.1, 0.2, 0.3))
 
 
 def test_the_tools_of_all_6d_components_of_a_frame_count() -> None:
@@ -202,19 +158,60 @@ def test_the_tools_of_all_6d_components_of_a_frame_count() -> None:
     assert (loss.cause, loss.messages) == ("too many tools", 300)
 
 
-def test_topics_stay_open_when_tools_are_added() -> None:
-    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    publish_tools(fan_out, 1)
-    before = set(output.tool_names())
-    publish_tools(fan_out, 3)
-    assert before == {"tool 1"}
-    assert sorted(output.tool_names()) == ["tool 1", "tool 2", "tool 3"]
+def test_without_parameters_tools_are_numbered_and_poses_converted_from_millimetres(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    for has_parameters in (False, True):
+        output = ToyOutput("toy", "tool 1", has_tool_poses=True)
+        fan_out = FanOut("lab", [output])
+        if has_parameters:
+            fan_out.set_parameters(in_metres(Parameters()))
+        publish_tools(fan_out, 1)
+        assert output.poses("tool 1")[0].position_m == pytest.approx((0.1, 0.2, 0.3))
+        publish_tools(fan_out, 3)
+        assert (output.tool_names(), output.closed_topics) == (["tool 1", "tool 2", "tool 3"], [])
+    assert not caplog.records
 
 
-def test_no_tool_has_the_name_of_the_key_with_json() -> None:
-    output = ToyOutput(has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(in_metres(parameters("json", "JSON", "json")))
-    publish_tools(fan_out, 3)
-    assert output.tool_names() == ["json_2", "JSON", "json_3"]
+# What is not published -----------------------------------------------------------------------
+
+
+def test_too_many_tools_get_no_topics_and_are_logged_and_counted(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.routes")
+    output, fan_out = lab(wanted=("tool 1",))
+    for _ in range(2):
+        publish_tools(fan_out, 257)
+    assert output.tool_names() == []
+    assert amounts(fan_out.outputs[0][1].losses) == {"too many tools": (514, 2)}
+    assert fan_out.outputs[0][1].messages == {"6d": 2}
+    publish_tools(fan_out, 256)
+    assert len(output.tool_names()) == 256
+    fan_out.close()
+    assert [f"{record.levelname} {record.getMessage()}" for record in caplog.records] == [
+        "WARNING lab to toy: a frame of 257 tools, more than 256: no tool poses are published",
+        "INFO lab to toy: lost within 0.0 s: 514 messages of 2 frames (too many tools)",
+    ]
+
+
+def test_with_an_unknown_unit_no_pose_is_published_which_is_logged_and_counted(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.routes")
+    output, fan_out = lab("Probe", wanted=("Probe",), unit="x" * 41)
+    publish_tools(fan_out, 2)
+    publish_tools(fan_out, 0)
+    assert output.poses("Probe") == []
+    assert amounts(fan_out.outputs[0][1].losses) == {"unknown unit": (2, 1)}
+    fan_out.set_parameters(in_metres(parameters("Probe", unit="m")))
+    publish_tools(fan_out, 2)
+    fan_out.close()
+    assert [f"{record.levelname} {record.getMessage()}" for record in caplog.records] == [
+        f"WARNING lab to toy: unit of length '{'x' * 40}' is unknown: no tool poses are published; "
+        "set it to mm or m in the server, or set transform.units of the source in the configuration",
+        "INFO lab to toy: lost within 0.0 s: 2 messages of 1 frame (unknown unit)",
+    ]
+
+
+def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCaptureFixture) -> None:
+    lab("Probe", unit="furlong", has_tool_poses=False)
+    assert not caplog.records

@@ -34,21 +34,14 @@ def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
 # At each connection --------------------------------------------------------------------------
 
 
-async def test_parameters_are_announced_at_every_connection() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
-    await source.connect(MM)
-    await source.connect(CM)
-    assert source.announced == [(MM, 1), (MM, 1), (CM, 2)]
-    assert (await source.parameters()).session == 3
-
-
-async def test_the_statistics_of_a_new_connection_are_no_change() -> None:
+async def test_parameters_are_announced_at_every_connection_and_statistics_are_no_change() -> None:
     source = FakeSource()
     await source.store_parameters(MM)
     other = parameters_xml("mm", frames_sent=7)
-    await source.connect(other)
-    assert source.announced == [(MM, 1), (other, 1)]
+    for xml in (MM, other, CM):
+        await source.connect(xml)
+    assert source.announced == [(MM, 1), (MM, 1), (other, 1), (CM, 2)]
+    assert (await source.parameters()).session == 4
 
 
 @no_parameters
@@ -67,13 +60,6 @@ async def test_a_server_without_parameters_makes_the_former_ones_void(
     assert len(source.announced) == 2
     await source.connect(MM)
     assert source.announced[2:] == [(MM, 3)]
-
-
-async def test_a_server_that_never_gave_parameters_announces_nothing() -> None:
-    source = FakeSource()
-    with pytest.raises(ServerError):
-        await source.connect(ServerError("err-what?"))
-    assert source.announced == []
 
 
 async def test_a_lost_connection_keeps_the_parameters() -> None:
@@ -232,23 +218,6 @@ async def test_a_change_of_the_statistics_is_not_announced_but_answered() -> Non
     assert general.frames_sent == 2
 
 
-async def test_unchanged_xml_is_not_parsed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    parsed: list[bytes] = []
-
-    def parse(xml: bytes) -> ParsedParameters:
-        parsed.append(xml)
-        return parse_parameters(xml)
-
-    monkeypatch.setattr("gateway.queries.known_parameters.parse_parameters", parse)
-    source = FakeSource()
-    long = parameters_xml("mm") + b" " * LONG_XML_BYTES
-    await source.store_parameters(long)
-    source.server.replies["SendParameters"] = long.replace(b">1<", b">2<")
-    await source.queries.parameters.refresh()
-    assert parsed[0] == long
-    assert all(len(xml) < 1000 for xml in parsed[1:])  # the statistics alone
-
-
 async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_them() -> None:
     source = FakeSource()
     await source.queries.parameters.refresh()
@@ -322,12 +291,7 @@ async def test_an_answer_to_a_peer_is_read_again_later() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "level", "text"),
     [
-        (
-            "A B",
-            "A C",
-            logging.WARNING,
-            "lab: markers or tools were renamed on the server: 3d 'B' to 'C';",
-        ),
+        ("A B", "A C", logging.WARNING, "lab: markers or tools were renamed on the server: 3d 'B' to 'C';"),
         ("A B", "A B C", logging.INFO, "lab: the server's parameters changed: 3d (parameters_version 2)"),
     ],
 )
@@ -350,15 +314,6 @@ def labelled(labels: str) -> bytes:
 
 
 # Peers ---------------------------------------------------------------------------------------
-
-
-async def test_cached_parameters_are_returned_without_a_request() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
-    cached = await source.parameters()
-    assert (cached.xml, cached.session, cached.version) == (MM, 1, 1)
-    assert cached.age_s >= 0
-    assert source.server.commands == []
 
 
 async def test_a_section_is_taken_from_all_parameters() -> None:
@@ -428,42 +383,6 @@ async def test_a_server_without_single_sections_is_not_asked_again_in_the_connec
     assert (await source.parameters("6d")).xml == in_root("<The_6D/>")  # another server may know sections
 
 
-async def test_a_server_that_refuses_is_not_asked_for_sections() -> None:
-    source = FakeSource()
-    with pytest.raises(ServerError):
-        await source.connect(ServerError("err-what?"))
-    for _ in range(2):
-        assert (await source.parameters_error("3d")).code == "refused"
-    assert source.server.commands == ["SendParameters"]
-
-
-async def test_an_answer_counts_as_fresh_within_the_interval() -> None:
-    source = FakeSource(fresh_interval_s=3600.0)
-    await source.store_parameters(MM)
-    assert (await source.parameters(fresh=True)).xml == MM
-    assert source.server.commands == []
-
-
-async def test_a_refusal_is_cached_for_the_connection_unless_the_query_is_fresh() -> None:
-    source = FakeSource()
-    with pytest.raises(ServerError):
-        await source.connect(ServerError("err-what?"))
-    texts = {str(await source.parameters_error()) for _ in range(3)}
-    assert texts == {"source 'lab': the server does not know SendParameters, or refuses it: err-what?"}
-    assert source.server.commands == ["SendParameters"]
-    assert (await source.parameters_error(fresh=True)).code == "refused"
-    assert source.server.commands == ["SendParameters"] * 2
-
-
-async def test_a_refusal_counts_as_fresh_within_the_interval() -> None:
-    source = FakeSource(fresh_interval_s=3600.0)
-    with pytest.raises(ServerError):
-        await source.connect(ServerError("err-what?"))
-    for _ in range(3):
-        assert (await source.parameters_error(fresh=True)).code == "refused"
-    assert source.server.commands == ["SendParameters"]
-
-
 async def test_stale_parameters_are_returned_only_without_a_connection() -> None:
     source = FakeSource()
     await source.store_parameters(MM)
@@ -476,20 +395,52 @@ async def test_stale_parameters_are_returned_only_without_a_connection() -> None
     assert (await source.parameters(stale_ok=True)).xml == CM
 
 
-async def test_xml_is_parsed_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    in_event_loop: list[bool] = []
+@pytest.mark.parametrize("fresh_interval_s", [0.0, 3600.0])
+async def test_the_last_answer_is_returned_unless_a_fresh_one_is_asked_for_after_the_interval(
+    fresh_interval_s: float,
+) -> None:
+    requests = [] if fresh_interval_s else ["SendParameters"]
+    source = FakeSource(fresh_interval_s=fresh_interval_s)
+    await source.store_parameters(MM)
+    cached = await source.parameters()
+    assert (cached.xml, cached.session, cached.version, cached.age_s >= 0) == (MM, 1, 1, True)
+    assert source.server.commands == []
+    assert (await source.parameters(fresh=True)).xml == MM
+    assert source.server.commands == requests
+
+
+@pytest.mark.parametrize("fresh_interval_s", [0.0, 3600.0])
+async def test_a_refusal_is_cached_for_the_connection_unless_the_query_is_fresh(
+    fresh_interval_s: float,
+) -> None:
+    requests = [] if fresh_interval_s else ["SendParameters"]
+    source = FakeSource(fresh_interval_s=fresh_interval_s)
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("err-what?"))
+    assert source.announced == []
+    texts = {str(await source.parameters_error(*sections)) for sections in ((), (), ("3d",))}
+    assert texts == {"source 'lab': the server does not know SendParameters, or refuses it: err-what?"}
+    assert source.server.commands == ["SendParameters"]
+    assert (await source.parameters_error(fresh=True)).code == "refused"
+    assert source.server.commands == ["SendParameters", *requests]
+
+
+async def test_xml_is_parsed_in_a_thread_and_only_its_statistics_if_nothing_else_has_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parsed: list[bytes] = []
 
     def parse(xml: bytes) -> ParsedParameters:
-        try:
+        with pytest.raises(RuntimeError, match="no running event loop"):
             asyncio.get_running_loop()
-        except RuntimeError:
-            in_event_loop.append(False)
-        else:
-            in_event_loop.append(True)
+        parsed.append(xml)
         return parse_parameters(xml)
 
     monkeypatch.setattr("gateway.queries.known_parameters.parse_parameters", parse)
     source = FakeSource()
-    await source.store_parameters(MM)
-    await source.connect(CM + b" " * LONG_XML_BYTES)
-    assert in_event_loop == [False, False]
+    long = parameters_xml("mm") + b" " * LONG_XML_BYTES
+    await source.store_parameters(long)
+    source.server.replies["SendParameters"] = long.replace(b">1<", b">2<")
+    await source.queries.parameters.refresh()
+    assert parsed[0] == long
+    assert all(len(xml) < 1000 for xml in parsed[1:])  # the statistics alone

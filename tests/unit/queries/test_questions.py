@@ -1,13 +1,7 @@
 import pytest
 
 from gateway.errors import QueryError
-from gateway.queries.questions import (
-    Question,
-    accepted_keys,
-    known_keys,
-    parse_question,
-    parse_questions,
-)
+from gateway.queries.questions import Question, accepted_keys, known_keys, parse_question, parse_questions
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 
 ALL = frozenset(WIRE_ORDER)

@@ -37,18 +37,13 @@ async def test_cancelling_one_caller_does_not_cancel_a_shared_request() -> None:
         await cancelled
 
 
-async def test_the_fallback_is_sent_if_the_command_is_refused() -> None:
+async def test_the_fallback_is_sent_if_the_command_is_refused_and_its_error_raised() -> None:
     source = FakeSource()
     source.server.replies = {"SendParameters 3D": ServerError("err-what?"), "SendParameters": b"<a/>"}
     requests = ServerRequests(source.queries.settings, lambda: source.streams)
     command, packet = await requests.send(SendParameters(("3d",)), fallback=SendParameters())
     assert (command, packet.body) == (SendParameters(), b"<a/>")
-
-
-async def test_the_error_of_the_fallback_is_raised() -> None:
-    source = FakeSource()
     source.server.replies = {"SendCurrentFrame 3D": ServerError("a"), "SendCurrentFrame": ServerError("b")}
-    requests = ServerRequests(source.queries.settings, lambda: source.streams)
     [component, _] = source.streams[0].components
     with pytest.raises(QueryError, match="the server does not know SendCurrentFrame, or refuses it: b"):
         await requests.send(SendCurrentFrame((component,)), fallback=SendCurrentFrame())
@@ -96,17 +91,12 @@ async def test_losing_the_connection_while_waiting_for_another_request_is_an_err
     assert source.server.commands == ["SendParameters"]
 
 
-async def test_before_the_first_failure_the_error_names_the_address() -> None:
+async def test_without_a_connection_the_error_has_the_address_or_reason_age_and_remedy() -> None:
     source = FakeSource()
     source.server.is_connected = False
     error = await source.parameters_error()
     assert error.code == "no-connection"
     assert str(error) == "source 'lab' has no connection yet: connecting to 192.0.2.1:3020"
-
-
-async def test_without_a_connection_the_error_has_reason_age_and_remedy() -> None:
-    source = FakeSource()
-    source.server.is_connected = False
     source.status.record_error("connection refused by 192.0.2.1:3020; is the RT server running?")
     source.status.last_error_s -= 300
     problem, _, remedy = str(await source.parameters_error(stale_ok=True)).partition("; ")

@@ -1,6 +1,7 @@
-"""The file of a recording while its disk is full."""
+"""The file of a recording: its name, and what happens while its disk is full."""
 
 import os
+import re
 import resource
 import threading
 from collections.abc import Iterator
@@ -9,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from gateway.errors import TakeError
 from gateway.recorder.file_sink import FileSink
+from gateway.recorder.target import Target
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.recording import LogFile
 from tests.waiting import wait_until
@@ -32,6 +35,17 @@ def disk_of(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+@contextmanager
+def writing(sink: FileSink, sent: list[tuple[bytes, bytes]]) -> Iterator[threading.Thread]:
+    """Write in a thread to a disk with room for 700 kB in the block, and for all afterwards."""
+    thread = threading.Thread(target=sink.write, args=(sent,))
+    with disk_of(sink.num_bytes + 700_000):
+        thread.start()
+        wait_until(lambda: sink.problem)
+        yield thread
+    thread.join(30)
+
+
 @pytest.fixture
 def sink(tmp_path: Path) -> FileSink:
     return FileSink(LogFile(tmp_path / "walk.lcmlog"))
@@ -45,24 +59,21 @@ def written(sink: FileSink) -> list[tuple[bytes, bytes]]:
 
 
 def test_nothing_is_lost_if_the_disk_has_room_again(sink: FileSink) -> None:
+    """Each period without room counts as one error: how often it was tried does not matter."""
     sent = messages(2000)
-    with disk_of(700_000):
-        thread = threading.Thread(target=sink.write, args=(sent,))
-        thread.start()
-        wait_until(lambda: sink.problem)
-        assert sink.problem == f"{sink.path} cannot be written: File too large"
-        assert 400_000 < len(written(sink)) * 1000 < 700_000
-    thread.join(10)
-    assert written(sink) == sent
-    assert (sink.problem, sink.num_errors, sink.lost) == ("", 1, {})
+    for number in (1, 2):
+        with writing(sink, sent):
+            assert sink.problem == f"{sink.path} cannot be written: File too large"
+            assert 400_000 < len(written(sink)) * 1000 - 2_000_000 * (number - 1) < 700_000
+            for _ in range(3):
+                sink._failed(OSError(28, "No space left on device"))
+        assert written(sink) == sent * number
+        assert (sink.problem, sink.num_errors, sink.lost, sink.is_unsafe) == ("", number, {}, False)
 
 
 def test_what_the_disk_does_not_accept_at_the_end_is_counted(sink: FileSink) -> None:
     sent = messages(2000)
-    with disk_of(700_000):
-        thread = threading.Thread(target=sink.write, args=(sent,))
-        thread.start()
-        wait_until(lambda: sink.problem)
+    with writing(sink, sent) as thread:
         sink.give_up()
         thread.join(10)
     assert written(sink) == sent[: len(written(sink))]
@@ -79,16 +90,49 @@ def test_no_end_of_an_event_is_left_behind_if_the_disk_is_full(sink: FileSink) -
     assert len(written(sink)) == 97  # 95 of the 200 fit
 
 
-def test_each_period_without_room_counts_as_one_error(sink: FileSink) -> None:
-    """The report says how often the disk failed, not how often it was tried."""
-    for _ in range(2):
-        with disk_of(100_000):
-            sink.write(messages(0))
-            thread = threading.Thread(target=sink.write, args=(messages(200),))
-            thread.start()
-            wait_until(lambda: sink.problem)
-            for _ in range(3):
-                sink._failed(OSError(28, "No space left on device"))
-        thread.join(30)
-        assert not sink.problem
-    assert (sink.num_errors, sink.lost, sink.is_unsafe) == (2, {}, False)
+# Its name ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sources", "expected"),
+    [
+        (["lab"], "lab"),
+        (["lab", "robot", "Hand-2"], r"lab\+robot\+Hand-2"),
+        (["a", "b", "c", "d"], "4-sources"),
+    ],
+)
+def test_a_name_in_a_folder_follows_the_sources(tmp_path: Path, sources: list[str], expected: str) -> None:
+    first, second = (Target(tmp_path).open(sources).path.name for _ in range(2))
+    assert re.fullmatch(expected + r"-\d{8}-\d{6}\.lcmlog", first)
+    assert re.fullmatch(expected + r"-\d{8}-\d{6}(-2)?\.lcmlog", second)
+    assert first != second
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("there.lcmlog", "there.lcmlog exists already, and nothing is overwritten"),
+        ("there", "there.lcmlog exists already"),
+        ("dangling.lcmlog", "exists already"),
+        ("nowhere/walk.lcmlog", "there is no folder .*nowhere; create it first"),
+        ("there.lcmlog/walk.lcmlog", "there.lcmlog/walk.lcmlog cannot be created: Not a directory"),
+        ("walk.mcap", r"choose a name that ends with \.lcmlog, and convert it afterwards"),
+        ("x" * 300, "cannot be created: File name too long"),
+    ],
+)
+def test_what_cannot_be_a_new_file_is_an_error(tmp_path: Path, name: str, problem: str) -> None:
+    (tmp_path / "there.lcmlog").write_bytes(b"precious")
+    (tmp_path / "dangling.lcmlog").symlink_to("elsewhere")
+    with pytest.raises(TakeError, match=problem):
+        Target(tmp_path / name)
+    assert (tmp_path / "there.lcmlog").read_bytes() == b"precious"
+    assert {path.name for path in tmp_path.iterdir()} == {"there.lcmlog", "dangling.lcmlog"}
+
+
+def test_a_file_gets_the_extension_and_is_removed_if_it_remains_empty(tmp_path: Path) -> None:
+    targets = [Target(tmp_path / name) for name in ("walk", "run.lcmlog", "full")]
+    assert {path.name for path in tmp_path.iterdir()} == {"walk.lcmlog", "run.lcmlog", "full.lcmlog"}
+    targets[2].open([]).append([(CHANNEL, bytes(40))])
+    for target in targets:
+        target.discard_empty()
+    assert {path.name: path.stat().st_size for path in tmp_path.iterdir()} == {"full.lcmlog": 28 + 12 + 40}

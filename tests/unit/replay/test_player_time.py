@@ -64,11 +64,7 @@ class Replay:
     def prepare(self, selection: Selection | None = None, **options: Any) -> Player:
         """Make the player."""
         self.player = Player(
-            TakeReader(self.path),
-            selection or Selection(),
-            self,
-            on_jump=self.jumps.append,
-            **options,
+            TakeReader(self.path), selection or Selection(), self, on_jump=self.jumps.append, **options
         )
         self.player.clock = self.clock
         return self.player
@@ -118,9 +114,7 @@ def test_a_pause_moves_all_that_follows_by_its_length(replay: Replay) -> None:
 
 
 @pytest.mark.parametrize(("stall_s", "is_made_up"), [(0.9 * STALL_S, True), (60.0, False)])
-def test_what_a_short_stall_delays_is_made_up_and_a_long_one_is_not(
-    replay: Replay, stall_s: float, is_made_up: bool
-) -> None:
+def test_only_what_a_short_stall_delays_is_made_up(replay: Replay, stall_s: float, is_made_up: bool) -> None:
     """After a suspended laptop wakes, minutes of frames at once would overrun every receiver."""
 
     def stall() -> None:

@@ -39,11 +39,10 @@ ANALOG_ONLY = encode_frame([encode_component(ComponentType.ANALOG, 1, 0, np.zero
 
 
 def test_a_command_is_sent_once_as_a_packet_of_type_1() -> None:
-    """The bytes are those of the specification's example, and are not sent again."""
     protocol = ClientProtocol()
     protocol.send(Version())
-    assert protocol.bytes_to_send() == b"\x00\x00\x00\x13\x00\x00\x00\x01Version 1.0"
-    assert protocol.bytes_to_send() == b""
+    sent = b"\x00\x00\x00\x13\x00\x00\x00\x01Version 1.0"
+    assert (protocol.bytes_to_send(), protocol.bytes_to_send()) == (sent, b"")
 
 
 def test_recording_control_is_the_data_frame_of_field_note_16() -> None:
@@ -77,45 +76,30 @@ def test_a_command_that_cannot_be_sent_is_named_with_the_reason() -> None:
 
 # States ---------------------------------------------------------------------------------------
 
-STOP_OK = ok("OK-StreamFrames Stop")
+STOP, STOP_OK = StopStreaming(), ok("OK-StreamFrames Stop")
 
 
 @pytest.mark.parametrize(
     ("steps", "states"),
     [
         (
-            [STREAM, ok("OK"), NO_DATA, FRAME, NO_DATA, FRAME, StopStreaming(), STOP_OK, FRAME, Bye(), "end"],
-            "requested, requested, no measurement, streaming, no measurement, streaming, streaming, stopped, "
-            "stopped, closing, closed",
+            [STREAM, ok("OK"), NO_DATA, FRAME, NO_DATA, FRAME],
+            "requested, requested, no, streaming, no, streaming",
         ),
         (
-            [STREAM, FRAME, StopStreaming(), STOP_OK, STREAM, FRAME],
-            "requested, streaming, streaming, stopped, requested, streaming",
+            [STREAM, FRAME, STOP, STOP_OK, FRAME, Bye(), "end"],
+            "requested, streaming, streaming, stopped, stopped, closing, closed",
         ),
+        ([STREAM, FRAME, STOP, STOP_OK, STREAM], "requested, streaming, streaming, stopped, requested"),
         ([STREAM, error("no"), FRAME], "requested, idle, streaming"),
-        ([STREAM, error("no"), NO_DATA], "requested, idle, no measurement"),
-        (
-            [STREAM, ok("OK"), FRAME, StopStreaming(), error("no"), FRAME],
-            "requested, requested, streaming, streaming, streaming, streaming",
-        ),
-        (
-            [STREAM, ok("OK"), FRAME, StopStreaming(), "give up", FRAME],
-            "requested, requested, streaming, streaming, idle, streaming",
-        ),
-        (
-            [STREAM, FRAME, StreamFrames(), error("no")],
-            "requested, streaming, streaming, streaming",
-        ),
+        ([STREAM, error("no"), NO_DATA], "requested, idle, no"),
+        ([STREAM, FRAME, STOP, error("no"), FRAME], "requested" + ", streaming" * 4),
+        ([STREAM, FRAME, STOP, "give up", FRAME], "requested, streaming, streaming, idle, streaming"),
+        ([STREAM, FRAME, StreamFrames(), error("no")], "requested, streaming, streaming, streaming"),
         ([SendCurrentFrame(), FRAME], "idle, idle"),
-        (
-            [STREAM, "give up", Version(), error("Error-Version?")],
-            "requested, requested, requested, requested",
-        ),
+        ([STREAM, "give up", Version(), error("Error-Version?")], "requested" + ", requested" * 3),
         ([SendCurrentFrame(), NO_DATA], "idle, idle"),
-        (
-            [STREAM, FRAME + ok("OK"), SendCurrentFrame(), NO_DATA],
-            "requested, streaming, streaming, no measurement",
-        ),
+        ([STREAM, FRAME + ok("OK"), SendCurrentFrame(), NO_DATA], "requested, streaming, streaming, no"),
         ([Bye(), ok("bye"), FRAME, NO_DATA], "closing, closing, closing, closing"),
         (["end", NO_DATA], "closed, closed"),
     ],
@@ -132,7 +116,7 @@ def test_the_state_follows_what_the_server_sends(steps: list[Command | bytes | s
             protocol.give_up()
         elif not isinstance(step, str):
             protocol.send(step)
-        seen.append(protocol.state.value)
+        seen.append(protocol.state.value.removesuffix(" measurement"))
     assert ", ".join(seen) == states
 
 
@@ -142,58 +126,48 @@ def test_the_state_follows_what_the_server_sends(steps: list[Command | bytes | s
 @pytest.mark.parametrize("frames_before_ok", [0, 1, 2])
 def test_stream_frames_may_be_acknowledged_before_between_or_after_frames(frames_before_ok: int) -> None:
     """Field note 3: the request counts as answered once, and no frame is lost."""
-    protocol = protocol_after(STREAM)
-    before = FRAME * frames_before_ok
-    frames, events = protocol.receive(before + ok(f"OK-{STREAM}") + FRAME * (2 - frames_before_ok))
-    answered = [event.command for event in events if isinstance(event, Answered)]
-    assert (len(frames), answered) == (2, [STREAM])
+    before, after = FRAME * frames_before_ok, FRAME * (2 - frames_before_ok)
+    frames, events = protocol_after(STREAM).receive(before + ok(f"OK-{STREAM}") + after)
+    assert (len(frames), [event.command for event in events if isinstance(event, Answered)]) == (2, [STREAM])
 
 
 def test_the_current_frame_is_the_answer_alone_while_nothing_is_streamed() -> None:
     """Published as a streamed frame, it would count as the stream's first one."""
     for body in (FULL_FRAME["big"], ANALOG_ONLY, EMPTY_FRAME["big"]):
         command = SendCurrentFrame((ComponentType.MARKERS,))
-        protocol = protocol_after(command)
-        assert protocol.receive(packet(3, body)) == ([], [Answered(command, Packet(3, body))])
+        assert protocol_after(command).receive(packet(3, body)) == ([], [Answered(command, Packet(3, body))])
 
 
-def test_a_streamed_frame_answers_if_it_has_a_requested_component() -> None:
-    """Frames of a running stream arrive between the request and its answer."""
-    markers_only = packet(3, struct.pack(">IIIiqI", 1, 24, 1, 5, 0, 0))
-    for requested, answers in (
+@pytest.mark.parametrize(
+    ("requested", "answers"),
+    [
         ((ComponentType.ANALOG,), [False, True]),
         ((ComponentType.ANALOG, ComponentType.MARKERS), [True, False]),
         ((), [True, False]),
-    ):
+    ],
+)
+def test_a_streamed_frame_answers_if_it_fits(
+    requested: tuple[ComponentType, ...], answers: list[bool]
+) -> None:
+    """Frames of a running stream arrive between the request and its answer, which may be an empty frame."""
+    markers_only = packet(3, struct.pack(">IIIiqI", 1, 24, 1, 5, 0, 0))
+    for stream, expected in (((markers_only, FRAME), answers), ((packet(3, EMPTY_FRAME["big"]),), [True])):
         protocol = protocol_after(STREAM)
         protocol.receive(FRAME)
         protocol.send(SendCurrentFrame(requested))
-        received = [protocol.receive(body) for body in (markers_only, FRAME)]
-        assert [len(frames) for frames, _ in received] == [1, 1]
-        assert [bool(events) for _, events in received] == answers
-
-
-def test_a_frame_without_components_answers_any_request() -> None:
-    """A server that has none of the components may say so with an empty frame."""
-    protocol = protocol_after(STREAM)
-    protocol.receive(FRAME)
-    protocol.send(SendCurrentFrame((ComponentType.ANALOG,)))
-    _, [answered] = protocol.receive(packet(3, EMPTY_FRAME["big"]))
-    assert isinstance(answered, Answered)
+        received = [protocol.receive(body) for body in stream]
+        assert [len(frames) for frames, _ in received] == [1] * len(stream)
+        assert [bool(events) for _, events in received] == expected
 
 
 @pytest.mark.parametrize(
     ("reply", "sent", "is_mismatch"),
     [
-        (ok("OK"), "big", True),
-        (ok("OK"), "little", False),
-        (error("no"), "big", False),
-        (error("no"), "little", True),
+        *((ok("OK"), "big", True), (ok("OK"), "little", False)),
+        *((error("no"), "big", False), (error("no"), "little", True)),
     ],
 )
-def test_the_first_frame_with_components_decides_the_byte_order(
-    reply: bytes, sent: ByteOrder, is_mismatch: bool
-) -> None:
+def test_the_first_components_decide_the_byte_order(reply: bytes, sent: ByteOrder, is_mismatch: bool) -> None:
     """A server may acknowledge a byte order and ignore it (field note 4); an empty frame shows neither."""
     protocol = protocol_after(SetByteOrder("little"))
     protocol.receive(reply)
@@ -220,14 +194,12 @@ def test_a_frame_that_contradicts_itself_is_rejected_and_the_next_one_returned(o
 
 
 @pytest.mark.parametrize("first", [1, 7, 8, 12, len(FRAME) - 1])
-def test_a_frame_in_two_reads_is_the_same_frame_and_packets_follow_it(first: int) -> None:
-    """TCP cuts anywhere; the offset of a later fault still counts every byte."""
+def test_the_offset_of_a_fault_counts_every_byte_of_frames_in_two_reads(first: int) -> None:
     protocol = protocol_after(STREAM)
     protocol.receive(FRAME)
     assert protocol.receive(FRAME[:first]) == ([], [])
     frames, [corrupted] = protocol.receive(FRAME[first:] + FRAME + bytes(8))
-    expected = split_frame(FULL_FRAME["big"], "big").components
-    assert [frame.components for frame in frames] == [expected] * 2
+    assert len(frames) == 2
     assert isinstance(corrupted, StreamCorrupted)
     assert corrupted.error.offset == 3 * len(FRAME)
 
@@ -240,8 +212,7 @@ def test_frames_are_received_in_parts_while_there_are_more() -> None:
     while protocol.has_more:
         frames, events = protocol.receive(b"", 2)
         counts.append(len(frames))
-    assert counts == [2, 2, 1]
-    assert [type(event) for event in events] == [UnexpectedPacket]
+    assert (counts, [type(event) for event in events]) == ([2, 2, 1], [UnexpectedPacket])
 
 
 # Events ---------------------------------------------------------------------------------------
@@ -259,10 +230,7 @@ def test_frames_are_received_in_parts_while_there_are_more() -> None:
         (StreamFrames(), 4, b""),
     ],
 )
-def test_an_answer_carries_the_command_and_the_whole_packet(
-    command: Command, packet_type: int, body: bytes
-) -> None:
-    """Whoever asked needs the content of the reply, whatever its type is."""
+def test_an_answer_has_the_command_and_the_packet(command: Command, packet_type: int, body: bytes) -> None:
     _, events = protocol_after(command).receive(packet(packet_type, body))
     assert events == [Answered(command, Packet(packet_type, body))]
 
@@ -276,12 +244,7 @@ def test_a_packet_that_answers_nothing_is_passed_on_whole(packet_type: int) -> N
 
 @pytest.mark.parametrize(
     ("reply", "text"),
-    [
-        ("err-no such command", "err-no such command"),
-        ("", "no reason given"),
-        ("x" * 301, "x" * 300),
-        ("a\x1bb", r"a\x1bb"),
-    ],
+    [("err-no", "err-no"), ("", "no reason given"), ("x" * 301, "x" * 300), ("a\x1bb", r"a\x1bb")],
 )
 def test_a_refusal_carries_at_most_300_bytes_of_the_servers_text(reply: str, text: str) -> None:
     """The text goes into logs and status messages, so it is bounded and printable."""
@@ -293,10 +256,9 @@ def test_a_refusal_carries_at_most_300_bytes_of_the_servers_text(reply: str, tex
 def test_a_c3d_file_is_returned_in_the_pieces_in_which_it_arrives() -> None:
     """Frames go on between the packets of a file, and the pieces keep their order."""
     protocol, file = ClientProtocol(), packet(5, b"C3D")
-    frames, pieces = protocol.receive(FRAME + file[:10])
-    later_frames, later_pieces = protocol.receive(file[10:] + FRAME)
-    assert [len(frames), len(later_frames)] == [1, 1]
-    assert list(map(repr, pieces + later_pieces)) == ["FilePiece(b'C3', 0, 3)", "FilePiece(b'D', 2, 3)"]
+    received = [protocol.receive(each) for each in (FRAME + file[:10], file[10:] + FRAME)]
+    pieces = [(len(frames), repr(piece)) for frames, [piece] in received]
+    assert pieces == [(1, "FilePiece(b'C3', 0, 3)"), (1, "FilePiece(b'D', 2, 3)")]
 
 
 def test_a_size_out_of_bounds_closes_the_connection_after_the_frames_before_it() -> None:

@@ -27,43 +27,23 @@ TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
 # Each command with its canonical text. "§" marks examples of the specification.
 TEXTS: list[tuple[Command, str]] = [
     (Version(), "Version 1.0"),  # § 5.3.1
-    (Version("2.13"), "Version 2.13"),
     (SetByteOrder("little"), "SetByteOrder LittleEndian"),  # § 5.3.2
     (SetByteOrder("big"), "SetByteOrder BigEndian"),
     (SendParameters(("3d", "force")), "SendParameters 3D Force"),  # § 5.3.3
     (SendParameters(), "SendParameters"),
-    (SendParameters(("general",)), "SendParameters General"),  # § 6.1
-    (SendParameters(("3d",)), "SendParameters 3D"),  # § 6.2
-    (SendParameters(("6d",)), "SendParameters 6D"),
-    (SendParameters(("analog",)), "SendParameters Analog"),  # § 6.4
-    (SendParameters(("force",)), "SendParameters Force"),  # § 6.5
-    (SendParameters(("events",)), "SendParameters Events"),  # § 6.6
-    (
-        SendParameters(("general", "3d", "analog", "force", "6d", "events")),
-        "SendParameters General 3D Analog Force 6D Events",
-    ),
+    (SendParameters(("general", "analog", "6d", "events")), "SendParameters General Analog 6D Events"),  # § 6
     (ControlRecording(start=True), "Recording Start"),  # field note 18
     (ControlRecording(start=False), "Recording Stop"),
     (SendCurrentFrame((MARKERS, ANALOG)), "SendCurrentFrame 3D Analog"),  # § 5.3.4
     (SendCurrentFrame(), "SendCurrentFrame"),
-    (SendCurrentFrame((TOOLS,)), "SendCurrentFrame 6D"),
-    (SendCurrentFrame((FORCE, EVENT)), "SendCurrentFrame Force Events"),  # field note 14
+    (SendCurrentFrame((FORCE, TOOLS, EVENT)), "SendCurrentFrame Force 6D Events"),  # field note 14
     (StreamFrames(Frequency(30), (MARKERS, ANALOG)), "StreamFrames Frequency:30 3D Analog"),  # § 5.3.5
     (StreamFrames(FrequencyDivisor(4)), "StreamFrames FrequencyDivisor:4"),
-    (StreamFrames(Frequency(60)), "StreamFrames Frequency:60"),
     (StreamFrames(Frequency(59.94)), "StreamFrames Frequency:59.94"),
-    (StreamFrames(Frequency(0.5)), "StreamFrames Frequency:0.5"),
-    (StreamFrames(Frequency(100)), "StreamFrames Frequency:100"),
     (StreamFrames(Frequency(0.000001)), "StreamFrames Frequency:0.000001"),
     (StreamFrames(Frequency(123456789.123456)), "StreamFrames Frequency:123456789.123456"),
-    (StreamFrames(AllFrames()), "StreamFrames AllFrames"),
     (StreamFrames(AllFrames(), (FORCE,)), "StreamFrames AllFrames Force"),
     (StreamFrames(), "StreamFrames"),
-    (StreamFrames(None, (TOOLS, EVENT)), "StreamFrames 6D Events"),
-    (
-        StreamFrames(FrequencyDivisor(1), (MARKERS, ANALOG, FORCE, TOOLS, EVENT)),
-        "StreamFrames FrequencyDivisor:1 3D Analog Force 6D Events",
-    ),
     (StopStreaming(), "StreamFrames Stop"),  # § 5.3.5
     (Bye(), "Bye"),  # § 5.3.6
 ]
@@ -78,14 +58,9 @@ ONE_RATE = "StreamFrames takes one of FrequencyDivisor:n, Frequency:n, AllFrames
 
 
 def error_text(body: bytes) -> str:
-    """Return the text of the error that the body raises, which must fit into an error packet."""
     with pytest.raises(CommandError) as caught:
         parse_command(body)
-    text = str(caught.value)
-    assert text.isascii()
-    assert text.isprintable()
-    assert len(text) < 300
-    return text
+    return str(caught.value)
 
 
 def test_each_command_is_encoded_as_its_text_and_parsed_from_it() -> None:
@@ -103,15 +78,12 @@ def test_each_command_is_encoded_as_its_text_and_parsed_from_it() -> None:
 @pytest.mark.parametrize(
     ("text", "command"),
     [
-        ("SendParameters All", SendParameters()),
         ("SendParameters 3D All", SendParameters()),
         ("SendParameters Event", SendParameters(("events",))),
         ("SendParameters 3D Force 3d", SendParameters(("3d", "force"))),
-        ("SendCurrentFrame All", SendCurrentFrame()),
         ("SendCurrentFrame All 6D", SendCurrentFrame()),
         ("SendCurrentFrame Event", SendCurrentFrame((EVENT,))),
         ("StreamFrames All", StreamFrames()),
-        ("StreamFrames AllFrames All", StreamFrames(AllFrames())),
         ("StreamFrames Frequency:60 All 3D", StreamFrames(Frequency(60))),
         ("StreamFrames 3D 3D Event Events", StreamFrames(None, (MARKERS, EVENT))),
         ("StreamFrames 3D Frequency:60 6D", StreamFrames(Frequency(60), (MARKERS, TOOLS))),
@@ -167,34 +139,31 @@ def test_the_error_says_what_is_accepted(verb: str, parameters: list[str], text:
         assert error_text(f"{verb} {each}".encode()) == text, each
 
 
-@pytest.mark.parametrize(
-    "rate",
-    [
-        *("Frequency:", "Frequency:0", "Frequency:0.000000", "Frequency:0.0000009", "Frequency:-60"),
-        *("Frequency:+60", "Frequency:60Hz", "Frequency:nan", "Frequency:inf", "Frequency:1e3"),
-        *(
-            "Frequency:1_000",
-            "Frequency:60:30",
-            "Frequency:" + "9" * 400,
-            "Frequency:\N{ARABIC-INDIC DIGIT SIX}",
-        ),
-        *("FrequencyDivisor:", "FrequencyDivisor:0", "FrequencyDivisor:-4", "FrequencyDivisor:2.5"),
-        *("FrequencyDivisor:four", "Period:10", ":"),
-    ],
-)
-def test_the_error_of_an_invalid_rate_shows_the_three_forms(rate: str) -> None:
+def test_the_error_of_an_invalid_rate_shows_the_three_forms() -> None:
     """A rate that is misread would make the server send too much or nothing."""
-    text = error_text(f"StreamFrames 3D {rate}".encode())
-    assert text.startswith(f"Unknown rate '{rate[:10].lower()}")
-    assert text.endswith(f"; {RATES}")
+    numbers = [
+        "",
+        "0",
+        "-60",
+        "+60",
+        "60Hz",
+        "nan",
+        "inf",
+        "1e3",
+        "1_000",
+        "60:30",
+        "\N{ARABIC-INDIC DIGIT SIX}",
+    ]
+    rates = [prefix + number for prefix in ("Frequency:", "FrequencyDivisor:") for number in numbers]
+    for rate in (*rates, "Frequency:0.0000009", "Frequency:" + "9" * 400, "FrequencyDivisor:2.5", ":"):
+        text = error_text(f"StreamFrames 3D {rate}".encode())
+        assert text.startswith(f"Unknown rate '{rate[:10].lower()}"), rate
+        assert text.endswith(f"; {RATES}")
 
 
 @pytest.mark.parametrize(
     ("word", "shown"),
-    [
-        *(("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "?"), ("\xe9", "?"), ("\x01", r"\x01")),
-        *(("StreamFrames3D", "StreamFrames3D"), ("3D", "3D"), ("GetState", "GetState")),
-    ],
+    [("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "?"), ("\xe9", "?"), ("\x01", r"\x01"), ("3D", "3D")],
 )
 def test_an_unknown_command_is_quoted_with_up_to_40_printable_characters(word: str, shown: str) -> None:
     """Clients are untrusted, and their words go into logs and packets."""
@@ -203,7 +172,8 @@ def test_an_unknown_command_is_quoted_with_up_to_40_printable_characters(word: s
 
 @pytest.mark.parametrize("before", ["", "Version ", "SetByteOrder ", "SendParameters ", "SendCurrentFrame "])
 def test_the_error_text_of_a_huge_or_binary_word_is_short_and_printable(before: str) -> None:
-    """``error_text`` checks this for words that no client should send."""
+    """It must fit into an error packet."""
     for word in (b"A" * 1_000_000, b"\xff" * 100_000, b"\x01" * 1000, b"'\"\\" * 1000, b"a\0" * 1000):
-        error_text(before.encode() + word)
-        error_text(before.encode() + word + b" " + word)
+        for body in (before.encode() + word, before.encode() + word + b" " + word):
+            text = error_text(body)
+            assert (text.isascii(), text.isprintable(), len(text) < 300) == (True, True, True)

@@ -1,93 +1,191 @@
-"""Data frames (§7.1): splitting and encoding them, those that contradict themselves, and their byte order."""
+"""Data frames (§7): components as in vectors written by hand, contradictions, byte order and layouts."""
 
 import re
+import struct
+import tracemalloc
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from gateway.errors import FrameError
-from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, SHORT_EVENT, ComponentType, encode_component
+from gateway.rtc3d.components import (
+    COMPONENTS_BY_KEY,
+    ITEM_DTYPES,
+    LONG_EVENT,
+    MISSING,
+    MISSING_RELIABILITY,
+    SHORT_EVENT,
+    WIRE_ORDER,
+    Component,
+    ComponentType,
+    big_endian_content,
+    encode_component,
+)
+from gateway.rtc3d.frame_reader import FrameReader
 from gateway.rtc3d.frames import announced_components, detect_byte_order, encode_frame, split_frame
-from tests.unit.rtc3d.wire import both_orders, each_component, frame, only_component
 from tests.vectors import (
     ANALOG,
+    COMPONENTS,
     EMPTY_FRAME,
     FRAME_WITH_UNKNOWN,
     FULL_FRAME,
     FULL_FRAME_COMPONENTS,
-    LONG_EVENTS,
     MARKERS,
     SHORT_EVENTS,
     START_RECORDING,
     STOP_RECORDING,
+    TOOLS,
     UNKNOWN_COMPONENT,
     ByteOrder,
     ComponentVector,
 )
 
+Array = npt.NDArray[Any]
+both_orders = pytest.mark.parametrize("order", ["big", "little"])
+each_component = pytest.mark.parametrize("vector", COMPONENTS, ids=[vector.name for vector in COMPONENTS])
+
+
+def frame(order: ByteOrder, *components: bytes, count: int | None = None) -> bytes:
+    """Return a frame's bytes. ``count`` replaces its component count with a wrong one."""
+    return (len(components) if count is None else count).to_bytes(4, order) + b"".join(components)
+
+
+def only_component(body: bytes, order: ByteOrder) -> Component:
+    (component,) = split_frame(body, order).components
+    return component
+
+
+def zeros(kind: ComponentType, count: int = 1) -> bytes:
+    """Return a component whose items are zeros."""
+    return encode_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind]))
+
+
+def values_of(items: Array, field: str) -> Array:
+    return items if items.dtype.names is None else items[field]
+
+
+# Components -----------------------------------------------------------------------------------
+
+
+def test_types_have_the_numbers_names_and_words_of_the_specification() -> None:
+    """Clients and servers use the numbers in frames and the words in commands."""
+    words = [
+        (1, "3d", "3D"),
+        (4, "6d", "6D"),
+        (2, "analog", "Analog"),
+        (3, "force", "Force"),
+        (5, "event", "Events"),
+    ]
+    assert [(kind.value, kind.key, kind.command_word) for kind in WIRE_ORDER] == words
+    assert set(WIRE_ORDER) == set(ComponentType)
+    assert {kind.key: kind for kind in ComponentType} == COMPONENTS_BY_KEY
+
+
+@both_orders
+@each_component
+def test_each_component_is_split_and_encoded_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
+    """Every field of §7 is where the specification puts it; items may have any byte order and gaps."""
+    component = only_component(frame(order, vector.wire[order]), order)
+    head = (ComponentType(vector.type), vector.frame_number, vector.timestamp_us)
+    assert component == (*head, vector.num_items, vector.item_bytes, order, vector.wire[order][8:])
+    assert big_endian_content(component) == vector.wire["big"][8:]
+    items = component.items()
+    assert (items.shape, items.dtype.itemsize) == ((vector.num_items,), vector.item_bytes)
+    assert items.dtype.names == (None if vector is ANALOG else tuple(vector.fields))
+    dtype = SHORT_EVENT if vector is SHORT_EVENTS else ITEM_DTYPES[ComponentType(vector.type)]
+    made: Array = np.zeros(vector.num_items, dtype)
+    for field, expected in vector.fields.items():
+        values = values_of(items, field)
+        np.testing.assert_array_equal(values, np.array(expected, values.dtype))
+        values_of(made, field)[:] = expected
+    for each in (made, made.astype(made.dtype.newbyteorder("little")), np.repeat(made, 2)[::2]):
+        assert encode_component(*head, each, order) == vector.wire[order]
+        assert order == "little" or encode_component(*head, each) == vector.wire[order]  # the default of §4.3
+
+
+@both_orders
+def test_missing_markers_and_tools_keep_all_their_bits(order: ByteOrder) -> None:
+    """Subscribers recognise what is out of view by exactly these bits (§7.3, field note 7)."""
+    _, missing = only_component(frame(order, MARKERS.wire[order]), order).items()
+    assert {missing[field].tobytes() for field in ("x", "y", "z")} == {MISSING.tobytes()} == {b"\xff" * 4}
+    assert missing["reliability"] == MISSING_RELIABILITY == 999.0
+    _, out_of_view = only_component(frame(order, TOOLS.wire[order]), order).items()
+    assert out_of_view.tobytes() == b"\xff" * 32
+
+
+def test_nothing_is_copied_to_read_items() -> None:
+    """Copies of every frame would cost more than everything else that the gateway does."""
+    for component in split_frame(FULL_FRAME["big"], "big").components:
+        items = component.items()
+        assert np.shares_memory(items, np.frombuffer(component.content, np.uint8))
+        assert big_endian_content(component) is component.content
+        with pytest.raises(ValueError, match="read-only"):
+            items[0] = items[0]
+
+
+# Frames ---------------------------------------------------------------------------------------
+
 
 @both_orders
 def test_documented_frames_are_split_and_encoded(order: ByteOrder) -> None:
-    """The vectors have all five components, none, and one of an unknown type, which is skipped."""
+    """Components of unknown type are skipped, and bytes after the last component are ignored.
+
+    Some programs end every body in LF (field note 17), and NDI's own code ignores it.
+    """
     for body, known, unknown in (
-        (FULL_FRAME, FULL_FRAME_COMPONENTS, ()),
-        (EMPTY_FRAME, (), ()),
-        (FRAME_WITH_UNKNOWN, (MARKERS, ANALOG), (9,)),
+        (FULL_FRAME[order], FULL_FRAME_COMPONENTS, ()),
+        (EMPTY_FRAME[order], (), ()),
+        (FRAME_WITH_UNKNOWN[order], (MARKERS, ANALOG), (9,)),
     ):
-        split = split_frame(body[order], order)
-        assert [component.content for component in split.components] == [
-            vector.wire[order][8:] for vector in known
-        ]
-        assert split.unknown_types == unknown
-        if not unknown:
-            assert encode_frame((vector.wire[order] for vector in known), order) == body[order]
+        for extra in (b"", b"\n", b"\r\n\0\0", bytes(range(60))):
+            split = split_frame(body + extra, order)
+            assert [each.content for each in split.components] == [each.wire[order][8:] for each in known]
+            assert (split.unknown_types, split.layout.num_extra_bytes) == (unknown, len(extra))
+            assert detect_byte_order(body + extra, order) == order
+        assert unknown or encode_frame((vector.wire[order] for vector in known), order) == body
+    assert encode_frame([MARKERS.wire["big"]]) == frame("big", MARKERS.wire["big"])
 
 
-def test_a_layout_counts_the_items_of_components_that_may_be_repeated() -> None:
-    """Queries and checks of parameters take the most items that a component has."""
-    encoded = [encode_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")) for count in (2, 3, 1)]
-    layout = split_frame(encode_frame(encoded), "big").layout
+def test_a_layout_has_the_most_items_of_a_component_and_the_type_of_the_first_known_one() -> None:
+    """Checks of parameters take the most items; the clock of a stream follows the first component."""
+    layout = split_frame(
+        encode_frame([zeros(ComponentType.ANALOG, count) for count in (2, 3, 1)]), "big"
+    ).layout
     assert layout.num_items(list(ComponentType)) == {ComponentType.ANALOG: 3}
     assert layout.num_items({ComponentType.MARKERS}) == {}
-
-
-def test_the_first_known_component_gives_a_layout_its_type() -> None:
-    """The clock of a stream follows this component."""
-    markers = encode_component(ComponentType.MARKERS, 1, 0, np.zeros(1, ITEM_DTYPES[ComponentType.MARKERS]))
-    unknown = bytes.fromhex("0000000c 00000063 00000000")
-    types = [
-        split_frame(encode_frame(components), "big").layout.first_component_type
-        for components in ([markers], [unknown, markers], [unknown], [])
-    ]
+    markers, unknown = zeros(ComponentType.MARKERS), bytes.fromhex("0000000c 00000063 00000000")
+    frames = [encode_frame(each) for each in ([markers], [unknown, markers], [unknown], [])]
+    types = [split_frame(each, "big").layout.first_component_type for each in frames]
     assert types == [ComponentType.MARKERS, ComponentType.MARKERS, None, None]
-
-
-@both_orders
-def test_events_of_16_and_of_24_bytes_may_be_in_one_frame(order: ByteOrder) -> None:
-    """Field note 6: the specification and NDI's code differ, and the size decides."""
-    short, long = split_frame(
-        frame(order, SHORT_EVENTS.wire[order], LONG_EVENTS.wire[order]), order
-    ).components
-    assert (short.item_bytes, long.item_bytes) == (16, 24)
-    assert short.items().dtype.names == SHORT_EVENT.names
-    assert long.items().dtype.names == LONG_EVENT.names
-    assert short.items()["param1"].tolist() == long.items()["param1"].tolist() == [7, 1065353216]
 
 
 @pytest.mark.parametrize(
     ("packet", "order", "event_id"), [(START_RECORDING, "little", 1), (STOP_RECORDING, "big", 0)]
 )
-def test_the_frame_that_controls_wavefronts_recording_is_split_and_encoded(
-    packet: bytes, order: ByteOrder, event_id: int
-) -> None:
+def test_wavefronts_control_of_recording_is_a_frame(packet: bytes, order: ByteOrder, event_id: int) -> None:
     """Field note 16 was captured from NDI's own client."""
-    body = packet[8:]
+    body, event = packet[8:], (event_id, 0, -1, -1, -1)
     assert detect_byte_order(body, "big") == order
     component = only_component(body, order)
     assert (component.type, component.frame_number, component.item_bytes) == (ComponentType.EVENT, -1, 24)
-    assert component.items().tolist() == [(event_id, 0, -1, -1, -1)]
-    events = np.array([(event_id, 0, -1, -1, -1)], LONG_EVENT)
-    assert encode_frame([encode_component(ComponentType.EVENT, -1, 0, events, order)], order) == body
+    assert component.items().tolist() == [event]
+    encoded = encode_component(ComponentType.EVENT, -1, 0, np.array([event], LONG_EVENT), order)
+    assert encode_frame([encoded], order) == body
+
+
+@both_orders
+def test_the_byte_order_of_a_frame_is_detected(order: ByteOrder) -> None:
+    """Some servers ignore the byte order they have acknowledged (field note 4)."""
+    expected_orders: tuple[ByteOrder, ByteOrder] = ("big", "little")
+    for expected in expected_orders:
+        assert detect_byte_order(FRAME_WITH_UNKNOWN[order], expected) == order
+        assert detect_byte_order(EMPTY_FRAME["big"], expected) == expected
+    with pytest.raises(FrameError) as of_split:
+        split_frame(FULL_FRAME[order][:-1], order)
+    with pytest.raises(FrameError, match=re.escape(str(of_split.value))):
+        detect_byte_order(FULL_FRAME[order][:-1], order)
 
 
 # Contradictions -------------------------------------------------------------------------------
@@ -106,15 +204,12 @@ def assert_rejected(body: bytes, order: ByteOrder, *numbers: int) -> None:
     """Assert that the frame is rejected, and that the error's text has each of the numbers."""
     with pytest.raises(FrameError) as caught:
         split_frame(body, order)
-    found = [int(number) for number in re.findall(r"\b\d+\b", str(caught.value))]
-    assert set(numbers) <= set(found), str(caught.value)
+    assert set(numbers) <= set(map(int, re.findall(r"\b\d+\b", str(caught.value)))), str(caught.value)
 
 
 @both_orders
 @each_component
-def test_sizes_and_counts_of_a_known_component_that_contradict_each_other(
-    vector: ComponentVector, order: ByteOrder
-) -> None:
+def test_sizes_and_counts_that_contradict_each_other(vector: ComponentVector, order: ByteOrder) -> None:
     """No value of such a frame can be trusted, so none may reach a robot."""
     wire = vector.wire[order]
     size = len(wire)
@@ -122,8 +217,7 @@ def test_sizes_and_counts_of_a_known_component_that_contradict_each_other(
     assert_rejected(frame(order, ANALOG.wire[order], longer), order, 2, vector.type, size + 1, size)
     # Not 1 more, because three events of 16 bytes have the size of two events of 24 bytes. The size of 2^30
     # items is a multiple of 2^32 bytes, because every item size is a multiple of 4.
-    for difference in (-1, 2, 2**30):
-        count = vector.num_items + difference
+    for count in (vector.num_items - 1, vector.num_items + 2, vector.num_items + 2**30):
         assert_rejected(frame(order, changed(wire, order, count=count)), order, size, count)
     for short in (8, 20, 23):
         cut = short.to_bytes(4, order) + vector.type.to_bytes(4, order) + bytes(short - 8)
@@ -132,24 +226,18 @@ def test_sizes_and_counts_of_a_known_component_that_contradict_each_other(
 
 
 @both_orders
-def test_sizes_of_any_component_that_do_not_fit_the_frame(order: ByteOrder) -> None:
+def test_frames_that_end_too_soon_or_whose_components_do_not_fit(order: ByteOrder) -> None:
     """A size below the header's, or beyond the end, would make the reader run away."""
     for size in (0, 1, 7):
         for kind in (1, 9):
             component = size.to_bytes(4, order) + kind.to_bytes(4, order) + bytes(16)
             assert_rejected(frame(order, component), order, size, kind, 24)
     for size in (29, 0x7FFFFFFF, 0xFFFFFFFF):
-        unknown = changed(UNKNOWN_COMPONENT[order], order, size=size)
-        assert_rejected(frame(order, unknown), order, size, 9, 28)
+        assert_rejected(frame(order, changed(UNKNOWN_COMPONENT[order], order, size=size)), order, size, 9, 28)
     for item_bytes in (12, 20, 32):
         events = SHORT_EVENTS.wire[order][:24] + bytes(3 * item_bytes)
         component = changed(events, order, size=len(events), count=3)
         assert_rejected(frame(order, component), order, len(events), 3)
-
-
-@both_orders
-def test_frames_that_end_too_soon(order: ByteOrder) -> None:
-    """A frame is whole or worthless, wherever it is cut and however many components it announces."""
     for length in range(len(FULL_FRAME[order])):
         assert_rejected(FULL_FRAME[order][:length], order)
     for length in (0, 1, 3):
@@ -194,28 +282,63 @@ def test_the_error_says_what_contradicts_what(body: str, text: str) -> None:
     assert str(caught.value) == text
 
 
-@both_orders
-def test_bytes_after_the_last_component_are_ignored(order: ByteOrder) -> None:
-    """Some programs end every body in LF (field note 17), and NDI's own code ignores it."""
-    for body in (FULL_FRAME[order], FRAME_WITH_UNKNOWN[order], EMPTY_FRAME[order]):
-        whole = split_frame(body, order)
-        for extra in (b"", b"\n", b"\0\0\0", b"\r\n\0\0", bytes(range(60))):
-            extended = split_frame(body + extra, order)
-            assert extended.components == whole.components
-            assert extended.unknown_types == whole.unknown_types
-            assert extended.layout.num_extra_bytes == len(extra)
-            assert detect_byte_order(body + extra, order) == order
+# Layouts that repeat --------------------------------------------------------------------------
+
+MARKERS_FRAME = frame("big", MARKERS.wire["big"])
+
+
+def reader_after(*bodies: bytes) -> FrameReader:
+    reader = FrameReader("big")
+    for body in bodies:
+        reader.read(body)
+    return reader
 
 
 @both_orders
-def test_the_byte_order_of_a_frame_is_detected(order: ByteOrder) -> None:
-    """Some servers ignore the byte order they have acknowledged (field note 4)."""
-    expected_orders: tuple[ByteOrder, ByteOrder] = ("big", "little")
-    for expected in expected_orders:
-        assert detect_byte_order(FRAME_WITH_UNKNOWN[order], expected) == order
-        assert detect_byte_order(EMPTY_FRAME["big"], expected) == expected
-    cut = FULL_FRAME[order][:-1]
-    with pytest.raises(FrameError) as of_split:
-        split_frame(cut, order)
-    with pytest.raises(FrameError, match=re.escape(str(of_split.value))):
-        detect_byte_order(cut, order)
+@pytest.mark.parametrize("frames", [FULL_FRAME, FRAME_WITH_UNKNOWN, EMPTY_FRAME])
+def test_frames_of_a_layout_are_read_alike_and_share_it(
+    frames: dict[ByteOrder, bytes], order: ByteOrder
+) -> None:
+    """Other connections have layouts of their own, so layouts are forgotten with the connection."""
+    reader, expected = FrameReader(order), split_frame(frames[order], order)
+    layout = reader.read(frames[order]).layout
+    for _ in range(3):
+        read = reader.read(bytes(bytearray(frames[order])))
+        assert read.layout is layout
+        assert (read.layout.fields, read.components) == (expected.layout.fields, expected.components)
+        assert read.unknown_types == expected.unknown_types
+    assert FrameReader(order).read(frames[order]).layout is not layout
+
+
+def test_frames_of_one_layout_may_differ_in_number_time_and_items_only() -> None:
+    wire = bytearray(MARKERS.wire["big"])
+    wire[8:20] = struct.pack(">iq", -7, 2**40)
+    wire[24:] = bytes(len(wire) - 24)
+    reader = reader_after(MARKERS_FRAME, MARKERS_FRAME)
+    read = reader.read(frame("big", bytes(wire)))
+    assert read.layout is reader.read(MARKERS_FRAME).layout
+    assert (read.number_and_timestamp, read.contents) == ((-7, 2**40), (bytes(wire[8:]),))
+    for offset in (3, 7, 11, 27):  # component count, and the component's size, type and count of items
+        body = bytearray(MARKERS_FRAME)
+        body[offset] ^= 2
+        with pytest.raises(FrameError):
+            reader.read(bytes(body))
+
+
+def test_the_number_and_size_of_remembered_layouts_are_bounded() -> None:
+    """A server that varies its frames, by mistake or on purpose, must not fill the memory."""
+    reader = reader_after(MARKERS_FRAME)
+    assert reader._templates == {}
+    reader.read(MARKERS_FRAME)  # reading every repeated frame field by field would take ten times as long
+    assert list(reader._templates) == [len(MARKERS_FRAME)]
+    for count in range(100):
+        for _ in range(3):
+            reader.read(frame("big", zeros(ComponentType.MARKERS, count)))
+        assert len(reader._templates) <= len(reader._layouts) <= 64
+    large = frame("big", *[zeros(ComponentType.ANALOG, 60_000)] * 64)
+    reader = FrameReader("big")
+    tracemalloc.start()
+    for _ in range(3):
+        reader.read(large)
+    assert tracemalloc.get_traced_memory()[1] < 100_000
+    tracemalloc.stop()

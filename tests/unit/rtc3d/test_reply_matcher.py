@@ -16,8 +16,10 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from tests.servers import error, ok
-from tests.unit.rtc3d.protocols import FRAME, NO_DATA, STREAM, xml
+from tests.unit.rtc3d.protocols import FRAME, STREAM, xml
 
+VERSION: Final = Version()
+CURRENT: Final = SendCurrentFrame()
 GIVE_UP: Final = "give up"
 ASSUME: Final = "assume"
 LITTLE: Final = SetByteOrder("little")
@@ -26,23 +28,29 @@ STOP: Final = StopStreaming()
 ALL: Final = SendParameters()
 ONLY_3D: Final = SendParameters(("3d",))
 ONLY_6D: Final = SendParameters(("6d",))
+GENERAL_3D: Final = SendParameters(("general", "3d"))
 
 Step = Command | bytes | str
 """A command to send, bytes to receive, or what else the client does."""
 
 
+_COMMANDS = (VERSION, LITTLE, STREAM, STOP, CURRENT, ALL, ONLY_3D, ONLY_6D, StreamFrames(), GENERAL_3D)
+_NAMES = ("version", "little", "stream", "stop", "current", "all", "3d", "6d", "streamframes", "general 3d")
+NAMES: Final = dict(zip(_COMMANDS, _NAMES, strict=True))
+
+
 def outcome(event: ProtocolEvent) -> str:
     match event:
         case Answered(command):
-            return f"{command}: answered"
+            return f"{NAMES[command]} answered"
         case Refused(command):
-            return f"{command}: refused"
+            return f"{NAMES[command]} refused"
         case PossibleReply(command):
-            return f"{command}: maybe"
+            return f"{NAMES[command]} maybe"
     return "unexpected"
 
 
-def outcomes_of(steps: Sequence[Step]) -> list[str]:
+def outcomes_of(steps: Sequence[Step]) -> str:
     """Return what the client makes of everything that it receives."""
     protocol, events = ClientProtocol(), []
     for step in steps:
@@ -54,167 +62,106 @@ def outcomes_of(steps: Sequence[Step]) -> list[str]:
             protocol.give_up()
         elif not isinstance(step, str):
             protocol.send(step)
-    return [outcome(event) for event in events]
+    return ", ".join(map(outcome, events))
 
 
 @pytest.mark.parametrize("text", ["OK-Version 1.0", "version 1.0", "ok-version", "OK", "", "Version 1.0\0\0"])
 def test_the_type_of_a_reply_decides_and_not_its_text(text: str) -> None:
     """Every server words its replies differently (field note 1)."""
-    assert outcomes_of([Version(), ok(text)]) == ["Version 1.0: answered"]
-    assert outcomes_of([Version(), error(text)]) == ["Version 1.0: refused"]
+    assert outcomes_of([VERSION, ok(text)]) == "version answered"
+    assert outcomes_of([VERSION, error(text)]) == "version refused"
 
 
 # Each row: what happens, and what the client makes of what it receives.
-DUPLICATES: Final = {
-    "nothing was asked": ([ok("hello")], ["unexpected"]),
-    "that name no command": ([Version(), ok("OK") * 2], ["Version 1.0: answered", "unexpected"]),
-    **{
-        f"{text} after the next command": (
-            [Version(), ok(text), LITTLE, ok(text), error("err-no")],
-            ["Version 1.0: answered", "unexpected", f"{LITTLE}: refused"],
+ROWS: Final[list[tuple[Sequence[object], str]]] = [
+    # Duplicates: nothing was asked.
+    ([ok("hello")], "unexpected"),
+    # Duplicates: that name no command.
+    ([VERSION, ok("OK") * 2], "version answered, unexpected"),
+    # Duplicates: after the next command.
+    *(
+        (
+            [VERSION, ok(text), LITTLE, ok(text), error("err-no")],
+            "version answered, unexpected, little refused",
         )
         for text in ("OK-Version 1.0", "version 1.0", "ok-version")
-    },
-    "of StreamFrames before that of Stop": (
+    ),
+    # Duplicates: of StreamFrames before that of Stop.
+    (
         [STREAM, ok(f"OK-{STREAM}"), STOP, ok(f"OK-{STREAM}"), ok("OK-StreamFrames Stop")],
-        [f"{STREAM}: answered", "unexpected", f"{STOP}: answered"],
+        "stream answered, unexpected, stop answered",
     ),
-    "that name a command given up before another was answered": (
-        [STREAM, GIVE_UP, LITTLE, OK_LITTLE, STOP, ok(f"OK-{STREAM}")],
-        [f"{LITTLE}: answered", "unexpected"],
-    ),
-    "of a repeated request for parameters": (
+    # Duplicates: that name a command given up before another was answered.
+    ([STREAM, GIVE_UP, LITTLE, OK_LITTLE, STOP, ok(f"OK-{STREAM}")], "little answered, unexpected"),
+    # Duplicates: of a repeated request for parameters.
+    (
         [ONLY_3D, GIVE_UP, ONLY_3D, xml("The_3D"), ONLY_6D, xml("The_3D"), xml("The_6D")],
-        [f"{ONLY_3D}: answered", "unexpected", f"{ONLY_6D}: answered"],
+        "3d answered, unexpected, 6d answered",
     ),
-}
-
-LATE: Final = {
-    "that name the earlier command": (
-        [Version(), GIVE_UP, LITTLE, ok("OK-Version 1.0"), OK_LITTLE],
-        ["unexpected", f"{LITTLE}: answered"],
+    # Late replies: that name the later command by its verb.
+    ([VERSION, GIVE_UP, LITTLE, ok("ok-setbyteorder")], "little answered"),
+    # Late replies: that name the earlier command.
+    ([VERSION, GIVE_UP, LITTLE, ok("OK-Version 1.0"), OK_LITTLE], "unexpected, little answered"),
+    # Late replies: that name none.
+    ([VERSION, GIVE_UP, LITTLE, ok("OK"), ok("OK")], "little maybe, little answered"),
+    # Late replies: that name the later command first.
+    ([VERSION, GIVE_UP, LITTLE, OK_LITTLE, STREAM, ok("OK")], "little answered, stream answered"),
+    # Late replies: that are refusals, while XML answers.
+    ([VERSION, GIVE_UP, ALL, error("err-unknown command"), xml("The_3D"), ASSUME], "all maybe, all answered"),
+    # Late replies: that may be those to the pending command.
+    ([VERSION, GIVE_UP, STREAM, error("what?"), ASSUME, ASSUME], "stream maybe, stream refused"),
+    # Late replies: that may accept the pending command.
+    ([VERSION, GIVE_UP, STREAM, ok("fine"), ASSUME], "stream maybe, stream answered"),
+    # Late replies: from a server that ignored the first command.
+    (
+        [VERSION, GIVE_UP, STREAM, error("what?"), ASSUME, StreamFrames(), error("what?")],
+        "stream maybe, stream refused, streamframes refused",
     ),
-    "that name none": (
-        [Version(), GIVE_UP, LITTLE, ok("OK"), ok("OK")],
-        [f"{LITTLE}: maybe", f"{LITTLE}: answered"],
-    ),
-    "that name the later command first": (
-        [Version(), GIVE_UP, LITTLE, OK_LITTLE, STREAM, ok("OK")],
-        [f"{LITTLE}: answered", f"{STREAM}: answered"],
-    ),
-    "that name the later command by its verb": (
-        [Version(), GIVE_UP, LITTLE, ok("ok-setbyteorder")],
-        [f"{LITTLE}: answered"],
-    ),
-    "that never come": (
-        [Version(), GIVE_UP, LITTLE, OK_LITTLE, STREAM, ok(f"OK-{STREAM}"), STOP, ok("OK-StreamFrames Stop")],
-        [f"{command}: answered" for command in (LITTLE, STREAM, STOP)],
-    ),
-    "that are refusals, while XML answers": (
-        [Version(), GIVE_UP, ALL, error("err-unknown command"), xml("The_3D"), ASSUME],
-        [f"{ALL}: maybe", f"{ALL}: answered"],
-    ),
-    "that may be those to the pending command": (
-        [Version(), GIVE_UP, STREAM, error("what?"), ASSUME, ASSUME],
-        [f"{STREAM}: maybe", f"{STREAM}: refused"],
-    ),
-    "that may accept the pending command": (
-        [Version(), GIVE_UP, STREAM, ok("fine"), ASSUME],
-        [f"{STREAM}: maybe", f"{STREAM}: answered"],
-    ),
-    "from a server that ignored the first command": (
-        [Version(), GIVE_UP, STREAM, error("what?"), ASSUME, StreamFrames(), error("what?")],
-        [f"{STREAM}: maybe", f"{STREAM}: refused", "StreamFrames: refused"],
-    ),
-    "as many as there are commands": (
-        [Version(), GIVE_UP, ALL, GIVE_UP, STREAM, error("what?") * 2, ok("fine")],
-        [f"{STREAM}: maybe", f"{STREAM}: maybe", f"{STREAM}: answered"],
-    ),
-    "that name a command without its parameters": (
+    # Late replies: that name a command without its parameters.
+    (
         [
-            *(Version(), GIVE_UP, STREAM),
+            *(VERSION, GIVE_UP, STREAM),
             *(error("Error-version is not known in this form"), error("Error-streamframes is not known")),
         ],
-        ["unexpected", f"{STREAM}: refused"],
+        "unexpected, stream refused",
     ),
-    "before the client gave up again": (
-        [Version(), GIVE_UP, STREAM, error("what?"), GIVE_UP, ASSUME, LITTLE, ASSUME],
-        [f"{STREAM}: maybe"],
+    # Late replies: before the client gave up again.
+    ([VERSION, GIVE_UP, STREAM, error("what?"), GIVE_UP, ASSUME, LITTLE, ASSUME], "stream maybe"),
+    # Late replies: that name another command than the only pending one.
+    ([LITTLE, error("Version must be sent first")], "little refused"),
+    # Late replies: that follow the frames of a request, which were its answer.
+    ([STREAM, FRAME, STOP, ok("OK"), ok("OK")], "stream answered, stop maybe, stop answered"),
+    # Late replies: to a ninth command, of which eight are remembered.
+    (
+        [*(step for _ in range(9) for step in (VERSION, GIVE_UP)), LITTLE, *[ok("OK")] * 9],
+        "little maybe, " * 8 + "little answered",
     ),
-    "that name another command than the only pending one": (
-        [LITTLE, error("Version must be sent first")],
-        [f"{LITTLE}: refused"],
-    ),
-    "that follow the frames of a request, which were its answer": (
-        [STREAM, FRAME, STOP, ok("OK"), ok("OK")],
-        [f"{STREAM}: answered", f"{STOP}: maybe", f"{STOP}: answered"],
-    ),
-    "to a ninth command, of which eight are remembered": (
-        [*(step for _ in range(9) for step in (Version(), GIVE_UP)), LITTLE, *[ok("OK")] * 9],
-        [*[f"{LITTLE}: maybe"] * 8, f"{LITTLE}: answered"],
-    ),
-}
-
-PARAMETERS: Final = {
-    "only XML answers": (
-        [ONLY_3D, ok("OK-SendParameters 3D"), xml("The_3D")],
-        ["unexpected", f"{ONLY_3D}: answered"],
-    ),
-    "of other sections are late": (
-        [ONLY_3D, GIVE_UP, ONLY_6D, xml("The_3D"), xml("The_6D")],
-        ["unexpected", f"{ONLY_6D}: answered"],
-    ),
-    "with more sections than requested": (
-        [ALL, xml("The_3D", "The_6D"), SendParameters(("general",)), xml("The_3D", "The_6D")],
-        [f"{ALL}: answered", "SendParameters General: answered"],
-    ),
-    "without a section that the server lacks": (
-        [ONLY_6D, GIVE_UP, SendParameters(("general", "3d")), xml("The_3D")],
-        ["SendParameters General 3D: answered"],
-    ),
-    "without those that were given up": (
-        [ONLY_3D, GIVE_UP, ONLY_6D, xml("The_6D")],
-        [f"{ONLY_6D}: answered"],
-    ),
-    "late, to the same request sent again": ([ALL, GIVE_UP, ALL, xml("The_6D")], [f"{ALL}: answered"]),
-    "late, while nothing is pending": (
-        [ONLY_3D, GIVE_UP, xml("The_3D"), ONLY_6D, xml("The_3D")],
-        ["unexpected", f"{ONLY_6D}: answered"],
-    ),
-}
-
-CURRENT: Final = SendCurrentFrame()
-FRAMES: Final = {
-    "after an acknowledgement": (
-        [CURRENT, ok("OK-SendCurrentFrame"), FRAME],
-        ["unexpected", f"{CURRENT}: answered"],
-    ),
-    "without an acknowledgement": ([CURRENT, FRAME], [f"{CURRENT}: answered"]),
-    "that do not exist": ([CURRENT, NO_DATA], [f"{CURRENT}: answered"]),
-    "that stream at the former rate": (
+    # Parameters: only XML answers.
+    ([ONLY_3D, ok("OK-SendParameters 3D"), xml("The_3D")], "unexpected, 3d answered"),
+    # Parameters: of other sections are late.
+    ([ONLY_3D, GIVE_UP, ONLY_6D, xml("The_3D"), xml("The_6D")], "unexpected, 6d answered"),
+    # Parameters: without a section that the server lacks.
+    ([ONLY_6D, GIVE_UP, GENERAL_3D, xml("The_3D")], "general 3d answered"),
+    # Parameters: late, to the same request sent again.
+    ([ALL, GIVE_UP, ALL, xml("The_6D")], "all answered"),
+    # Parameters: late, while nothing is pending.
+    ([ONLY_3D, GIVE_UP, xml("The_3D"), ONLY_6D, xml("The_3D")], "unexpected, 6d answered"),
+    # Frames: after an acknowledgement.
+    ([CURRENT, ok("OK-SendCurrentFrame"), FRAME], "unexpected, current answered"),
+    # Frames: that stream at the former rate.
+    (
         [STREAM, FRAME, ok(f"OK-{STREAM}"), StreamFrames(), FRAME, error("err-no")],
-        [f"{STREAM}: answered", "unexpected", "StreamFrames: refused"],
+        "stream answered, unexpected, streamframes refused",
     ),
-    "in two reads": (
+    # Frames: in two reads.
+    (
         [STREAM, FRAME + ok("OK-StreamFrames"), CURRENT, FRAME[:20], FRAME[20:]],
-        [f"{STREAM}: answered", "unexpected", f"{CURRENT}: answered"],
+        "stream answered, unexpected, current answered",
     ),
-}
+]
 
 
-@pytest.mark.parametrize(
-    ("steps", "expected"),
-    [
-        pytest.param(*row, id=f"{topic}: {name}")
-        for topic, rows in (
-            ("duplicates", DUPLICATES),
-            ("late replies", LATE),
-            ("parameters", PARAMETERS),
-            ("frames", FRAMES),
-        )
-        for name, row in rows.items()
-    ],
-)
-def test_each_reply_goes_to_the_command_that_it_answers(steps: list[Step], expected: list[str]) -> None:
+@pytest.mark.parametrize(("steps", "expected"), ROWS)
+def test_each_reply_goes_to_the_command_that_it_answers(steps: list[Step], expected: str) -> None:
     """A reply taken for that of another command would start, stop or configure the wrong thing."""
     assert outcomes_of(steps) == expected

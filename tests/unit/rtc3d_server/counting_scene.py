@@ -31,10 +31,8 @@ class CountingScene(ComputedScene):
         )
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        count = {ComponentType.MARKERS: self._num_markers, ComponentType.TOOLS: 1, ComponentType.ANALOG: 2}[
-            component
-        ]
-        dtype = ITEM_DTYPES[component]
+        counts = {ComponentType.MARKERS: self._num_markers, ComponentType.TOOLS: 1, ComponentType.ANALOG: 2}
+        count, dtype = counts[component], ITEM_DTYPES[component]
         values = np.zeros((len(samples), count, dtype.itemsize // 4), ">f4")
         values[:, :, 0] = samples[:, None]
         if component is ComponentType.MARKERS:
@@ -42,7 +40,6 @@ class CountingScene(ComputedScene):
         return values.view(dtype)[..., 0]
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        numbers = [
-            k for k in range(1, stop_us // EVENT_EVERY_US + 2) if start_us <= k * EVENT_EVERY_US < stop_us
-        ]
+        last = stop_us // EVENT_EVERY_US + 1
+        numbers = [k for k in range(1, last + 1) if start_us <= k * EVENT_EVERY_US < stop_us]
         return np.array([(k, k * EVENT_EVERY_US, -1, -1, -1) for k in numbers], LONG_EVENT)

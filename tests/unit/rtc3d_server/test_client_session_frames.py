@@ -1,3 +1,5 @@
+"""Which frames one client gets from the RT server, and when: streams, single frames, events, measurements."""
+
 import math
 from itertools import pairwise
 
@@ -32,13 +34,10 @@ def client() -> ScriptedClient:
 @pytest.mark.parametrize("sent", ["StreamFrames", "StreamFrames AllFrames", "StreamFrames All"])
 def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedClient, sent: str) -> None:
     client.send(sent)
-
     frames = client.frames_until(60_000)
-
     assert [[component.type for component in frame] for frame in frames] == [[MARKERS, TOOLS, ANALOG]] * 7
-    assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7]
-    assert [frame[2].frame_number for frame in frames] == [1, 11, 21, 31, 41, 51, 61]
-    assert [frame[2].timestamp_us for frame in frames] == list(range(0, 70_000, 10_000))
+    numbers = [(frame[0].frame_number, frame[2].frame_number, frame[2].timestamp_us) for frame in frames]
+    assert numbers == [(k + 1, 10 * k + 1, 10_000 * k) for k in range(7)]
 
 
 @pytest.mark.parametrize(
@@ -51,7 +50,7 @@ def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedC
         ("Force", 50_000, []),  # which the scene lacks
     ],
 )
-def test_a_stream_has_the_requested_rate(
+def test_a_stream_has_its_rate(
     client: ScriptedClient, requested: str, until_us: int, numbers: list[int]
 ) -> None:
     """§5.3.5: the slowest component of a request is the limit."""
@@ -60,9 +59,7 @@ def test_a_stream_has_the_requested_rate(
 
 
 @given(rate_hz=st.integers(1, 2000), frequency_hz=st.floats(0.1, 2500), start=st.integers(0, 10**6))
-def test_any_frequency_is_exact_on_average_with_even_gaps(
-    rate_hz: int, frequency_hz: float, start: int
-) -> None:
+def test_any_frequency_is_exact_and_has_even_gaps(rate_hz: int, frequency_hz: float, start: int) -> None:
     client = ScriptedClient(rate_hz)
     client.elapsed_us = start
     text = f"{frequency_hz:.6f}"
@@ -70,41 +67,26 @@ def test_any_frequency_is_exact_on_average_with_even_gaps(
     stride = max(1.0, rate_hz / float(text))
     numbers = []
     for _ in range(200):
-        due_us = client.session.due_us
-        assert due_us is not None
-        numbers += client.numbers_until(due_us)
-
-    gaps = {after - before for before, after in pairwise(numbers)}
-    assert gaps <= {math.floor(stride), math.ceil(stride)}
+        assert client.session.due_us is not None
+        numbers += client.numbers_until(client.session.due_us)
+    assert {after - before for before, after in pairwise(numbers)} <= {math.floor(stride), math.ceil(stride)}
     assert numbers[-1] - numbers[0] == pytest.approx(199 * stride, abs=1)
     assert len(numbers) == 200
 
 
-def test_a_new_stream_replaces_the_old_one(client: ScriptedClient) -> None:
-    client.send("StreamFrames 3D")
-    client.frames_until(20_000)
-    client.send("StreamFrames FrequencyDivisor:2 6D")
-
-    frames = client.frames_until(60_000)
-
-    assert [(component.type, component.frame_number) for frame in frames for component in frame] == [
-        (TOOLS, 4),
-        (TOOLS, 6),
-    ]
-
-
-def test_a_new_stream_sends_the_overdue_frames_of_the_old_one(client: ScriptedClient) -> None:
+def test_a_new_stream_replaces_the_old_one_from_its_overdue_frames_on(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D")
     assert client.numbers_until(20_000) == [1, 2, 3]
     client.elapsed_us = 55_000  # three frames are due, and not sent yet
-    client.send("StreamFrames All")
-    assert client.numbers_until(60_000) == [4, 5, 6, 7]
+    client.send("StreamFrames FrequencyDivisor:2 6D")
+    frames = client.frames_until(90_000)
+    found = [(component.type, component.frame_number) for frame in frames for component in frame]
+    assert found == [(TOOLS, number) for number in (4, 6, 8, 10)]
 
 
 def test_stop_ends_the_stream_for_later_measurements_too(client: ScriptedClient) -> None:
     client.send("StreamFrames")
     client.send("StreamFrames Stop")
-
     assert client.frames_until(50_000) == []
     assert client.session.measurement_stopped() == []
     client.session.measurement_started()
@@ -116,72 +98,22 @@ def test_a_new_byte_order_applies_from_the_next_frame_on(client: ScriptedClient)
     big = client.frames_until(0)
     client.send("SetByteOrder LittleEndian")
     little = client.frames_until(10_000, "little")
-
     assert [frame[0].items[0][0] for frame in big + little] == [0, 1]
 
 
-def test_frames_more_than_a_second_late_are_dropped(client: ScriptedClient) -> None:
+def test_frames_more_than_a_second_late_are_dropped_but_not_their_events(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D Events")
-
     frames = client.frames_until(10 * SECOND_US)
-
-    numbers = [frame[0].frame_number for frame in frames]
-    assert numbers == list(range(902, 1002))
+    assert [frame[0].frame_number for frame in frames] == list(range(902, 1002))
     assert client.session.frames_dropped == 901
-    assert [event[0] for event in frames[0][1].items] == list(range(1, 129))  # those of the dropped frames
+    assert [event[0] for event in frames[0][1].items] == list(range(1, 129))
 
 
 def test_a_frame_that_is_not_taken_stays_due(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D")
-
     next(client.session.due_frames(50_000))
-
     assert client.session.due_us == 10_000
     assert client.numbers_until(20_000) == [2, 3]
-
-
-# Events -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rate", ["AllFrames", "Frequency:7", "FrequencyDivisor:33"])
-@pytest.mark.parametrize("components", ["All", "3D Events", "Events", "Analog Event"])
-def test_every_event_is_sent_once_with_the_next_frame(
-    client: ScriptedClient, rate: str, components: str
-) -> None:
-    client.send(f"StreamFrames {rate} {components}")
-    frame_components = [
-        component
-        for t in range(0, 10 * SECOND_US, 500_000)
-        for frame in client.frames_until(t)
-        for component in frame
-    ]
-    events = [component for component in frame_components if component.type == EVENT]
-
-    sent = [event[0] for component in events for event in component.items]
-    assert sent == list(range(1, len(sent) + 1))
-    assert len(sent) >= 130
-    assert all(event[1] <= component.timestamp_us for component in events for event in component.items)
-    assert all(component.items for component in events)
-
-
-def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
-    client.elapsed_us = 10 * SECOND_US
-    client.send("StreamFrames Events")
-
-    [[events]] = client.frames_until(10 * SECOND_US + 70_000)
-
-    assert [event[0] for event in events.items] == [143]
-
-
-def test_a_stream_of_events_alone_loses_no_frames_while_the_client_does_not_read(
-    client: ScriptedClient,
-) -> None:
-    """Its frames exist only if there are events, and these come with the next frame."""
-    client.send("StreamFrames Events")
-    client.session.drop_due_frames(100_000)
-    assert client.session.frames_dropped == 0
-    frames = client.frames_until(140_000)
-    assert [[event[0] for event in events.items] for [events] in frames] == [[1], [2]]
 
 
 def test_dropped_frames_are_counted_once_and_never_before_they_are_due(client: ScriptedClient) -> None:
@@ -193,12 +125,52 @@ def test_dropped_frames_are_counted_once_and_never_before_they_are_due(client: S
     assert client.numbers_until(100_000) == [11]
 
 
+# Events -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", ["AllFrames", "Frequency:7", "FrequencyDivisor:33"])
+@pytest.mark.parametrize("components", ["All", "3D Events", "Events", "Analog Event"])
+def test_each_event_is_sent_once_with_a_frame(client: ScriptedClient, rate: str, components: str) -> None:
+    client.send(f"StreamFrames {rate} {components}")
+    frames = [frame for t in range(0, 10 * SECOND_US, 500_000) for frame in client.frames_until(t)]
+    events = [component for frame in frames for component in frame if component.type == EVENT]
+    sent = [event[0] for component in events for event in component.items]
+    assert sent == list(range(1, len(sent) + 1))
+    assert len(sent) >= 130
+    assert all(event[1] <= component.timestamp_us for component in events for event in component.items)
+    assert all(component.items for component in events)
+
+
+def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
+    client.elapsed_us = 10 * SECOND_US
+    client.send("StreamFrames Events")
+    [[events]] = client.frames_until(10 * SECOND_US + 70_000)
+    assert [event[0] for event in events.items] == [143]
+
+
+def test_a_stream_of_events_alone_loses_none_while_the_client_does_not_read(client: ScriptedClient) -> None:
+    """Its frames exist only if there are events, and these come with the next frame."""
+    client.send("StreamFrames Events")
+    client.session.drop_due_frames(100_000)
+    assert client.session.frames_dropped == 0
+    frames = client.frames_until(140_000)
+    assert [[event[0] for event in events.items] for [events] in frames] == [[1], [2]]
+
+
+def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
+    events = []
+    for elapsed_us in range(0, SECOND_US, 50_000):
+        client.elapsed_us = elapsed_us
+        client.send("SendCurrentFrame Events")
+        [components] = client.frames_until(elapsed_us)
+        events += [event[0] for component in components for event in component.items]
+    assert events == list(range(1, 14))
+
+
 # SendCurrentFrame ---------------------------------------------------------------------------
 
 
-def test_the_current_frame_is_sent_at_once_if_it_is_new_and_else_when_there_is_a_newer_one(
-    client: ScriptedClient,
-) -> None:
+def test_the_current_frame_is_sent_at_once_or_when_there_is_a_newer_one(client: ScriptedClient) -> None:
     """§5.3.4: no client gets the same frame twice."""
     client.elapsed_us = 123_456
     client.send("SendCurrentFrame 3D")
@@ -210,13 +182,10 @@ def test_the_current_frame_is_sent_at_once_if_it_is_new_and_else_when_there_is_a
     assert client.numbers_until(130_000) == [14]
 
 
-def test_all_requests_are_answered_in_order_even_if_the_scene_lacks_their_components(
-    client: ScriptedClient,
-) -> None:
+def test_all_requests_are_answered_in_order_even_without_their_components(client: ScriptedClient) -> None:
     """A client counts its answers; what is missing is an empty frame."""
-    client.send("SendCurrentFrame 3D")
-    client.send("SendCurrentFrame Force")
-    client.send("SendCurrentFrame 6D")
+    for components in ("3D", "Force", "6D"):
+        client.send(f"SendCurrentFrame {components}")
     assert [[each.type for each in frame] for frame in client.frames_until(0)] == [[MARKERS], [], [TOOLS]]
     client.send("StreamFrames 3D")
     client.send("SendCurrentFrame 3D")
@@ -235,9 +204,7 @@ def test_a_frame_of_a_slow_stream_does_not_make_older_frames_current(client: Scr
     assert client.session.due_us == 100_000
 
 
-def test_the_next_frame_is_due_for_the_stream_or_for_a_request_whichever_is_first(
-    client: ScriptedClient,
-) -> None:
+def test_the_next_frame_is_due_for_the_stream_or_for_an_earlier_request(client: ScriptedClient) -> None:
     """The server's timer waits for this time, so a later one would delay frames."""
     client.send("StreamFrames Analog")
     client.frames_until(0)
@@ -265,22 +232,9 @@ def test_no_more_than_1000_requests_wait(client: ScriptedClient) -> None:
     """They may wait for components that never come, and take memory."""
     for _ in range(1000):
         assert client.send("SendCurrentFrame 3D")[0][0] == COMMAND
-    assert client.send("SendCurrentFrame 3D")[0] == (
-        ERROR,
-        b"Error-1000 requests for the current frame wait already",
-    )
+    refusal = b"Error-1000 requests for the current frame wait already"
+    assert client.send("SendCurrentFrame 3D") == [(ERROR, refusal)]
     assert len(client.frames_until(0)) == 1000
-
-
-def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
-    events = []
-    for elapsed_us in range(0, SECOND_US, 50_000):
-        client.elapsed_us = elapsed_us
-        client.send("SendCurrentFrame Events")
-        [components] = client.frames_until(elapsed_us)
-        events += [event[0] for component in components for event in component.items]
-
-    assert events == list(range(1, 14))
 
 
 # No measurement -----------------------------------------------------------------------------
@@ -289,7 +243,6 @@ def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
 @pytest.mark.parametrize("sent", ["StreamFrames", "SendCurrentFrame 3D"])
 def test_without_a_measurement_requests_get_no_data(client: ScriptedClient, sent: str) -> None:
     client.elapsed_us = None
-
     assert client.send(sent) == [(COMMAND, f"OK-{sent}".encode()), (NO_DATA, b"")]
 
 
@@ -298,28 +251,18 @@ def test_clients_that_wait_for_frames_get_no_data_when_the_measurement_ends(clie
     client.send("StreamFrames")
     client.frames_until(0)
     client.send("SendCurrentFrame")
-
-    assert packets_in(b"".join(client.session.measurement_stopped())) == [(NO_DATA, b""), (NO_DATA, b"")]
+    assert packets_in(b"".join(client.session.measurement_stopped())) == [(NO_DATA, b"")] * 2
     assert client.frames_until(50_000) == []
 
 
-def test_a_stream_continues_with_the_first_frame_of_the_next_measurement(client: ScriptedClient) -> None:
+def test_a_stream_goes_on_in_the_next_measurement_and_loses_no_events(client: ScriptedClient) -> None:
+    """Frame numbers start again, and the first frame in time has the events of those that were late."""
     client.elapsed_us = None
     client.send("StreamFrames 3D Events")
     client.session.measurement_started()
-
     frames = client.frames_until(70_000)
-
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert frames[-1][1] == WireComponent(EVENT, 8, 70_000, [(1, 70_000, -1, -1, -1)])
-    client.session.measurement_stopped()
-    client.session.measurement_started()
-    assert client.numbers_until(0) == [1]
-
-
-def test_a_new_measurement_starts_over_and_loses_no_events(client: ScriptedClient) -> None:
-    """Frame numbers start again, and the first frame in time has the events of those that were late."""
-    client.send("StreamFrames 3D Events")
     client.frames_until(SECOND_US)
     client.session.measurement_stopped()
     client.session.measurement_started()

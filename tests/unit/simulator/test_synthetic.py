@@ -16,6 +16,7 @@ Floats = npt.NDArray[np.floating[Any]]
 RATE_HZ = 50.0
 MINUTE = np.arange(int(60 * RATE_HZ))
 NOISE_MM = 0.1
+COUNTED = (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG, ComponentType.FORCE)
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +43,6 @@ def rotation(quaternion: Floats) -> Floats:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def fitted(local_mm: Floats, measured_mm: Floats) -> tuple[Floats, Floats]:
-    """Return the least-squares rotation and translation from local to measured points (Kabsch)."""
-    local_centre, centre = local_mm.mean(axis=0), measured_mm.mean(axis=0)
-    u, _, vt = np.linalg.svd((measured_mm - centre).T @ (local_mm - local_centre))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return turn, centre - turn @ local_centre
-
-
 def tool_and_markers(scene: SyntheticScene, tool: int) -> tuple[Floats, Floats]:
     """Return a minute of the tool's item, (frames, 8), and of its markers' items, (frames, markers, 4)."""
     tools, markers = scene.parameters.tools, scene.parameters.markers
@@ -69,49 +62,28 @@ def local_mm_of(poses: Floats, markers: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("tool", range(7))
-def test_a_tools_markers_are_rigid_in_its_own_coordinates(scene: SyntheticScene, tool: int) -> None:
+def test_a_tools_markers_are_rigid_in_its_coordinates_and_fit(scene: SyntheticScene, tool: int) -> None:
     poses, markers = tool_and_markers(scene, tool)
-    local_mm = local_mm_of(poses, markers)
-
-    assert np.nanstd(local_mm, axis=0) == pytest.approx(NOISE_MM, rel=0.15)
+    all_local_mm = local_mm_of(poses, markers)
+    assert np.nanstd(all_local_mm, axis=0) == pytest.approx(NOISE_MM, rel=0.15)
     in_view = poses[~np.isnan(poses[:, 0])]
     assert np.linalg.norm(in_view[:, :4], axis=1) == pytest.approx(1.0, abs=1e-6)
     assert np.ptp(in_view[:, 4:7], axis=0).min() > 10  # mm: it moves
     assert np.nanmax(np.abs(np.diff(poses[:, :4], axis=0))) < 0.1  # smoothly, at 50 Hz
-
-
-@pytest.mark.parametrize("tool", range(7))
-def test_a_fit_of_the_visible_markers_gives_the_tools_pose_and_error(
-    scene: SyntheticScene, tool: int
-) -> None:
-    poses, markers = tool_and_markers(scene, tool)
-    local_mm = np.nanmean(local_mm_of(poses, markers), axis=0)
+    # It is out of view exactly when fewer than three of its markers are visible.
+    assert np.array_equal(np.isnan(poses[:, 0]), np.sum(~np.isnan(markers[..., 0]), axis=1) < 3)
+    local_mm = np.nanmean(all_local_mm, axis=0)
     for pose, measured in list(zip(poses, markers, strict=True))[::100]:
         if np.isnan(pose[0]):
             continue
         visible = ~np.isnan(measured[:, 0])
-        turn, origin_mm = fitted(local_mm[visible], measured[visible, :3])
-        expected = rotation(pose[None, :4])[0]
-
-        assert origin_mm == pytest.approx(pose[4:7], abs=5 * NOISE_MM)
-        assert turn == pytest.approx(expected, abs=0.01)
-        off_mm = measured[visible, :3] - (local_mm[visible] @ expected.T + pose[4:7])
+        off_mm = measured[visible, :3] - (local_mm[visible] @ rotation(pose[None, :4])[0].T + pose[4:7])
         assert pose[7] == pytest.approx(np.sqrt(np.mean(np.sum(off_mm**2, axis=1))), abs=0.02)
-
-
-def test_a_tool_is_out_of_view_exactly_when_fewer_than_three_of_its_markers_are_visible(
-    scene: SyntheticScene,
-) -> None:
-    for tool in range(7):
-        poses, markers = tool_and_markers(scene, tool)
-        num_visible = np.sum(~np.isnan(markers[..., 0]), axis=1)
-        assert np.array_equal(np.isnan(poses[:, 0]), num_visible < 3)
 
 
 def test_missing_markers_and_tools_have_the_bytes_of_the_specification(scene: SyntheticScene) -> None:
     markers = scene.items(ComponentType.MARKERS, MINUTE)
     tools = scene.items(ComponentType.TOOLS, MINUTE)
-
     missing_markers = {item.tobytes() for item in markers[np.isnan(markers["x"])]}
     assert missing_markers == {b"\xff" * 12 + bytes.fromhex("4479C000")}  # 999.0
     assert {item.tobytes() for item in tools[np.isnan(tools["x"])]} == {b"\xff" * 32}
@@ -129,7 +101,6 @@ def test_a_sample_does_not_depend_on_the_others_in_one_call(first: int, cut: int
 
 def test_channels_are_sines_of_different_frequencies(scene: SyntheticScene) -> None:
     voltages = table(scene.items(ComponentType.ANALOG, np.arange(10_000)))[..., 0]  # 20 s at 500 Hz
-
     spectrum = np.abs(np.fft.rfft(voltages, axis=0))
     assert (np.argmax(spectrum, axis=0) / 20).tolist() == [0.5, 1.25, 2.0, 2.75, 3.5]
     assert np.all(np.max(np.abs(voltages), axis=0) > 100)  # mV
@@ -143,34 +114,21 @@ def steps_on(scene: SyntheticScene, plate: int) -> list[Floats]:
 
 
 @pytest.mark.parametrize("plate", [0, 1])
-def test_a_step_has_two_peaks_of_about_the_weight_of_the_body(scene: SyntheticScene, plate: int) -> None:
-    steps = steps_on(scene, plate)
-
-    assert len(steps) >= 3
-    for step in steps:
-        third = len(step) // 3
-        early, middle, late = (
-            np.max(step[:third, 2]),
-            np.min(step[third:-third, 2]),
-            np.max(step[-third:, 2]),
-        )
-        assert 800 < early < 950
-        assert 800 < late < 950
-        assert 500 < middle < 700
-
-
-@pytest.mark.parametrize("plate", [0, 1])
-def test_moments_put_the_centre_of_pressure_on_the_plate_from_heel_to_toe(
-    scene: SyntheticScene, plate: int
-) -> None:
+def test_steps_have_two_peaks_and_roll_from_heel_to_toe(scene: SyntheticScene, plate: int) -> None:
     force = scene.parameters.force
     assert force is not None
     described = force.plates[plate]
     assert {channel.unit for channel in described.channels[3:]} == {"Nm"}
     half_x_mm = (described.corners[1].x - described.corners[0].x) / 2
     half_y_mm = (described.corners[2].y - described.corners[1].y) / 2
-    for step in steps_on(scene, plate):
+    steps = steps_on(scene, plate)
+    assert len(steps) >= 3
+    for step in steps:
         fx, fy, fz, mx, my, mz = step.T
+        third = len(step) // 3
+        assert 800 < np.max(fz[:third]) < 950
+        assert 500 < np.min(fz[third:-third]) < 700
+        assert 800 < np.max(fz[-third:]) < 950
         x_mm, y_mm = -1000 * my / fz, 1000 * mx / fz
         assert np.all(np.abs(x_mm) < half_x_mm)
         assert np.all(np.abs(y_mm) < half_y_mm)
@@ -182,15 +140,15 @@ def test_moments_put_the_centre_of_pressure_on_the_plate_from_heel_to_toe(
 
 def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) -> None:
     events = scene.events(0, 3_000_000)
-
-    assert [tuple(event) for event in events.tolist()] == [
-        (BUTTON_EVENT, 500_000, 1, 1, -1),
-        (BUTTON_EVENT, 800_000, 1, 0, -1),
-        (BUTTON_EVENT, 1_500_000, 2, 1, -1),
-        (BUTTON_EVENT, 1_800_000, 2, 0, -1),
-        (BUTTON_EVENT, 2_500_000, 1, 1, -1),
-        (BUTTON_EVENT, 2_800_000, 1, 0, -1),
+    presses = [
+        (500_000, 1, 1),
+        (800_000, 1, 0),
+        (1_500_000, 2, 1),
+        (1_800_000, 2, 0),
+        (2_500_000, 1, 1),
+        (2_800_000, 1, 0),
     ]
+    assert [tuple(event) for event in events.tolist()] == [(BUTTON_EVENT, *each, -1) for each in presses]
     assert scene.parameters.events is not None
     assert [int(event.id, 0) for event in scene.parameters.events.events] == [BUTTON_EVENT]
 
@@ -202,9 +160,7 @@ def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) ->
 )
 def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) -> None:
     scene = SyntheticScene(markers=0, tools=0, analog=0, plates=0)
-
     parts = [scene.events(a, b).tolist() for a, b in pairwise(times_us)]
-
     whole = scene.events(times_us[0], times_us[-1]).tolist()
     assert [event for part in parts for event in part] == whole
     assert all(times_us[0] <= event[1] < times_us[-1] for event in whole)
@@ -217,12 +173,7 @@ def test_the_parameters_describe_a_scene_of_any_size(
 ) -> None:
     """Clients allocate by the parameters; labels have a word and a number, and tools name their markers."""
     scene = SyntheticScene(markers=markers, tools=tools, analog=analog, plates=plates, seed=seed)
-    counts = {
-        ComponentType.MARKERS: markers,
-        ComponentType.TOOLS: tools,
-        ComponentType.ANALOG: analog,
-        ComponentType.FORCE: plates,
-    }
+    counts = dict(zip(COUNTED, (markers, tools, analog, plates), strict=True))
     described = {kind: num_described_items(scene.parameters, kind) for kind in counts}
     assert described == counts
     assert set(scene.rates_hz) == {component for component, count in counts.items() if count}

@@ -7,62 +7,44 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, RequestError
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.change_tasks import DEMAND_POLL_S, MAX_RESUMES, ChangeTasks
-from gateway.stream.files import IgnoredFiles
-from gateway.stream.session import Session
+from gateway.stream.change_tasks import DEMAND_POLL_S, MAX_RESUMES
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
-from gateway.stream.stream_control import StreamControl
-from tests.unit.stream.scripted_server import (
-    ScriptedServer,
-    obliging,
-    read_parameters,
-    refusing,
-    silent_to,
-)
+from tests.unit.stream.scripted_server import obliging, refusing, silent_to
+from tests.unit.stream.session_lab import Lab
 from tests.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
 HALF = "StreamFrames FrequencyDivisor:2"
 
 
-class Lab:
-    """The change tasks of one stream after its handshake."""
+async def started(**settings: Any) -> Lab:
+    """Return the lab of a stream after its handshake."""
+    lab = Lab(components=("all",), **settings)
+    await lab.start()
+    lab.changes.start()
+    return lab
 
-    def __init__(self, **stream: Any) -> None:
-        self.server = ScriptedServer()
-        self.status = StreamStatus("3d", name="lab (3d)")
-        self.has_subscribers = True
-        self.has_defect = False
-        source, settings = SourceSettings(name="lab", host="192.0.2.20"), StreamSettings(**stream)
-        self.session = Session(
-            source, settings, self.status, lambda *_: None, IgnoredFiles(), self.server.connect
-        )
-        self._control = StreamControl(source, settings, self.status, self.session, read_parameters)
-        self.adaptation = ChangeTasks(
-            source, settings, self.status, self.session, self._control, self._ask_for_subscribers
-        )
 
-    async def start(self) -> None:
-        await self.session.connect()
-        await self._control.start()
-        self.adaptation.start()
+async def stopped(**settings: Any) -> Lab:
+    """Return the lab of a stream that was stopped since it has no subscribers."""
+    lab = await started(on_demand=True, idle_after_s=5.0, **settings)
+    lab.has_subscribers = False
+    await asyncio.sleep(6)
+    return lab
 
-    def _ask_for_subscribers(self) -> bool:
-        if self.has_defect:
-            raise ZeroDivisionError
-        return self.has_subscribers
 
-    async def check_silence(self) -> None:
-        """Find nothing wrong."""
+def requests(lab: Lab) -> list[str]:
+    """Return the commands since the handshake."""
+    return lab.commands[3:]
 
-    @property
-    def requests(self) -> list[str]:
-        """The commands since the handshake."""
-        return self.server.connection.commands[3:]
+
+async def change(lab: Lab, halvings: int, lag_s: float | None = None) -> None:
+    if lag_s is not None:
+        lab.status.lag_measured(lag_s)
+    lab.changes.lateness_changed(halvings)
+    await settle()
 
 
 def records(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
@@ -70,72 +52,57 @@ def records(caplog: pytest.LogCaptureFixture) -> list[logging.LogRecord]:
     return [record for record in caplog.records if re.search("subscriber|late|in time", record.getMessage())]
 
 
-async def test_an_on_demand_stream_stops_without_subscribers_and_resumes_with_them() -> None:
-    lab = Lab(on_demand=True, idle_after_s=5.0)
-    await lab.start()
+async def test_an_on_demand_stream_stops_once_without_subscribers_and_resumes_with_them(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.stream")
+    lab = await started(on_demand=True, idle_after_s=5.0)
     await asyncio.sleep(60)
-    assert lab.requests == []
     lab.has_subscribers = False
     await asyncio.sleep(4.9)
-    assert lab.requests == []
+    assert requests(lab) == []
     await asyncio.sleep(0.1 + DEMAND_POLL_S)
     await settle()
-    assert lab.requests == [STOP]
-    assert lab.status.rate == ""
+    assert (requests(lab), lab.status.rate) == ([STOP], "")
     await asyncio.sleep(60)
     lab.has_subscribers = True
     await asyncio.sleep(DEMAND_POLL_S)
     await settle()
-    assert lab.requests == [STOP, START]
-    assert lab.status.rate == "AllFrames"
-    lab.adaptation.cancel()
-
-
-async def test_each_stop_and_each_start_on_demand_happens_once_and_is_logged(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    caplog.set_level(logging.INFO, "gateway.stream")
-    lab = Lab(on_demand=True, idle_after_s=5.0)
-    await lab.start()
-    for has_subscribers in (False, True, False):
-        lab.has_subscribers = has_subscribers
-        await asyncio.sleep(60)
-    assert lab.requests == [STOP, START, STOP]
+    assert (requests(lab), lab.status.rate) == ([STOP, START], "AllFrames")
+    await asyncio.sleep(60)
+    lab.has_subscribers = False
+    await asyncio.sleep(60)
+    assert requests(lab) == [STOP, START, STOP]
     assert [record.getMessage() for record in records(caplog)] == [
         "lab (3d): no subscribers; the stream is stopped",
         "lab (3d): a subscriber appeared; frames are requested again",
         "lab (3d): no subscribers; the stream is stopped",
     ]
-    lab.adaptation.cancel()
+    lab.changes.cancel()
 
 
 async def test_a_short_absence_of_subscribers_does_not_stop_an_on_demand_stream() -> None:
-    lab = Lab(on_demand=True, idle_after_s=5.0)
-    await lab.start()
+    lab = await started(on_demand=True, idle_after_s=5.0)
     for _ in range(5):
         lab.has_subscribers = not lab.has_subscribers
         await asyncio.sleep(4)
-    assert lab.requests == []
-    lab.adaptation.cancel()
+    assert requests(lab) == []
+    lab.changes.cancel()
 
 
 async def test_other_streams_run_without_subscribers() -> None:
-    lab = Lab(idle_after_s=5.0)
+    lab = await started(idle_after_s=5.0)
     lab.has_subscribers = False
-    await lab.start()
     await asyncio.sleep(60)
-    assert lab.requests == []
+    assert requests(lab) == []
 
 
 async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream")
-    lab = Lab(adapt_rate=True)
-    await lab.start()
+    lab = await started(adapt_rate=True)
     for halvings, lag_s in ((1, 0.3), (2, 0.3), (1, 0.0), (0, 0.0)):
-        lab.status.lag_measured(lag_s)
-        lab.adaptation.lateness_changed(halvings)
-        await settle()
-    assert lab.requests == [HALF, "StreamFrames FrequencyDivisor:4", HALF, START]
+        await change(lab, halvings, lag_s)
+    assert requests(lab) == [HALF, "StreamFrames FrequencyDivisor:4", HALF, START]
     assert lab.status.rate == "AllFrames"
     assert [record.levelname for record in records(caplog)] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
     first, second, third, last = [record.getMessage() for record in records(caplog)]
@@ -147,25 +114,21 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
 
 async def test_a_reduced_rate_is_requested_again_with_other_components() -> None:
     """The request for components has no rate; without another one, the full rate would reach a slow link."""
-    lab = Lab(adapt_rate=True)
-    await lab.start()
-    lab.adaptation.lateness_changed(1)
+    lab = await started(adapt_rate=True)
+    await change(lab, 1)
+    lab.changes.request_components((ComponentType.MARKERS,))
     await settle()
-    lab.adaptation.request_components((ComponentType.MARKERS,))
-    await settle()
-    assert lab.requests == [HALF, "StreamFrames AllFrames 3D", f"{HALF} 3D"]
-    lab.adaptation.cancel()
+    assert requests(lab) == [HALF, "StreamFrames AllFrames 3D", f"{HALF} 3D"]
+    lab.changes.cancel()
 
 
 async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream")
-    lab = Lab()
-    await lab.start()
+    lab = await started()
     lab.status.lag_measured(0.3)
     for halvings in (1, 0):
-        lab.adaptation.lateness_changed(halvings)
-        await settle()
-    assert lab.requests == []
+        await change(lab, halvings)
+    assert requests(lab) == []
     assert [record.levelname for record in records(caplog)] == ["WARNING", "INFO"]
     late, in_time = [record.getMessage() for record in records(caplog)]
     assert late == "lab (3d): frames arrive 300 ms late"
@@ -174,12 +137,9 @@ async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCapt
 
 async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream")
-    lab = Lab(adapt_rate=True)
-    await lab.start()
+    lab = await started(adapt_rate=True)
     for halvings, lag_s in ((1, 0.05), (2, 0.051), (3, 2.0)):
-        lab.status.lag_measured(lag_s)
-        lab.adaptation.lateness_changed(halvings)
-        await settle()
+        await change(lab, halvings, lag_s)
     assert [record.getMessage() for record in records(caplog)] == [
         "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2",
         "lab (3d): frames arrive 51 ms late; asked the server for FrequencyDivisor:4",
@@ -187,26 +147,19 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
     ]
 
 
-async def test_a_request_for_the_default_rate_is_logged_as_such(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    lab = Lab(adapt_rate=True)
-    await lab.start()
+async def test_a_request_for_the_default_rate_is_logged_as_such(caplog: pytest.LogCaptureFixture) -> None:
+    lab = await started(adapt_rate=True)
     lab.server.answer = refusing("StreamFrames")
     lab.status.rate_agreed("")
-    lab.status.lag_measured(0.3)
-    lab.adaptation.lateness_changed(1)
-    await settle()
+    await change(lab, 1, 0.3)
     assert "lab (3d): frames arrive 300 ms late; asked the server for its default rate" in caplog.messages
 
 
 async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
-    lab = Lab(adapt_rate=True)
-    await lab.start()
+    lab = await started(adapt_rate=True)
     lab.server.answer = silent_to("StreamFrames")
-    lab.adaptation.lateness_changed(1)
-    await settle()
+    await change(lab, 1)
     lab.server.connection.end()
     await settle()
     assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
@@ -217,13 +170,11 @@ async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.Lo
 
 async def test_cancelling_ends_every_task() -> None:
     tasks_before = asyncio.all_tasks()
-    lab = Lab(on_demand=True, adapt_rate=True)
-    await lab.start()
+    lab = await started(on_demand=True, adapt_rate=True)
     lab.server.answer = silent_to("StreamFrames")
-    lab.adaptation.lateness_changed(1)
-    await settle()
+    await change(lab, 1)
     assert len(asyncio.all_tasks() - tasks_before) == 2
-    lab.adaptation.cancel()
+    lab.changes.cancel()
     await settle()
     assert asyncio.all_tasks() == tasks_before
 
@@ -232,76 +183,64 @@ async def test_cancelling_ends_every_task() -> None:
 
 
 async def test_a_stopped_stream_stays_stopped_while_its_rate_changes_and_resumes_at_that_rate() -> None:
-    lab = Lab(on_demand=True, idle_after_s=5.0, adapt_rate=True)
-    await lab.start()
-    lab.adaptation.lateness_changed(1)
-    await settle()
+    lab = await started(on_demand=True, idle_after_s=5.0, adapt_rate=True)
+    await change(lab, 1)
     lab.has_subscribers = False
     await asyncio.sleep(6)
-    lab.adaptation.lateness_changed(2)
+    lab.changes.lateness_changed(2)
     await asyncio.sleep(60)
-    assert lab.requests == [HALF, STOP]
+    assert requests(lab) == [HALF, STOP]
     lab.has_subscribers = True
     await asyncio.sleep(1)
-    assert lab.requests == [HALF, STOP, "StreamFrames FrequencyDivisor:4"]
-    lab.adaptation.cancel()
+    assert requests(lab) == [HALF, STOP, "StreamFrames FrequencyDivisor:4"]
+    lab.changes.cancel()
 
 
 async def test_a_refused_resume_is_repeated_until_the_server_accepts_it() -> None:
-    lab = Lab(on_demand=True, idle_after_s=5.0)
-    await lab.start()
-    lab.has_subscribers = False
-    await asyncio.sleep(6)
+    lab = await stopped()
     lab.server.answer = refusing("StreamFrames AllFrames")
     lab.has_subscribers = True
     await asyncio.sleep(2)
-    assert lab.requests == [STOP, START, START]
+    assert requests(lab) == [STOP, START, START]
     lab.server.answer = obliging
     await asyncio.sleep(60)
-    assert lab.requests == [STOP, START, START, START]
-    assert lab.status.rate == "AllFrames"
-    assert lab.session.is_open
-    lab.adaptation.cancel()
+    assert requests(lab) == [STOP, START, START, START]
+    assert (lab.status.rate, lab.session.is_open) == ("AllFrames", True)
+    lab.changes.cancel()
 
 
 async def test_a_server_that_refuses_every_resume_is_left_with_a_reason() -> None:
-    lab = Lab(on_demand=True, idle_after_s=5.0)
-    await lab.start()
-    lab.has_subscribers = False
-    await asyncio.sleep(6)
+    lab = await stopped()
     lab.server.answer = refusing("StreamFrames")
     lab.has_subscribers = True
-    with pytest.raises(
-        RequestError, match="refuses to send frames again after they were stopped; connecting"
-    ):
+    text = "refuses to send frames again after they were stopped; connecting"
+    with pytest.raises(RequestError, match=text):
         await lab.session.monitor(lab.check_silence)
-    assert lab.requests.count(START) == MAX_RESUMES
-    lab.adaptation.cancel()
+    assert requests(lab).count(START) == MAX_RESUMES
+    lab.changes.cancel()
 
 
 async def test_a_refused_stop_is_repeated_ever_later_and_not_once_frames_are_wanted_again() -> None:
-    lab = Lab(on_demand=True, idle_after_s=5.0)
-    await lab.start()
+    lab = await started(on_demand=True, idle_after_s=5.0)
     lab.server.connection.send_frames(1)
     lab.server.answer = refusing("StreamFrames Stop")
     lab.has_subscribers = False
     await asyncio.sleep(5.5)
-    assert lab.requests == [STOP]
+    assert requests(lab) == [STOP]
     await asyncio.sleep(300)
-    assert 8 < len(lab.requests) < 20
+    assert 8 < len(requests(lab)) < 20
     assert lab.status.state is StreamState.STREAMING
     assert lab.status.rate == "AllFrames"
     lab.has_subscribers = True
-    num_before = len(lab.requests)
+    num_before = len(requests(lab))
     await asyncio.sleep(300)
-    assert len(lab.requests) == num_before
-    lab.adaptation.cancel()
+    assert len(requests(lab)) == num_before
+    lab.changes.cancel()
 
 
 async def test_a_defect_ends_the_session() -> None:
-    lab = Lab(on_demand=True)
-    await lab.start()
+    lab = await started(on_demand=True)
     lab.has_defect = True
     with pytest.raises(DefectError, match="defect in the gateway: ZeroDivisionError: "):
         await lab.session.monitor(lab.check_silence)
-    lab.adaptation.cancel()
+    lab.changes.cancel()

@@ -140,17 +140,20 @@ def test_capture_times_do_not_go_back_when_a_better_line_is_lower(seed: int) -> 
 # --- late frames
 
 
-def test_one_late_frame_does_not_move_the_clock() -> None:
-    frames = delayed(simulate(seconds=40, rate_hz=RATE_HZ), RATE_HZ, [29.996, 30, 30.004], [0, 1, 0])
-    observed = observe(ServerClock(), frames)
-    assert observed.lags_s[LEARNED] == pytest.approx(1.0, abs=0.1)
-    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
-
-
-def test_a_pause_of_the_gateway_does_not_move_the_clock() -> None:
-    frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, [29.999, 30, 35], [0, 5, 0])
-    observed = observe(ServerClock(), frames)
-    assert observed.lags_s[LEARNED] == pytest.approx(5.0, abs=0.1)
+@pytest.mark.parametrize(
+    ("seconds", "delays_s", "lag_s"),
+    [
+        pytest.param([29.996, 30, 30.004], [0, 1, 0], 1.0, id="one late frame"),
+        pytest.param([29.999, 30, 35], [0, 5, 0], 5.0, id="a pause of the gateway"),
+    ],
+)
+def test_what_is_late_once_does_not_move_the_clock(
+    seconds: Sequence[float], delays_s: Sequence[float], lag_s: float
+) -> None:
+    observed = observe(
+        ServerClock(), delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, seconds, delays_s)
+    )
+    assert observed.lags_s[LEARNED] == pytest.approx(lag_s, abs=0.1)
     assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
 
 

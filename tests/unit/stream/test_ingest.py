@@ -55,13 +55,7 @@ class Lab:
         )
         source = SourceSettings(name="lab", host="127.0.0.1")
         self.ingest = Ingest(
-            source,
-            stream,
-            self.status,
-            self._publish,
-            self._skip,
-            self.halvings.append,
-            self._on_restart,
+            source, stream, self.status, self._publish, self._skip, self.halvings.append, self._on_restart
         )
 
     def _on_restart(self) -> None:

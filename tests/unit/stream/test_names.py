@@ -8,7 +8,7 @@ import pytest
 import uvloop
 
 from gateway.stream.names import MAX_ADDRESSES, is_address, look_up
-from tests.unit.stream.resolver import Resolver
+from tests.unit.stream.conftest import Resolver
 
 
 def num_look_ups(name: str) -> int:

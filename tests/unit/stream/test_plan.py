@@ -73,37 +73,31 @@ def test_components_of_one_rate_share_a_connection(
     assert list(plan.rates_hz) == sorted(plan.rates_hz)
 
 
-def test_a_rate_of_zero_is_none() -> None:
-    plan = plan_streams(announcing({MARKERS: 200, ANALOG: 0}))
-    assert plan.groups == (WIRE_ORDER,)
-    assert "rates of analog, so" in plan.limitation
-
-
-def test_a_section_without_items_has_no_rate() -> None:
-    parameters = replace(announcing({ANALOG: 2000, TOOLS: 2000}), markers=Parameters3D(200.0))
-    assert plan_streams(parameters).groups == (WIRE_ORDER,)
-
-
 @pytest.mark.parametrize("parameters", [None, Parameters(), announcing({MARKERS: None, ANALOG: None})])
 def test_a_server_without_rates_gets_one_connection(parameters: Parameters | None) -> None:
     assert plan_streams(parameters) == StreamPlan((WIRE_ORDER,), (), NO_RATES)
 
 
-def test_one_component_without_a_rate_costs_nothing() -> None:
+def test_what_has_no_rate_of_its_own_shares_the_connection() -> None:
     assert plan_streams(announcing({TOOLS: None})) == StreamPlan()
+    assert "rates of analog, so" in plan_streams(announcing({MARKERS: 200, ANALOG: 0})).limitation
+    without_items = replace(announcing({ANALOG: 2000, TOOLS: 2000}), markers=Parameters3D(200.0))
+    assert plan_streams(without_items).groups == (WIRE_ORDER,)
 
 
-def test_the_cost_of_one_connection() -> None:
-    plan = plan_streams(announcing({MARKERS: 200, ANALOG: 2000})).on_one_connection("for a test")
-    assert plan.groups == (WIRE_ORDER,)
-    assert plan.limitation == "analog arrives at 200 Hz instead of 2000 Hz: for a test"
-
-
-def test_the_cost_for_several_rates() -> None:
-    rates_hz = {MARKERS: 119.88, TOOLS: 59.94, ANALOG: 2000, FORCE: 2000}
-    assert plan_streams(announcing(rates_hz)).on_one_connection("why").limitation == (
-        "3d arrives at 59.9 Hz instead of 119.9 Hz, analog and force instead of 2000 Hz: why"
-    )
+@pytest.mark.parametrize(
+    ("rates_hz", "cost"),
+    [
+        ({MARKERS: 200, ANALOG: 2000}, "analog arrives at 200 Hz instead of 2000 Hz"),
+        (
+            {MARKERS: 119.88, TOOLS: 59.94, ANALOG: 2000, FORCE: 2000},
+            "3d arrives at 59.9 Hz instead of 119.9 Hz, analog and force instead of 2000 Hz",
+        ),
+    ],
+)
+def test_the_cost_of_one_connection(rates_hz: Mapping[ComponentType, float], cost: str) -> None:
+    plan = plan_streams(announcing(rates_hz)).on_one_connection("why")
+    assert (plan.groups, plan.limitation) == ((WIRE_ORDER,), f"{cost}: why")
 
 
 @pytest.mark.parametrize("not_a_rate", [0.0, -1.0, 1e-30, 1e30])

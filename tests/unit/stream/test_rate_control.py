@@ -21,31 +21,22 @@ def texts(rate: Rate, components: Sequence[ComponentType], server_rate_hz: float
     return [str(request) for request in stream_requests(rate, components, server_rate_hz)]
 
 
-def test_the_configured_rate_and_components_are_requested_first() -> None:
-    assert texts(Frequency(60), TWO, 100)[0] == "StreamFrames Frequency:60 3D 6D"
-
-
-def test_all_components_are_requested_without_names() -> None:
-    backwards = WIRE_ORDER[::-1]
-    assert texts(AllFrames(), backwards, None)[0] == "StreamFrames AllFrames"
-
-
-def test_all_frames_fall_back_to_the_divisor_1() -> None:
-    assert texts(AllFrames(), TWO, 100) == [
-        "StreamFrames AllFrames 3D 6D",
-        "StreamFrames AllFrames",
-        "StreamFrames FrequencyDivisor:1",
-        "StreamFrames",
-    ]
-
-
-def test_a_frequency_falls_back_to_a_divisor_of_the_servers_rate() -> None:
-    assert texts(Frequency(50), TWO, 200) == [
-        "StreamFrames Frequency:50 3D 6D",
-        "StreamFrames Frequency:50",
-        "StreamFrames FrequencyDivisor:4",
-        "StreamFrames",
-    ]
+@pytest.mark.parametrize(
+    ("rate", "components", "server_rate_hz", "forms"),
+    [
+        (AllFrames(), TWO, 100, ["AllFrames 3D 6D", "AllFrames", "FrequencyDivisor:1", ""]),
+        (AllFrames(), WIRE_ORDER[::-1], None, ["AllFrames", "FrequencyDivisor:1", ""]),
+        (Frequency(50), TWO, 200, ["Frequency:50 3D 6D", "Frequency:50", "FrequencyDivisor:4", ""]),
+        (Frequency(50), TWO, None, ["Frequency:50 3D 6D", "Frequency:50", ""]),
+        (Frequency(50), TWO, 0.0, ["Frequency:50 3D 6D", "Frequency:50", ""]),
+        (FrequencyDivisor(4), TWO, 200, ["FrequencyDivisor:4 3D 6D", "FrequencyDivisor:4", ""]),
+    ],
+)
+def test_the_configured_rate_and_components_are_requested_first_and_simpler_forms_next(
+    rate: Rate, components: Sequence[ComponentType], server_rate_hz: float | None, forms: list[str]
+) -> None:
+    """All components need no names; a frequency falls back to a divisor of the server's rate."""
+    assert texts(rate, components, server_rate_hz) == [f"StreamFrames {form}".strip() for form in forms]
 
 
 @pytest.mark.parametrize(
@@ -56,23 +47,6 @@ def test_the_divisor_is_the_nearest_one_and_at_least_1(
     wanted_hz: float, server_rate_hz: float, divisor: int
 ) -> None:
     assert f"StreamFrames FrequencyDivisor:{divisor}" in texts(Frequency(wanted_hz), TWO, server_rate_hz)
-
-
-@pytest.mark.parametrize("server_rate_hz", [None, 0.0])
-def test_without_the_servers_rate_a_frequency_has_no_divisor(server_rate_hz: float | None) -> None:
-    assert texts(Frequency(50), TWO, server_rate_hz) == [
-        "StreamFrames Frequency:50 3D 6D",
-        "StreamFrames Frequency:50",
-        "StreamFrames",
-    ]
-
-
-def test_a_divisor_is_kept() -> None:
-    assert texts(FrequencyDivisor(4), TWO, 200) == [
-        "StreamFrames FrequencyDivisor:4 3D 6D",
-        "StreamFrames FrequencyDivisor:4",
-        "StreamFrames",
-    ]
 
 
 @pytest.mark.parametrize("rate", [AllFrames(), Frequency(100), FrequencyDivisor(1)])
@@ -103,26 +77,23 @@ class Link:
                 self.changes.append((self.now_s, self.control.halvings))
 
 
-def test_frames_in_time_do_not_change_the_rate() -> None:
-    link = Link(carries_halvings=0)
-    link.run(1000)
-    assert link.changes == []
+@pytest.mark.parametrize(
+    ("carries_halvings", "seconds", "num_changes"), [(0, 1000, 0), (3, 5, 3), (100, 1000, MAX_HALVINGS)]
+)
+def test_the_rate_is_halved_until_frames_arrive_in_time_or_the_limit(
+    carries_halvings: int, seconds: float, num_changes: int
+) -> None:
+    link = Link(carries_halvings)
+    link.run(seconds)
+    assert [halvings for _, halvings in link.changes] == list(range(1, num_changes + 1))
 
 
 def test_lateness_of_less_than_a_second_does_not_change_the_rate() -> None:
     link = Link(carries_halvings=1)
     for _ in range(20):
-        link.carries_halvings = 1
-        link.run(0.9)
-        link.carries_halvings = 0
-        link.run(0.1)
+        for link.carries_halvings, seconds in ((1, 0.9), (0, 0.1)):
+            link.run(seconds)
     assert link.changes == []
-
-
-def test_the_rate_is_halved_until_frames_arrive_in_time() -> None:
-    link = Link(carries_halvings=3)
-    link.run(5)
-    assert [halvings for _, halvings in link.changes] == [1, 2, 3]
 
 
 def test_the_rate_returns_to_the_configured_one_by_steps_of_ten_seconds() -> None:
@@ -156,65 +127,66 @@ def test_a_step_up_that_lasts_resets_the_wait() -> None:
     assert link.control.wait_s == FIRST_WAIT_S
 
 
-def test_halvings_are_bounded() -> None:
-    link = Link(carries_halvings=100)
-    link.run(1000)
-    assert link.control.halvings == MAX_HALVINGS
-    assert len(link.changes) == MAX_HALVINGS
-
-
 @pytest.mark.parametrize(
-    ("rate", "expected"),
+    ("rate", "halvings", "expected"),
     [
-        (AllFrames(), FrequencyDivisor(4)),
-        (None, FrequencyDivisor(4)),
-        (FrequencyDivisor(3), FrequencyDivisor(12)),
-        (Frequency(60), Frequency(15)),
+        (AllFrames(), 2, FrequencyDivisor(4)),
+        (None, 2, FrequencyDivisor(4)),
+        (FrequencyDivisor(3), 2, FrequencyDivisor(12)),
+        (Frequency(60), 2, Frequency(15)),
+        (AllFrames(), 5, FrequencyDivisor(32)),
+        (FrequencyDivisor(3), 5, FrequencyDivisor(96)),
+        (Frequency(64), 5, Frequency(2)),
     ],
 )
-def test_a_rate_is_halved_twice(rate: Rate | None, expected: Rate) -> None:
-    assert halved(rate, 2) == expected
+def test_a_rate_is_halved_several_times(rate: Rate | None, halvings: int, expected: Rate) -> None:
+    assert halved(rate, halvings) == expected
     assert halved(rate, 0) == rate
 
 
+RESTART = None
+LATE, IN_TIME = 0.2, 0.0
+
+
 @pytest.mark.parametrize(
-    ("rate", "expected"),
+    ("observed", "changes_s", "halvings"),
     [
-        (AllFrames(), FrequencyDivisor(32)),
-        (FrequencyDivisor(3), FrequencyDivisor(96)),
-        (Frequency(64), Frequency(2)),
+        pytest.param(
+            [(0.0, LATE), RESTART, (0.5, LATE), (1.25, LATE), (1.5, LATE)],
+            [1.5],
+            1,
+            id="a restart forgets that frames were late",
+        ),
+        pytest.param(
+            [
+                (0.0, LATE),
+                (1.0, LATE),
+                (2.0, IN_TIME),
+                RESTART,
+                (11.0, IN_TIME),
+                (20.9, IN_TIME),
+                (21.0, IN_TIME),
+            ],
+            [1.0, 21.0],
+            0,
+            id="after a restart frames must be in time for the whole wait again",
+        ),
+        pytest.param(
+            [(0.0, LATE), (1.0, LATE), (2.0, LATE), (3.0, IN_TIME), (13.0, IN_TIME), (23.0, IN_TIME)],
+            [1.0, 2.0, 13.0, 23.0],
+            0,
+            id="the second step up comes exactly one wait after the first",
+        ),
     ],
 )
-def test_rates_halved_five_times(rate: Rate, expected: Rate) -> None:
-    assert halved(rate, 5) == expected
-
-
-def test_a_restart_forgets_that_frames_were_late() -> None:
-    control = LagControl(max_lag_s=0.05)
-    control.observe(0.0, 0.2)
-    control.restart()
-    assert control.is_late is False
-    assert not control.observe(0.5, 0.2)
-    assert not control.observe(1.25, 0.2)
-    assert control.observe(1.5, 0.2)
-
-
-def test_after_a_restart_frames_must_be_in_time_for_the_whole_wait_again() -> None:
-    control = LagControl(max_lag_s=0.05)
-    control.observe(0.0, 0.2)
-    control.observe(1.0, 0.2)
-    control.observe(2.0, 0.0)
-    control.restart()
-    assert not control.observe(11.0, 0.0)
-    assert not control.observe(20.9, 0.0)
-    assert control.observe(21.0, 0.0)
-    assert control.halvings == 0
-
-
-def test_the_second_step_up_comes_exactly_one_wait_after_the_first() -> None:
-    control = LagControl(max_lag_s=0.05)
-    for now_s in (0.0, 1.0, 2.0):
-        control.observe(now_s, 0.2)
-    steps = [control.observe(3.0 + elapsed_s, 0.0) for elapsed_s in (0.0, 10.0, 20.0)]
-    assert steps == [False, True, True]
-    assert control.halvings == 0
+def test_when_the_rate_changes(
+    observed: list[tuple[float, float] | None], changes_s: list[float], halvings: int
+) -> None:
+    control, changed_s = LagControl(max_lag_s=0.05), []
+    for each in observed:
+        if each is None:
+            control.restart()
+            assert control.is_late is False
+        elif control.observe(*each):
+            changed_s.append(each[0])
+    assert (changed_s, control.halvings) == (changes_s, halvings)

@@ -1,77 +1,77 @@
-"""One session with a scripted server: commands and their replies, frames and the connection."""
+"""One session with a scripted server: commands and their replies, frames, files, and how it ends."""
 
 import asyncio
 import socket
 import struct
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from gateway.errors import ClosedError, ReplyTimeoutError, ServerError, SilenceError
+from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
 from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
 from gateway.stream.state import StreamState
 from tests.losses import amounts
 from tests.servers import markers_frame, ok, packet
-from tests.unit.stream.scripted_server import (
-    obliging,
-    refusing,
-    refusing_without_name,
-    silent_to,
-)
-from tests.unit.stream.session_lab import Lab, lab, now_s
+from tests.unit.stream.scripted_server import obliging, refusing, refusing_without_name, silent_to
+from tests.unit.stream.session_lab import Lab, now_s
 from tests.vectors import STOP_RECORDING
 from tests.virtual_time import settle
 
-__all__ = ["lab"]
+
+@pytest.fixture
+async def lab() -> Lab:
+    return Lab()
+
+
+@pytest.fixture
+async def silent() -> Lab:
+    """Return a connected lab whose server answers nothing."""
+    lab = Lab(silent_to(""))
+    await lab.session.connect()
+    return lab
 
 
 # --- commands and replies
 
 
-async def test_an_answer_goes_to_the_command_that_asked(lab: Lab) -> None:
+async def test_an_answer_goes_to_the_command_that_asked_and_a_refusal_raises_the_servers_text(
+    lab: Lab,
+) -> None:
     await lab.session.connect()
     assert (await lab.session.ask(Version())).body == b"OK-Version 1.0"
     assert (await lab.session.ask(SendParameters())).body.startswith(b"<RT_Parameters")
-
-
-async def test_a_refusal_raises_the_servers_text(lab: Lab) -> None:
     lab.server.answer = refusing("Version")
-    await lab.session.connect()
     with pytest.raises(ServerError, match=r"Error-Version 1\.0"):
         await lab.session.ask(Version())
     assert lab.session.is_open
 
 
-async def test_commands_are_sent_one_at_a_time(lab: Lab) -> None:
-    lab.server.answer = silent_to("")
-    await lab.session.connect()
-    first = asyncio.create_task(lab.session.ask(Version()))
-    second = asyncio.create_task(lab.session.ask(SendParameters()))
+async def test_commands_are_sent_one_at_a_time(silent: Lab) -> None:
+    first = asyncio.create_task(silent.session.ask(Version()))
+    second = asyncio.create_task(silent.session.ask(SendParameters()))
     await settle()
-    assert lab.connection.commands == ["Version 1.0"]
-    lab.connection.send(obliging("Version 1.0"))
+    assert silent.commands == ["Version 1.0"]
+    silent.connection.send(obliging("Version 1.0"))
     await first
     await settle()
-    assert lab.connection.commands == ["Version 1.0", "SendParameters"]
-    lab.connection.send(obliging("SendParameters"))
+    assert silent.commands == ["Version 1.0", "SendParameters"]
+    silent.connection.send(obliging("SendParameters"))
     await second
 
 
-async def test_an_unanswered_command_times_out_and_its_late_reply_answers_no_other(lab: Lab) -> None:
-    lab.server.answer = silent_to("Version")
-    await lab.session.connect()
+async def test_an_unanswered_command_times_out_and_its_late_reply_answers_no_other(silent: Lab) -> None:
     asked_s = now_s()
     with pytest.raises(ReplyTimeoutError, match=r"did not answer Version 1\.0 within 2 s"):
-        await lab.session.ask(Version())
+        await silent.session.ask(Version())
     assert now_s() - asked_s == pytest.approx(2)
-    assert lab.session.is_open
-    lab.server.answer = silent_to("")
-    second = asyncio.create_task(lab.session.ask(SendParameters()))
+    assert silent.session.is_open
+    second = asyncio.create_task(silent.session.ask(SendParameters()))
     await settle()
-    lab.connection.send(obliging("Version 1.0"))
+    silent.connection.send(obliging("Version 1.0"))
     await settle()
     assert not second.done()
-    lab.connection.send(obliging("SendParameters"))
+    silent.connection.send(obliging("SendParameters"))
     assert (await second).body.startswith(b"<RT_Parameters")
 
 
@@ -85,8 +85,8 @@ async def test_asking_before_connecting_raises(lab: Lab) -> None:
 # --- replies that name no command
 
 
-async def test_a_refusal_without_a_name_refuses_the_command_under_way_if_no_other_follows(lab: Lab) -> None:
-    lab.server.answer = silent_to("Version", by=refusing_without_name("SendParameters"))
+async def test_a_refusal_without_a_name_refuses_the_command_under_way_if_no_other_follows() -> None:
+    lab = Lab(silent_to("Version", by=refusing_without_name("SendParameters")))
     await lab.session.connect()
     with pytest.raises(ReplyTimeoutError):
         await lab.session.ask(Version())
@@ -96,22 +96,19 @@ async def test_a_refusal_without_a_name_refuses_the_command_under_way_if_no_othe
     assert now_s() - asked_s < 0.5
 
 
-async def test_late_refusals_that_come_together_refuse_each_its_own_command(lab: Lab) -> None:
-    lab.server.answer = silent_to("")
-    await lab.session.connect()
+async def test_late_refusals_that_come_together_refuse_each_its_own_command(silent: Lab) -> None:
     with pytest.raises(ReplyTimeoutError):
-        await lab.session.ask(Version())
-    asking = asyncio.create_task(lab.session.ask(StreamFrames()))
+        await silent.session.ask(Version())
+    asking = asyncio.create_task(silent.session.ask(StreamFrames()))
     await settle()
-    lab.connection.send(packet(0, "what?"))  # the late refusal of Version
+    silent.connection.send(packet(0, "what?"))  # the late refusal of Version
     await asyncio.sleep(0.1)
-    lab.connection.send(packet(1, "fine"))
+    silent.connection.send(packet(1, "fine"))
     assert (await asking).body == b"fine"
 
 
 async def test_a_refusal_without_a_name_after_the_command_timed_out_changes_nothing() -> None:
-    lab = Lab(reply_timeout_s=0.1)
-    lab.server.answer = silent_to("")
+    lab = Lab(silent_to(""), reply_timeout_s=0.1)
     await lab.session.connect()
     for _ in range(2):
         with pytest.raises(ReplyTimeoutError):
@@ -130,10 +127,10 @@ async def test_a_refusal_without_a_name_after_the_command_timed_out_changes_noth
 
 async def test_frames_of_one_read_are_passed_on_together_with_the_time(lab: Lab) -> None:
     await lab.streaming()
+    assert lab.status.byte_order == ""
     lab.connection.send_frames(1, 2, 3)
     assert lab.frames == [(1, now_s()), (2, now_s()), (3, now_s())]
-    assert lab.status.state is StreamState.STREAMING
-    assert lab.status.byte_order == "big"
+    assert (lab.status.state, lab.status.byte_order) == (StreamState.STREAMING, "big")
 
 
 async def test_the_control_of_a_recording_goes_out_at_once(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,14 +139,12 @@ async def test_the_control_of_a_recording_goes_out_at_once(lab: Lab, monkeypatch
     monkeypatch.setattr(lab.connection, "write", written.append)
     lab.session.control_recording(start=True)
     lab.session.control_recording(start=False)
-    start, stop = written
-    assert stop == STOP_RECORDING
-    assert start == STOP_RECORDING[:-24] + b"\0\0\0\1" + STOP_RECORDING[-20:]  # the event's id
+    event_id = b"\0\0\0\1"
+    assert written == [STOP_RECORDING[:-24] + event_id + STOP_RECORDING[-20:], STOP_RECORDING]
 
 
 async def test_a_stopped_stream_is_idle_once_the_server_has_answered(lab: Lab) -> None:
-    await lab.streaming()
-    lab.connection.send_frames(1)
+    await lab.streaming(1)
     lab.status.handshake_done(lab.session.protocol_state, lab.session.server, "StreamFrames")
     lab.server.answer = silent_to("StreamFrames Stop")
     stopping = asyncio.create_task(lab.session.ask(StopStreaming()))
@@ -163,8 +158,7 @@ async def test_a_stopped_stream_is_idle_once_the_server_has_answered(lab: Lab) -
 
 
 async def test_a_refused_stop_leaves_the_stream_streaming(lab: Lab) -> None:
-    await lab.streaming()
-    lab.connection.send_frames(1)
+    await lab.streaming(1)
     lab.server.answer = refusing("StreamFrames Stop")
     with pytest.raises(ServerError):
         await lab.session.ask(StopStreaming())
@@ -172,8 +166,7 @@ async def test_a_refused_stop_leaves_the_stream_streaming(lab: Lab) -> None:
 
 
 async def test_a_stop_without_an_answer_is_believed_until_the_next_frame(lab: Lab) -> None:
-    await lab.streaming()
-    lab.connection.send_frames(1)
+    await lab.streaming(1)
     lab.status.handshake_done(lab.session.protocol_state, lab.session.server, "StreamFrames")
     lab.server.answer = silent_to("StreamFrames Stop")
     with pytest.raises(ReplyTimeoutError):
@@ -187,61 +180,55 @@ async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     await lab.streaming()
-    good = markers_frame(2, (0.0, 0.0, 0.0))
     contradictory = bytearray(markers_frame(1, (0.0, 0.0, 0.0)))
     contradictory[32:36] = (9).to_bytes(4, "big")  # announces 9 markers
-    lab.connection.send(bytes(contradictory) + good)
-    assert [number for number, _ in lab.frames] == [2]
+    lab.connection.send(bytes(contradictory) + markers_frame(2, (0.0, 0.0, 0.0)))
+    assert lab.numbers == [2]
     assert amounts(lab.status.losses.report()) == {"frame rejected": (1, 1)}
     assert lab.status.last_error.startswith("frame rejected: ")
     assert any(record.levelname == "WARNING" for record in caplog.records)
 
 
-async def test_a_c3d_file_is_passed_on_in_pieces(lab: Lab) -> None:
+# --- C3D files
+
+
+async def test_a_c3d_file_is_passed_on_in_pieces_until_the_session_ends(lab: Lab) -> None:
     await lab.streaming()
     file = packet(5, b"content")
     lab.connection.send(file[:11])
     lab.connection.send(file[11:])
-    assert lab.files.pieces == [b"con", b"tent"]
-    assert lab.files.interruptions == []
-
-
-async def test_the_end_of_the_session_interrupts_a_file_and_later_pieces_are_ignored(lab: Lab) -> None:
-    await lab.streaming()
-    lab.connection.send(packet(5, b"content")[:-1])
+    assert (lab.files.pieces, lab.files.interruptions) == ([b"con", b"tent"], [])
+    lab.connection.send(file[:-1])
     closing = asyncio.create_task(lab.session.close())
     await settle()
     assert lab.files.interruptions == ["the connection to 192.0.2.20:3020 was closed by the gateway"]
     lab.connection.send(b"t" + packet(5, b"another"))
-    assert lab.files.pieces == [b"conten"]
+    assert lab.files.pieces[2:] == [b"conten"]
     await closing
 
 
+async def send_slowly(lab: Lab, pause_s: float) -> None:
+    file = packet(5, bytes(20))
+    lab.connection.send(file[:9])
+    for byte in file[9:]:
+        await asyncio.sleep(pause_s)
+        lab.connection.send(bytes([byte]))
+
+
 async def test_a_file_that_takes_long_is_no_silence(lab: Lab) -> None:
-    await lab.streaming()
-    lab.connection.send_frames(1)
-    file = packet(5, bytes(20))
-    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
-    lab.connection.send(file[:9])
-    for byte in file[9:]:
-        await asyncio.sleep(2.9)  # the server is silent after 3 s
-        lab.connection.send(bytes([byte]))
-    assert not monitoring.done()
-    with pytest.raises(SilenceError, match="no frame from"):
-        await monitoring
+    await lab.streaming(1)
+    async with lab.monitored() as monitoring:
+        await send_slowly(lab, 2.9)  # the server is silent after 3 s
+        assert not monitoring.done()
+        with pytest.raises(SilenceError, match="no frame from"):
+            await monitoring
 
 
-async def test_the_reply_to_a_command_may_be_behind_a_file(lab: Lab) -> None:
-    lab.server.answer = silent_to("Version")
-    await lab.session.connect()
-    asking = asyncio.create_task(lab.session.ask(Version()))
+async def test_the_reply_to_a_command_may_be_behind_a_file(silent: Lab) -> None:
+    asking = asyncio.create_task(silent.session.ask(Version()))
     await settle()
-    file = packet(5, bytes(20))
-    lab.connection.send(file[:9])
-    for byte in file[9:]:
-        await asyncio.sleep(1.9)  # the server does not answer after 2 s
-        lab.connection.send(bytes([byte]))
-    lab.connection.send(ok("OK-Version"))
+    await send_slowly(silent, 1.9)  # the server does not answer after 2 s
+    silent.connection.send(ok("OK-Version"))
     assert (await asking).body == b"OK-Version"
 
 
@@ -268,8 +255,104 @@ async def test_packets_above_the_configured_limits_end_the_session(packet_type: 
         await lab.session.monitor(lab.check_silence)
 
 
-async def test_the_byte_order_is_unknown_before_the_first_frame(lab: Lab) -> None:
+# --- the end
+
+
+@pytest.mark.parametrize(
+    ("by_gateway", "reason"),
+    [(False, "the connection to 192.0.2.20:3020 was closed by the server"), (True, "closed by the gateway")],
+)
+async def test_the_end_is_raised_by_every_waiting_call_at_once(
+    silent: Lab, *, by_gateway: bool, reason: str
+) -> None:
+    silent.server.closes_at_bye = False
+    tasks: list[asyncio.Task[Any]] = [
+        asyncio.create_task(silent.session.ask(Version())),
+        asyncio.create_task(silent.session.monitor(silent.check_silence)),
+    ]
+    await settle()
+    began_s = now_s()
+    if by_gateway:
+        tasks.append(asyncio.create_task(silent.session.close()))
+    else:
+        silent.connection.end()
+    await settle()
+    for task in tasks[:2]:
+        assert task.done()
+        assert reason in str(task.exception())
+    assert (now_s(), silent.session.is_open) == (began_s, False)
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_the_first_error_wins(lab: Lab) -> None:
     await lab.streaming()
-    assert lab.status.byte_order == ""
-    lab.connection.send_frames(1)
-    assert lab.status.byte_order == "big"
+    lab.connection.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+    await settle()  # the session has aborted the connection, which ended after that
+    lab.session.connection_lost(OSError("Connection reset by peer"))
+    for late_call in (lab.session.monitor(lab.check_silence), lab.session.ask(Version())):
+        with pytest.raises(ClosedError, match="this is not an RTC3D server"):
+            await late_call
+    with pytest.raises(ClosedError, match="this is not an RTC3D server"):
+        lab.session.control_recording(start=True)
+    assert not lab.connection.is_open
+
+
+async def test_a_broken_connection_names_its_reason(lab: Lab) -> None:
+    await lab.session.connect()
+    lab.connection.end(OSError("Connection reset by peer"))
+    with pytest.raises(ClosedError, match=r"192\.0\.2\.20:3020 broke: Connection reset by peer"):
+        await lab.session.monitor(lab.check_silence)
+
+
+async def test_closing_sends_bye_once_and_waits_for_the_server_to_close(lab: Lab) -> None:
+    await lab.session.close()  # before connecting, this does nothing
+    await lab.session.connect()
+    began_s = now_s()
+    for _ in range(2):
+        await lab.session.close()
+    assert (lab.commands, lab.connection.got_eof, now_s()) == (["Bye"], True, began_s)
+
+
+async def test_closing_waits_half_a_second_for_a_server_that_does_not_close(lab: Lab) -> None:
+    lab.server.closes_at_bye = False
+    await lab.streaming(1)
+    began_s = now_s()
+    closing = asyncio.create_task(lab.session.close())
+    await settle()
+    lab.connection.send_frames(2)  # was under way
+    await closing
+    assert now_s() - began_s == pytest.approx(0.5)
+    assert not lab.connection.is_open
+    assert lab.numbers == [1, 2]
+    assert lab.status.state is StreamState.STREAMING  # only the supervisor reports the end
+
+
+async def test_a_connection_that_is_lost_while_closing_does_not_change_the_reason(lab: Lab) -> None:
+    lab.server.closes_at_bye = False
+    await lab.streaming()
+    closing = asyncio.create_task(lab.session.close())
+    await settle()
+    began_s = now_s()
+    lab.connection.end(OSError("Connection reset by peer"))
+    await closing
+    assert now_s() == began_s  # it does not wait for the rest of the half second
+    with pytest.raises(ClosedError, match="closed by the gateway"):
+        await lab.session.ask(Version())
+
+
+async def test_closing_after_the_end_sends_no_bye(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.end()
+    await settle()
+    await lab.session.close()
+    assert "Bye" not in lab.commands
+
+
+async def test_a_connection_lost_before_connect_returns_ends_the_session(lab: Lab) -> None:
+    connecting = asyncio.create_task(lab.session.connect())
+    await asyncio.sleep(0)
+    lab.connection.end()
+    await connecting
+    await settle()
+    with pytest.raises(LinkError, match="was closed by the server"):
+        await lab.session.ask(Version())

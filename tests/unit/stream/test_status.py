@@ -1,16 +1,24 @@
+"""The status of a stream: its state, errors, limitations and counts, and the texts about them."""
+
 import logging
-import time
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import pytest
+import rtc3d
 
+from gateway.config.settings import SourceSettings
 from gateway.errors import ClosedError
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
+from gateway.monitoring.status_line import source_line
+from gateway.publish.status_messages import status_message
 from gateway.rtc3d.protocol_state import ProtocolState
-from gateway.stream.state import StreamState
+from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
+from gateway.stream.status_text import message_texts, source_text
 from tests.losses import amounts
-from tests.waiting import wait_until
 
 SERVER = "192.0.2.20:3020"
 
@@ -24,17 +32,11 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.message for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_an_error_is_kept_with_its_time() -> None:
+def test_the_beginning_of_an_error_is_kept_with_its_time() -> None:
     status = StreamStatus("3d")
     before = now_utime()
-    status.record_error("connection refused")
-    assert status.last_error == "connection refused"
-    assert before <= status.last_error_utime <= now_utime()
-
-
-def test_only_the_beginning_of_a_long_error_is_kept() -> None:
-    status = StreamStatus("3d")
     status.record_error("refused: " + 20_000_000 * "x")
+    assert before <= status.last_error_utime <= now_utime()
     assert status.last_error.startswith("refused: xxx")
     assert len(status.last_error) == MAX_ERROR_LENGTH
 
@@ -64,6 +66,8 @@ def test_a_change_of_state_is_logged_with_source_states_and_cause(caplog: pytest
         "lab (3d): closed by the server",
         "lab (3d): stalled → waiting to reconnect: the connection ended (closed by the server)",
     ]
+    assert [record.levelname for record in caplog.records[:2]] == ["DEBUG", "DEBUG"]
+    assert status.last_error == "closed by the server"
     assert len(states) == 8
     assert (states[-1], status.state) == (StreamState.STALLED, StreamState.WAITING)
 
@@ -82,16 +86,6 @@ def test_a_defect_in_what_shows_the_state_is_an_error_once(caplog: pytest.LogCap
     )
     assert error.levelname == "ERROR"
     assert error.exc_info is not None
-
-
-def test_attempts_to_connect_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    status = StreamStatus("3d", name="lab (3d)")
-    status.connecting(SERVER)
-    status.connected(SERVER)
-    status.disconnected(ClosedError("closed by the server"))
-    assert caplog.messages == ["lab (3d): closed by the server"]
-    assert status.last_error == "closed by the server"
 
 
 def test_a_frame_may_arrive_before_the_handshake_is_done() -> None:
@@ -138,18 +132,6 @@ def test_limitations_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
     status = StreamStatus("3d")
     limited(status, *(f"the server refused {number}" for number in range(100)))
     assert len(status.limitations) == len(warnings(caplog)) == MAX_LIMITATIONS
-
-
-def test_the_frame_rate_is_frames_divided_by_the_time_since_the_last_update() -> None:
-    before_s = time.monotonic()
-    rate = FrameRate()
-    created_s = time.monotonic()
-    wait_until(lambda: time.monotonic() > created_s)
-    asked_s = time.monotonic()
-    rate_hz = rate.update(100)
-    after_s = time.monotonic()
-    assert 100 / (after_s - before_s) <= rate_hz <= 100 / (asked_s - created_s)
-    assert rate.update(100) == 0.0
 
 
 @pytest.mark.interpreted
@@ -201,3 +183,100 @@ def test_repeated_events_are_added_up() -> None:
         status.reconnecting()
     assert (status.tries, status.session, status.restarts, status.reconnects) == (2, 2, 2, 2)
     assert (status.bytes_in, status.frames_in, status.last_frame_utime) == (700, 7, 4_000)
+
+
+# --- the rule for the state
+
+
+WITHOUT_CONNECTION = {
+    Phase.WAITING: StreamState.WAITING,
+    Phase.CONNECTING: StreamState.CONNECTING,
+    Phase.SILENT: StreamState.STALLED,
+}
+
+
+@pytest.mark.parametrize("protocol_state", ProtocolState)
+@pytest.mark.parametrize("phase", WITHOUT_CONNECTION)
+def test_without_a_usable_connection_the_phase_decides(phase: Phase, protocol_state: ProtocolState) -> None:
+    assert stream_state(phase, protocol_state) is WITHOUT_CONNECTION[phase]
+
+
+@pytest.mark.parametrize("phase", [Phase.HANDSHAKING, Phase.READY])
+def test_what_the_server_sends_decides_during_the_handshake_and_after_it(phase: Phase) -> None:
+    assert stream_state(phase, ProtocolState.STREAMING) is StreamState.STREAMING
+    assert stream_state(phase, ProtocolState.NO_MEASUREMENT) is StreamState.NO_MEASUREMENT
+
+
+@pytest.mark.parametrize(
+    "protocol_state",
+    [ProtocolState.IDLE, ProtocolState.REQUESTED, ProtocolState.CLOSING, ProtocolState.CLOSED],
+)
+def test_a_connection_on_which_nothing_arrives_is_idle_after_its_handshake(
+    protocol_state: ProtocolState,
+) -> None:
+    assert stream_state(Phase.HANDSHAKING, protocol_state) is StreamState.HANDSHAKING
+    assert stream_state(Phase.READY, protocol_state) is StreamState.IDLE
+
+
+def test_every_state_can_be_reached() -> None:
+    assert {stream_state(phase, state) for phase in Phase for state in ProtocolState} == set(StreamState)
+
+
+# --- the texts about a status_t
+
+
+LAB = SourceSettings(name="lab", host="192.0.2.9")
+Streams = Sequence[tuple[StreamStatus, float]]
+
+
+def message_of(streams: Streams) -> rtc3d.status_t:
+    server = f"{LAB.host}:{LAB.port}"
+    message = status_message(
+        source="lab",
+        server=server,
+        sequence=0,
+        streams=streams,
+        outputs=[],
+        stall_timeout_s=2.0,
+        frame=CoordinateFrame("lab"),
+    )
+    decoded: rtc3d.status_t = decode(message.encode())
+    return decoded
+
+
+@pytest.mark.parametrize("state", list(StreamState))
+@pytest.mark.parametrize("tries", [0, 1, 12])
+def test_a_status_message_has_the_words_of_the_status_line(state: StreamState, tries: int) -> None:
+    streams = [(StreamStatus("3d 6d", state=state, tries=tries), 199.96)]
+    assert source_line(LAB, streams) == f"lab: {source_text(message_texts(message_of(streams)))}"
+
+
+def test_different_streams_are_listed_by_components() -> None:
+    streams = [
+        (StreamStatus("3d", state=StreamState.STREAMING), 200.0),
+        (StreamStatus("analog", state=StreamState.STALLED), 0.0),
+    ]
+    text = source_text(message_texts(message_of(streams)))
+    assert text == "3d streaming 200.0 Hz, analog no frames from 192.0.2.9:3020"
+    assert source_line(LAB, streams) == f"lab: {text}"
+
+
+def test_frames_that_are_all_rejected_are_no_streaming() -> None:
+    rejected = StreamStatus("3d", state=StreamState.STREAMING)
+    rejected.frame_rejected("component 7 is too short", 1)
+    [(components, text)] = message_texts(message_of([(rejected, 200.0)]))
+    assert (components, text) == ("3d", "frames come, and all are rejected: component 7 is too short")
+
+
+def test_texts_of_a_hostile_message_are_escaped_and_cut() -> None:
+    message = message_of([(StreamStatus("3d"), 0.0)])
+    message.streams[0].state = "\x1b[2J" + "x" * 100_000
+    message.streams[0].components = "3d\n6d"
+    [(components, text)] = message_texts(message)
+    assert components.isprintable()
+    assert text.isprintable()
+    assert len(text) < 2000
+
+
+def test_a_status_without_streams_has_no_text() -> None:
+    assert source_text(message_texts(message_of([]))) == ""

@@ -6,10 +6,11 @@ import pytest
 
 from gateway.errors import ClosedError, LinkError, PacketError
 from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.stream.state import StreamState
 from tests.losses import amounts
 from tests.servers import error, markers_frame, packet
-from tests.unit.stream import session_lab, test_stream_control
 from tests.unit.stream.scripted_server import obliging, refusing
+from tests.unit.stream.session_lab import Lab
 from tests.virtual_time import settle
 
 SERVER = "192.0.2.20:3020"
@@ -29,18 +30,17 @@ def logged(caplog: pytest.LogCaptureFixture, module: str) -> list[str]:
     ]
 
 
-async def session_with_frames() -> session_lab.Lab:
-    lab = session_lab.Lab()
-    await lab.streaming()
-    lab.connection.send_frames(1)
+async def session_with_frames() -> Lab:
+    lab = Lab()
+    await lab.streaming(1)
     return lab
 
 
 async def test_each_state_from_connecting_to_streaming(caplog: pytest.LogCaptureFixture) -> None:
-    lab = test_stream_control.Lab()
+    lab = Lab()
     await lab.start()
-    lab.server.connection.send_frames(1)
-    lab.server.connection.send(packet(4))
+    lab.connection.send_frames(1)
+    lab.connection.send(packet(4))
     await lab.control.stop()
     assert logged(caplog, "status") == [
         f"DEBUG lab (3d): waiting to reconnect → connecting: connecting ({SERVER})",
@@ -70,7 +70,7 @@ async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged_with_t
 
 
 async def test_frames_in_another_byte_order_are_a_limitation() -> None:
-    lab = session_lab.Lab()
+    lab = Lab()
     await lab.streaming()
     lab.connection.send(markers_frame(1, (0.0, 0.0, 0.0), order="<"))
     assert lab.status.byte_order == "little"
@@ -113,9 +113,7 @@ async def test_repairs_of_the_parameters_are_logged_once(caplog: pytest.LogCaptu
     cells = "<The_3D><Frequency>fast</Frequency></The_3D>" * 2 + "<The_6D><Frequency>x</Frequency></The_6D>"
     xml = f"<RT_Parameters>{cells}<The_3D><Unit>m</The_3D></RT_Parameters>"
     repairs = parse_parameters(xml.encode()).recovered
-    lab = test_stream_control.Lab(
-        lambda command: packet(2, xml) if command == "SendParameters" else obliging(command)
-    )
+    lab = Lab(lambda command: packet(2, xml) if command == "SendParameters" else obliging(command))
     await lab.start()
     assert len(repairs) > 3
     texts = "; ".join(repairs[:3])
@@ -125,11 +123,10 @@ async def test_repairs_of_the_parameters_are_logged_once(caplog: pytest.LogCaptu
     assert [line for line in logged(caplog, "status") if "repaired" in line] == [expected]
 
 
-async def test_a_server_that_refuses_every_form_is_named_with_what_to_check() -> None:
-    lab = test_stream_control.Lab(refusing("StreamFrames"))
+async def test_a_server_that_refuses_every_form_ends_the_handshake_with_what_to_check() -> None:
+    lab = Lab(refusing("StreamFrames"))
     with pytest.raises(LinkError) as caught:
         await lab.start()
-    assert str(caught.value) == (
-        f"{SERVER} refuses StreamFrames in every form that the protocol has; "
-        "check its real-time output settings"
-    )
+    text = "refuses StreamFrames in every form that the protocol has; check its real-time output settings"
+    assert str(caught.value) == f"{SERVER} {text}"
+    assert (lab.status.state, lab.status.tries) == (StreamState.HANDSHAKING, 1)

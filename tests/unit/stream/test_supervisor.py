@@ -22,8 +22,8 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor
 from tests.servers import packet
-from tests.unit.stream.collected_files import CollectedFiles
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
+from tests.unit.stream.session_lab import CollectedFiles
 from tests.virtual_time import STEP_S, read_clocks, settle, until
 
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 10.0
@@ -202,9 +202,7 @@ async def test_recovery_is_logged_once_with_its_duration_when_it_has_held(
     assert recovered == "lab (3d): streaming again, after 5.0 s and 3 failures"
 
 
-async def test_a_server_that_breaks_again_and_again_is_logged_once(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_a_server_that_breaks_again_and_again_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.stream")
     lab = Lab()
     async with running(lab):

@@ -14,7 +14,9 @@ from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
 from gateway.stream.tcp import open_connection, set_socket_options
 from tests.networks import free_port
-from tests.unit.stream.resolver import Resolver
+from tests.unit.stream.conftest import Resolver
+
+CHECK_DNS = "check the name server (DNS), or use an IP address in sources.host"
 
 
 @contextmanager
@@ -65,27 +67,27 @@ def test_the_error_of_a_port_without_a_server() -> None:
     )
 
 
-def test_the_error_of_an_unknown_host_name(resolver: Resolver) -> None:
-    resolver.error = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-    assert error_of(source(host="labb", port=3020)) == (
-        "host name 'labb' is not known (Name or service not known); check sources.host and DNS"
-    )
-
-
-def test_the_error_of_a_name_server_that_does_not_answer(resolver: Resolver) -> None:
-    resolver.answers.clear()
-    assert error_of(source(host="dead-pc", port=3020, connect_timeout_s=0.1)) == (
-        "host name 'dead-pc' was not resolved within 0.1 s; "
-        "check the name server (DNS), or use an IP address in sources.host"
-    )
-
-
-def test_the_error_of_a_resolver_that_fails(resolver: Resolver) -> None:
-    resolver.error = OSError(errno.EMFILE, "Too many open files")
-    assert error_of(source(host="lab-pc", port=3020)) == (
-        "host name 'lab-pc' cannot be resolved: Too many open files; "
-        "check the name server (DNS), or use an IP address in sources.host"
-    )
+@pytest.mark.parametrize(
+    ("raised", "text"),
+    [
+        (
+            socket.gaierror(socket.EAI_NONAME, "Name or service not known"),
+            "is not known (Name or service not known); check sources.host and DNS",
+        ),
+        (
+            OSError(errno.EMFILE, "Too many open files"),
+            f"cannot be resolved: Too many open files; {CHECK_DNS}",
+        ),
+        (None, f"was not resolved within 0.1 s; {CHECK_DNS}"),
+    ],
+)
+def test_the_error_of_a_name_that_cannot_be_resolved(
+    resolver: Resolver, raised: OSError | None, text: str
+) -> None:
+    resolver.error = raised
+    if raised is None:
+        resolver.answers.clear()
+    assert error_of(source(host="labb", port=3020, connect_timeout_s=0.1)) == f"host name 'labb' {text}"
 
 
 @pytest.mark.netns
@@ -111,31 +113,25 @@ def test_a_number_is_not_looked_up(host: str, resolver: Resolver) -> None:
     assert resolver.names == []
 
 
-def test_the_addresses_of_a_name_are_tried_in_turn(resolver: Resolver) -> None:
-    async def connect(port: int) -> str:
-        settings = source(host="lab-pc", port=port, connect_timeout_s=20)
-        transport = await open_connection(settings, asyncio.Protocol())
-        address: str = transport.get_extra_info("peername")[0]
-        transport.close()
-        return address
+async def connected_address(port: int, timeout_s: float) -> str:
+    settings = source(host="lab-pc", port=port, connect_timeout_s=timeout_s)
+    transport = await open_connection(settings, asyncio.Protocol())
+    address: str = transport.get_extra_info("peername")[0]
+    transport.close()
+    return address
 
+
+def test_the_addresses_of_a_name_are_tried_in_turn(resolver: Resolver) -> None:
     resolver.addresses = ["127.0.0.2", "127.0.0.3", "127.0.0.4"]
     with socket.create_server(("127.0.0.3", 0)) as server:
-        assert uvloop.run(connect(server.getsockname()[1])) == "127.0.0.3"
+        assert uvloop.run(connected_address(server.getsockname()[1], 20)) == "127.0.0.3"
     assert resolver.names == ["lab-pc"]
 
 
 def test_an_address_that_does_not_answer_leaves_time_for_the_next(resolver: Resolver) -> None:
-    async def connect(port: int) -> str:
-        settings = source(host="lab-pc", port=port, connect_timeout_s=0.4)
-        transport = await open_connection(settings, asyncio.Protocol())
-        address: str = transport.get_extra_info("peername")[0]
-        transport.close()
-        return address
-
     resolver.addresses = ["127.0.0.1", "127.0.0.3"]
     with full_server() as port, socket.create_server(("127.0.0.3", port)):
-        assert uvloop.run(connect(port)) == "127.0.0.3"
+        assert uvloop.run(connected_address(port, 0.4)) == "127.0.0.3"
 
 
 def test_the_kernel_holds_seconds_of_frames_while_the_process_stands_still() -> None:

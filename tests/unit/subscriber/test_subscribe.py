@@ -1,23 +1,12 @@
-"""What is said if nothing arrives from gateways."""
+"""When gateways are queried about their sources, and what is said if nothing arrives from them."""
+
+from unittest.mock import Mock
 
 import pytest
 
 from gateway.live.live_data import LiveData
+from gateway.subscriber.series import Source
 from gateway.subscriber.subscribe import silence_text
-
-
-class Subscriber:
-    """A subscriber that has found no gateway, for this reason, or one that does not send."""
-
-    def __init__(self, reason: str) -> None:
-        self.reason = reason
-
-    def tick(self) -> None: ...
-
-    def silence(self) -> str:
-        return self.reason
-
-    def close(self) -> None: ...
 
 
 @pytest.mark.parametrize(
@@ -32,4 +21,18 @@ def test_silence_has_a_reason_also_if_a_gateway_is_found(reason: str, sources: l
     live = LiveData()
     for source in sources:
         live.source(source, source.upper(), is_known=True)
-    assert silence_text(Subscriber(reason), live) == text
+    assert silence_text(Mock(silence=lambda: reason), live) == text
+
+
+def test_queries_without_a_reply_become_rarer(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 1000.0
+    monkeypatch.setattr("gateway.subscriber.series.time.monotonic", lambda: now_s)
+    source = Source("lab", "MOCAP_LAB")
+    due_s = []
+    for tick in range(36_000):  # an hour
+        now_s = 1000.0 + tick / 10
+        if source.begin_query():
+            due_s.append(tick / 10)
+    assert sum(time_s < 1 for time_s in due_s) >= 3
+    assert 360 < len(due_s) < 450
+    assert due_s[-1] > 3580

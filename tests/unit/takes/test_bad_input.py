@@ -15,6 +15,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.takes import open_take
 from gateway.takes.reader import TakeReader
 from gateway.takes.statistics import take_statistics
+from gateway.takes.take import Take
 from tests.takes import description, log_bytes, markers, parameters, write_take
 
 READERS: list[Callable[[Path], Any]] = [
@@ -24,39 +25,9 @@ READERS: list[Callable[[Path], Any]] = [
 ]
 
 
-def png(path: Path) -> None:
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + random.Random(1).randbytes(100_000))
-
-
-def text(path: Path) -> None:
-    path.write_text("time,x,y\n" * 10_000)
-
-
-def c3d(path: Path) -> None:
-    path.write_bytes(b"\x02\x50" + bytes(510) + random.Random(2).randbytes(51_200))
-
-
-def sync_words(path: Path) -> None:
-    path.write_bytes(bytes.fromhex("eda1da01") * 10_000)
-
-
 def huge_hole(path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(100 * 1024**3)
-
-
-def huge_claims(path: Path) -> None:
-    # Each header claims a message of 200 MB that is not there.
-    claim = bytes.fromhex("eda1da01") + bytes(16) + (4).to_bytes(4, "big") + (200_000_000).to_bytes(4, "big")
-    path.write_bytes((claim + b"NAME" + bytes(2000)) * 500)
-
-
-def empty(path: Path) -> None:
-    path.touch()
-
-
-def folder(path: Path) -> None:
-    path.mkdir()
 
 
 def folder_of_others(path: Path) -> None:
@@ -65,60 +36,46 @@ def folder_of_others(path: Path) -> None:
     (path / "a.lcmlog").touch()
 
 
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
+HUGE_CLAIM = bytes.fromhex("eda1da01") + bytes(16) + (4).to_bytes(4, "big") + (200_000_000).to_bytes(4, "big")
+"""The header of an event with a message of 200 MB that is not there."""
 
+OTHER_LOG = log_bytes((f"CAMERA_{number % 9}", bytes(50)) for number in range(100))
+CHANNELS = "CAMERA_0, CAMERA_1, CAMERA_2, CAMERA_3, CAMERA_4, …"
 
-def device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def symlink_loop(path: Path) -> None:
-    path.symlink_to(path)
-
-
-def nothing(path: Path) -> None:
-    pass
-
-
-def other_log(path: Path) -> None:
-    write_take(path, [(f"CAMERA_{number % 9}", bytes(50)) for number in range(100)])
-
-
-def other_version(path: Path) -> None:
-    write_take(path, [("MOCAP_LAB_3D", bytes(56))])
-
-
-MAKERS = [
-    (png, "without an LCM event; choose a recording"),
-    (text, "without an LCM event"),
-    (c3d, "without an LCM event"),
-    (sync_words, "without an LCM event"),
-    (huge_hole, "without an LCM event"),
-    (huge_claims, "without an LCM event"),
-    (empty, "is empty"),
-    (folder, "has no recordings"),
-    (folder_of_others, "is empty"),
-    (pipe, "it is a pipe"),
-    (device, "it is a device"),
-    (symlink_loop, "Too many levels of symbolic links"),
-    (nothing, "No such file"),
-    (
-        other_log,
-        "100 messages of other types, on channel CAMERA_0, CAMERA_1, CAMERA_2, CAMERA_3, CAMERA_4, …$",
+NO_TAKES: dict[str, tuple[bytes | Callable[[Path], object], str]] = {
+    "png": (
+        b"\x89PNG\r\n\x1a\n" + random.Random(1).randbytes(100_000),
+        "without an LCM event; choose a recording",
     ),
-    (other_version, "on channel MOCAP_LAB_3D; they may be of another version of the gateway"),
-]
+    "text": (b"time,x,y\n" * 10_000, "without an LCM event"),
+    "c3d": (b"\x02\x50" + bytes(510) + random.Random(2).randbytes(51_200), "without an LCM event"),
+    "sync words": (bytes.fromhex("eda1da01") * 10_000, "without an LCM event"),
+    "huge hole": (huge_hole, "without an LCM event"),
+    "huge claims": ((HUGE_CLAIM + b"NAME" + bytes(2000)) * 500, "without an LCM event"),
+    "empty": (b"", "is empty"),
+    "folder": (Path.mkdir, "has no recordings"),
+    "folder of others": (folder_of_others, "is empty"),
+    "pipe": (os.mkfifo, "it is a pipe"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "it is a device"),
+    "loop": (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
+    "nothing": (lambda _path: None, "No such file"),
+    "other log": (OTHER_LOG, f"100 messages of other types, on channel {CHANNELS}$"),
+    "other version": (
+        log_bytes([("MOCAP_LAB_3D", bytes(56))]),
+        "on channel MOCAP_LAB_3D; they may be of another version of the gateway",
+    ),
+}
 
 
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("read", READERS, ids=["open_take", "take_statistics", "messages"])
-@pytest.mark.parametrize(("make", "message"), MAKERS, ids=[make.__name__ for make, _ in MAKERS])
-def test_what_is_no_take_is_a_clear_error(
-    tmp_path: Path, make: Callable[[Path], None], message: str, read: Callable[[Path], Any]
-) -> None:
-    path = tmp_path / "take"
-    make(path)
+@pytest.mark.parametrize("kind", NO_TAKES)
+def test_what_is_no_take_is_a_clear_error(tmp_path: Path, kind: str, read: Callable[[Path], Any]) -> None:
+    path, (content, message) = tmp_path / "take", NO_TAKES[kind]
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        content(path)
     with pytest.raises(TakeError, match=message) as raised:
         read(path)
     assert str(path) in str(raised.value)
@@ -131,15 +88,19 @@ def test_odd_paths(tmp_path: Path, name: str) -> None:
         open_take(tmp_path / name)
 
 
+def sequence(take: Take) -> list[int]:
+    """Return the sequence numbers of the markers."""
+    found = take.sources["lab"].markers
+    assert found
+    return [*map(int, found.sequence)]
+
+
 def test_a_folder_is_read_without_its_empty_files(tmp_path: Path) -> None:
     write_take(tmp_path / "a-001.lcmlog", [markers(1, 0)])
     (tmp_path / "a-002.lcmlog").touch()
     write_take(tmp_path / "a-003.lcmlog", [markers(1, 1)])
-    take = open_take(tmp_path)
-    assert take.sources["lab"].markers
-    assert take.sources["lab"].markers.sequence.tolist() == [0, 1]
-    assert take.num_damaged == 1
-    statistics = take_statistics(tmp_path)
+    take, statistics = open_take(tmp_path), take_statistics(tmp_path)
+    assert (sequence(take), take.num_damaged) == ([0, 1], 1)
     assert list(statistics.empty_files) == [tmp_path / "a-002.lcmlog"]
     assert not statistics.is_complete
 
@@ -147,9 +108,7 @@ def test_a_folder_is_read_without_its_empty_files(tmp_path: Path) -> None:
 def test_rotated_files_of_lcm_logger_are_read_in_the_order_of_their_times(tmp_path: Path) -> None:
     for number in range(3):  # with --rotate, the newest file is .0
         write_take(tmp_path / f"log.{2 - number}", [markers(1, number)])
-    source = open_take(tmp_path).sources["lab"]
-    assert source.markers
-    assert source.markers.sequence.tolist() == [0, 1, 2]
+    assert sequence(open_take(tmp_path)) == [0, 1, 2]
 
 
 def test_a_log_that_grows_while_it_is_read_gives_what_was_complete(tmp_path: Path) -> None:

@@ -90,7 +90,7 @@ def test_the_thread_writes_what_waits_and_ends() -> None:
 
 
 @pytest.mark.parametrize("written", [*range(0, 3 * 156, 31), 156, 312, 311, 313])
-def test_a_disk_that_fills_up_leaves_complete_events_only(
+def test_a_full_disk_has_complete_events_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
     """The next event follows a complete one, or a reader would find damage, and no event is written twice."""

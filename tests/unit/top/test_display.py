@@ -1,11 +1,90 @@
+"""The screen of ``top``: its tables, and its keys."""
+
 import pytest
 from rich.cells import cell_len
 
-from gateway.terminal.screen import Line
+from gateway.terminal.screen import Line, Style
 from gateway.top.display import Display
 from gateway.top.pages import PAGES
+from gateway.top.table import (
+    Column,
+    Order,
+    Section,
+    Table,
+    filtered,
+    laid_out,
+    number_cell,
+    sorted_by,
+    text_cell,
+    wrapped,
+)
 from tests.statuses import stream
 from tests.unit.top.live_lab import LiveLab
+
+COLUMNS = (Column("marker"), Column("%", is_number=True), Column("unit", rank=1))
+
+
+def table(*rows: tuple[str, float | None]) -> Table:
+    cells = [(text_cell(name), number_cell(value, 1), text_cell("mm")) for name, value in rows]
+    return Table(COLUMNS, [Section(cells, [("lab: streaming", Style.GOOD)])], "nothing")
+
+
+def texts(lines: list[Line]) -> list[str]:
+    return ["".join(text for text, _ in line) for line in lines]
+
+
+def names(found: Table) -> list[str]:
+    return [row[0].text for section in found.sections for row in section.rows]
+
+
+def test_numbers_are_on_the_right_and_texts_on_the_left() -> None:
+    lines = laid_out(table(("LASI", 9), ("marker 2", 100.25), ("漢字", 1)), 80)
+    assert texts([lines.titles]) == ["marker        %  unit"]
+    rows = ["LASI        9.0  mm  ", "marker 2  100.2  mm  ", "漢字        1.0  mm  "]
+    assert texts(lines.body) == ["lab: streaming", *rows]
+
+
+def test_columns_of_a_higher_rank_are_left_out_first_and_then_texts_are_cut() -> None:
+    shown = table(("a very long label", 9))
+    assert texts(laid_out(table(("a very long label " * 9, 9)), 31).body[-1:]) == [
+        "a very long label a…  9.0  mm  "
+    ]
+    rows = {22: "a very long label  9.0", 20: "a very long la…  9.0", 5: "a ver…  9.0"}
+    assert {width: texts(laid_out(shown, width).body)[-1] for width in rows} == rows
+
+
+def test_sorting_by_numbers_and_by_names_with_numbers() -> None:
+    shown = table(("marker 10", 5), ("marker 2", 70), ("Marker 1", None))
+    assert names(sorted_by(shown, None)) == ["marker 10", "marker 2", "Marker 1"]
+    assert names(sorted_by(shown, Order("marker"))) == ["Marker 1", "marker 2", "marker 10"]
+    assert names(sorted_by(shown, Order("%"))) == ["marker 10", "marker 2", "Marker 1"]
+    assert names(sorted_by(shown, Order("%", is_reversed=True))) == ["marker 2", "marker 10", "Marker 1"]
+    assert names(sorted_by(shown, Order("no such column"))) == names(shown)
+
+
+def test_any_name_can_be_sorted() -> None:
+    odd = [(name, 1.0) for name in ("9" * 400, "", "²", "a1b", "1a", "٣")]
+    assert len(names(sorted_by(table(*odd, ("a1", 2)), Order("marker")))) == 7
+
+
+def test_the_filter_finds_cells_and_headings_in_any_case() -> None:
+    shown = table(("LASI", 9), ("RASI", 10))
+    assert names(filtered(shown, "lasi")) == ["LASI"]
+    assert names(filtered(shown, "STREAM")) == ["LASI", "RASI"]
+    nothing = laid_out(filtered(shown, "x y"), 80)
+    assert texts(nothing.body) == ["nothing here contains 'x y'"]
+
+
+def test_sentences_are_wrapped() -> None:
+    assert wrapped("lab: waiting for the server", 12) == ["lab: waiting", "for the", "server"]
+    assert wrapped("abcdefgh", 3) == ["abc", "def", "gh"]
+    assert wrapped("漢字漢字", 4) == ["漢字", "漢字"]
+    assert wrapped("", 4) == []
+
+
+def test_odd_numbers_do_not_break_the_table() -> None:
+    numbers = (None, float("nan"), 1e15, float("inf"), -2.25)
+    assert [number_cell(value, 1).text for value in numbers] == ["", "", "1e+15", "", "-2.2"]
 
 
 class Shown:

@@ -1,8 +1,11 @@
 """A source with live data for tests of what is said about it."""
 
+import re
+import time
 from collections.abc import Sequence
 from typing import Any
 
+import pytest
 import rtc3d
 
 from gateway.live.live_data import LiveData, LiveSource
@@ -54,3 +57,14 @@ class Lab:
         status.streams, status.num_streams = list(streams), len(streams)
         status.num_outputs = len(status.outputs)
         self.live.publish(self.name, "status", status.encode())
+
+
+def text_of(html: str) -> str:
+    """Return the text of a page, with | between cells and lines."""
+    return re.sub(r"\s*(<[^>]*>\s*)+", "|", html)
+
+
+def wait(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """Let the monotonic clock stand still at a time that is so much later."""
+    now_s = time.monotonic() + seconds
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)

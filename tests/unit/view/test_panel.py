@@ -1,7 +1,7 @@
 """The panel of a real viser server, without a browser."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -11,8 +11,9 @@ from gateway.rtc3d.components import ComponentType
 from gateway.view import panel as view_panel
 from gateway.view.panel import Panel
 from gateway.view.plots import MAX_PLOTS
-from tests.unit.view.live_lab import Lab
-from tests.unit.view.test_state_text import wait
+from tests.unit.view.live_lab import Lab, wait
+
+Show = Callable[[], None]
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +23,9 @@ def server() -> Iterator[viser.ViserServer]:
     server.stop()
 
 
-@pytest.fixture
-def is_watched(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _is_watched(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "get_clients", lambda: {1: None})
-
-
-@pytest.fixture
-def lab() -> Lab:
-    return Lab()
 
 
 @pytest.fixture
@@ -37,30 +33,36 @@ def panel(server: viser.ViserServer, lab: Lab) -> Panel:
     return Panel(server, server.gui.add_tab_group(), lab.live)
 
 
-def show(panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Show everything that is due within a second."""
-    wait(monkeypatch, 1)
-    panel.update(lab.live.update())
+@pytest.fixture
+def show(panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Show:
+    """Return a function that shows everything that is due within a second."""
+
+    def show() -> None:
+        wait(monkeypatch, 1)
+        panel.update(lab.live.update())
+
+    return show
 
 
-def test_nothing_is_built_while_nobody_looks(panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_built_while_nobody_looks(
+    panel: Panel, lab: Lab, show: Show, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "get_clients", dict)
     lab.send_markers(True)
-    show(panel, lab, monkeypatch)
+    show()
     assert panel._banner.content == panel._sources.content == panel._items.content == ""
 
 
-@pytest.mark.usefixtures("is_watched")
-def test_all_tabs_are_filled(panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_tabs_are_filled(panel: Panel, lab: Lab, show: Show) -> None:
     lab.send_markers(True)
     lab.send(ComponentType.EVENT, [(7, 0, 1, 2, 3)])
-    show(panel, lab, monkeypatch)
+    show()
     assert "live" in panel._banner.content
     assert "captured → gateway" in panel._sources.content
     assert "1 marker" in panel._items.content
     assert "event 7" in panel._events.content
 
 
-@pytest.mark.usefixtures("is_watched")
 def test_a_stop_is_said_at_once_and_texts_change_rarely(
     panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -90,58 +92,51 @@ def test_a_stop_is_said_at_once_and_texts_change_rarely(
     assert built["banner_html"] == before + 1
 
 
-@pytest.mark.usefixtures("is_watched")
-def test_a_spike_is_in_the_plot_of_its_channel(
-    panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_spike_is_in_the_plot_of_its_channel(panel: Panel, lab: Lab, show: Show) -> None:
     lab.send(ComponentType.ANALOG, [0.0, 1.0])
-    show(panel, lab, monkeypatch)
+    show()
     plots = panel._plots
     assert "lab analog 2: channel 2 (mV)" in plots._add.options
     plots._add.value = "lab analog 2: channel 2 (mV)"  # type: ignore[misc]
-    show(panel, lab, monkeypatch)
+    show()
     assert plots._add.value not in plots._plots
     for value in (0, 0, 99, 0, -50, 0):
         lab.send(ComponentType.ANALOG, [0.0, value])
-    show(panel, lab, monkeypatch)
+    show()
     _, lowest, highest = plots._plots["lab analog 2: channel 2 (mV)"].handle.data
     assert np.nanmin(lowest) == -50
     assert np.nanmax(highest) == 99
 
 
-@pytest.mark.usefixtures("is_watched")
-def test_plots_are_limited_renamed_and_removed(
-    panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plots_are_limited_renamed_and_removed(panel: Panel, lab: Lab, show: Show) -> None:
     lab.send(ComponentType.ANALOG, range(20))
-    show(panel, lab, monkeypatch)
+    show()
     plots = panel._plots
     offered = plots._add.options[1:]
     for text in offered[: MAX_PLOTS + 1]:
         plots._add.value = text  # type: ignore[misc]
-        show(panel, lab, monkeypatch)
+        show()
     assert tuple(plots._plots) == offered[:MAX_PLOTS]
     lab.send_parameters("<Analog><Channels>1</Channels><Channel><Label>EMG</Label></Channel></Analog>")
-    show(panel, lab, monkeypatch)
+    show()
     assert plots._plots["lab analog 1: EMG (mV)"].handle.title == "lab analog 1: EMG (mV)"
     plots._remove.value = "lab analog 1: EMG (mV)"  # type: ignore[misc]
-    show(panel, lab, monkeypatch)
+    show()
     assert tuple(plots._plots) == offered[1:MAX_PLOTS]
     assert not set(plots._add.options) & set(plots._plots)
     plots._remove.value = "all"  # type: ignore[misc]
-    show(panel, lab, monkeypatch)
+    show()
     assert not plots._plots
     assert not plots._remove.visible
 
 
-@pytest.mark.usefixtures("is_watched")
 def test_a_plot_scrolls_on_when_data_have_stopped(
-    panel: Panel, lab: Lab, monkeypatch: pytest.MonkeyPatch
+    panel: Panel, lab: Lab, show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.send(ComponentType.ANALOG, [5.0])
-    show(panel, lab, monkeypatch)
+    show()
     panel._plots._add.value = "lab analog 1: channel 1 (mV)"  # type: ignore[misc]
-    show(panel, lab, monkeypatch)
+    show()
     for _ in range(100):
         lab.send(ComponentType.ANALOG, [5.0])
     panel.update(lab.live.update())

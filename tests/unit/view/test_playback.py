@@ -1,14 +1,16 @@
-"""Playing a take in a real viser server; the user's actions come as viser reports them."""
+"""Playing a take, and labels, in a real viser server; actions come as viser reports them."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import viser
 
 from gateway.errors import TakeError
 from gateway.live.live_data import LiveData
+from gateway.view.labels import Labels
 from gateway.view.playback import Playback
 from tests.takes import description, markers, parameters, write_take
 from tests.waiting import wait_until
@@ -108,3 +110,18 @@ def test_a_take_with_a_damaged_end_has_a_length(tmp_path: Path) -> None:
 def test_no_take_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(TakeError):
         Playback(tmp_path / "missing.lcmlog", (), LiveData())
+
+
+def test_labels_from_the_network_are_one_line_of_limited_length() -> None:
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        labels = Labels(server.scene, "/labels")
+        positions = np.zeros((2, 3), np.float32)
+        labels.update(positions, ["", ""], now_s=0.0)
+        labels.update(positions, ["a\n\u202eb", "L" * 500], now_s=1.0)
+        assert [node.text for node in labels._nodes] == [r"a\n\u202eb", "L" * 99 + "…"]
+        more = np.zeros((3, 3), np.float32)
+        labels.update(more, ["a", "b", "c\td"], now_s=2.0)
+        assert [node.text for node in labels._nodes] == ["a", "b", r"c\td"]
+    finally:
+        server.stop()

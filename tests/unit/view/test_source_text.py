@@ -1,56 +1,44 @@
-"""What the panel says about a source."""
+"""What the panel says about sources: whether the picture is live, their state and their losses."""
 
 import re
+import time
+from typing import Any
 
 import pytest
 import rtc3d
 
 from gateway.live.component import LiveComponent
 from gateway.live.latency import Percentiles
+from gateway.live.live_data import LiveSource
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
+from gateway.stream.status_text import Level
+from gateway.view.banner import MAX_SOURCES, banner_html
 from gateway.view.source_text import ignored_html, source_html
+from gateway.view.state_text import State, data_state, gateway_states, states_html
+from gateway.view.texts import clock_text
 from tests.statuses import loss, output, stream
-from tests.unit.view.live_lab import Lab
+from tests.unit.view.live_lab import Lab, text_of, wait
 
 HOSTILE = "<img src=x onerror=alert(1)>"
-
-
-def text_of(html: str) -> str:
-    """Return the text of a page, with | between cells and lines."""
-    return re.sub(r"\s*(<[^>]*>\s*)+", "|", html)
 
 
 def shown_text(lab: Lab, *, is_take: bool = False) -> str:
     return text_of(source_html(lab.source, {"3d": Percentiles(16, 33)}, is_take=is_take))
 
 
-@pytest.fixture
-def lab() -> Lab:
-    return Lab()
-
-
-def test_state_server_and_gateway(lab: Lab) -> None:
+def test_state_server_rates_and_latency_by_stage(lab: Lab) -> None:
     lab.send_status(stream())
-    text = shown_text(lab)
-    assert "|lab|streaming 200.0 Hz|server 192.0.2.9:3020 · gateway 1.2.3 on gatewaypc|" in text
-
-
-def test_rates_and_announced_rates(lab: Lab) -> None:
     lab.send_parameters("<The_3D><Markers>2</Markers><Frequency>200</Frequency></The_3D>")
     lab.send_markers(True, True)
-    assert "|3d|2|0.0|of 200.0|1|0|" in shown_text(lab)
+    text = shown_text(lab)
+    assert "|lab|streaming 200.0 Hz|server 192.0.2.9:3020 · gateway 1.2.3 on gatewaypc|" in text
+    assert "|3d|2|0.0|of 200.0|1|0|" in text
+    assert re.search(r"captured → gateway.*3d\|2.00 / 2.00\|\d[^|]* / \d[^|]*\|16.0 / 33.0\|", text)
+    assert "nothing lost, dropped or skipped" in text
+    assert "clock" not in text
     assert "<span class=waiting>0.0</span>" in source_html(lab.source, {}, is_take=False)
     assert "waiting" not in source_html(lab.source, {}, is_take=True)
-
-
-def test_latency_by_stage(lab: Lab) -> None:
-    lab.send_markers(True)
-    cells = re.search(r"3d\|([^|]*)\|([^|]*)\|([^|]*)\|", shown_text(lab).split("captured → gateway")[1])
-    assert cells is not None
-    assert cells[1] == "2.00 / 2.00"
-    assert re.fullmatch(r"\d.* / \d.*", cells[2])
-    assert cells[3] == "16.0 / 33.0"
 
 
 def test_a_take_has_no_latency_to_here(lab: Lab) -> None:
@@ -73,17 +61,6 @@ def test_clocks_of_two_computers_that_differ(lab: Lab, delay_us: int, sentence: 
     assert sentence in shown_text(lab)
 
 
-def test_clocks_that_agree_are_not_mentioned(lab: Lab) -> None:
-    lab.send_markers(True)
-    assert "clock" not in shown_text(lab)
-
-
-def test_nothing_lost(lab: Lab) -> None:
-    lab.send_markers(True)
-    lab.send_status(stream())
-    assert "nothing lost, dropped or skipped" in shown_text(lab)
-
-
 def test_messages_that_are_lost_on_the_way(lab: Lab) -> None:
     for sequence in (0, 5, 6, 8, 0):
         lab.send(ComponentType.MARKERS, [(1, 2, 3, 4)], sequence=sequence)
@@ -94,49 +71,25 @@ def test_messages_that_are_lost_on_the_way(lab: Lab) -> None:
 
 
 def test_drops_by_cause_of_streams_and_outputs(lab: Lab) -> None:
-    lab.send_status(
-        stream("3d 6d", drops=[loss("skipped while behind", 12, 6)]),
-        outputs=[
-            output("zenoh", drops=[loss("queue full", 3, 3), loss("closed", 1, 0)]),
-            output("lcm", connected=False, problem="no route to 239.255.76.67"),
-        ],
-    )
+    zenoh = output("zenoh", drops=[loss("queue full", 3, 3), loss("closed", 1, 0)])
+    lcm = output("lcm", connected=False, problem="no route to 239.255.76.67")
+    limited = stream("3d", limitations=["the server refused ByteOrder"], last_error="connection refused")
+    limited.last_error_utime = 1_700_000_000_000_000
+    skipped = stream("3d 6d", drops=[loss("skipped while behind", 12, 6)])
+    lab.send_status(skipped, limited, outputs=[zenoh, lcm])
     text = shown_text(lab)
     assert "dropped at 3d 6d: 12 messages of 6 frames (skipped while behind)" in text
     assert "dropped at output zenoh: 3 messages of 3 frames (queue full), 1 message (closed)" in text
     assert "output lcm: no route to 239.255.76.67" in text
-
-
-def test_limitations_and_the_last_error(lab: Lab) -> None:
-    lab.send_status(
-        stream(
-            "3d",
-            limitations=["the server refused ByteOrder"],
-            last_error="connection refused",
-            last_error_utime=1_700_000_000_000_000,
-        )
-    )
-    text = shown_text(lab)
     assert "3d: the server refused ByteOrder" in text
     assert re.search(r"last error of 3d, \d\d:\d\d:20: connection refused", text)
 
 
-def test_nothing_of_a_gateway_is_html() -> None:
-    lab = Lab()
-    lab.send_status(
-        stream(
-            HOSTILE,
-            HOSTILE,
-            problem=HOSTILE,
-            limitations=[HOSTILE],
-            last_error=HOSTILE,
-            drops=[loss(HOSTILE, 1, 1)],
-        ),
-        server=HOSTILE,
-        host=HOSTILE,
-        gateway_version=HOSTILE,
-        outputs=[output(HOSTILE, connected=False, problem=HOSTILE, drops=[loss(HOSTILE, 1, 1)])],
-    )
+def test_nothing_of_a_gateway_is_html(lab: Lab) -> None:
+    evil: dict[str, Any] = {"problem": HOSTILE, "drops": [loss(HOSTILE, 1, 1)]}
+    streams = stream(HOSTILE, HOSTILE, limitations=[HOSTILE], last_error=HOSTILE, **evil)
+    names = dict.fromkeys(("server", "host", "gateway_version"), HOSTILE)
+    lab.send_status(streams, outputs=[output(HOSTILE, connected=False, **evil)], **names)
     html = source_html(lab.source, {}, is_take=False)
     assert "<img" not in html
     assert html.count("&lt;img") == 14
@@ -149,19 +102,13 @@ def test_a_status_of_any_size_is_cut() -> None:
     assert len(source_html(lab.source, {}, is_take=False)) < 300_000
 
 
-def test_what_belongs_to_no_source() -> None:
-    lab = Lab()
+def test_what_belongs_to_no_source_or_cannot_be_read(lab: Lab) -> None:
     assert ignored_html(lab.live) == ""
     lab.live.ignore(beyond_limit=False)
     lab.live.ignore(beyond_limit=True)
     text = ignored_html(lab.live)
     assert "left out: 1 message of another program, 1 message of more sources or keys" in text
-
-
-def test_parameters_and_status_that_cannot_be_read() -> None:
-    lab = Lab()
-    broken = rtc3d.status_t().encode()[:60]
-    lab.live.publish("lab", "status", broken)
+    lab.live.publish("lab", "status", rtc3d.status_t().encode()[:60])
     assert "parameters or status that cannot be read: 1 message" in shown_text(lab)
 
 
@@ -170,3 +117,98 @@ def test_a_component_that_a_thread_adds_at_this_moment(lab: Lab) -> None:
     source = lab.source
     source.components["analog"] = LiveComponent(ComponentType.ANALOG)
     assert "analog" not in source_html(source, {}, is_take=False)
+
+
+def test_data_before_the_first_and_while_they_come(lab: Lab) -> None:
+    lab.send_status()
+    assert data_state(lab.source) == State(Level.WAITING, "no data yet")
+    lab.send_markers(True)
+    assert data_state(lab.source) == State(Level.GOOD, "live")
+
+
+def test_data_that_have_stopped(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send_markers(True)
+    lab.send(ComponentType.EVENT, [(1, 2, 3, 4, 5)])
+    source = lab.source
+    wait(monkeypatch, 12)
+    assert data_state(source) == State(Level.BAD, "no data for 12 s")
+
+
+def test_one_component_that_has_stopped(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send(ComponentType.ANALOG, [1.5])
+    assert lab.source
+    wait(monkeypatch, 3)
+    lab.send_markers(True)
+    assert data_state(lab.source) == State(Level.BAD, "no analog for 3.0 s")
+
+
+def test_a_text_for_each_stream_or_for_those_in_the_same_state(lab: Lab) -> None:
+    lab.send_status(stream("3d 6d"), stream("analog"))
+    assert gateway_states(lab.source) == [State(Level.GOOD, "streaming 200.0 Hz")]
+    rejected = stream("analog", problem="frames come, and all are rejected: x")
+    lab.send_status(stream("6d", "waiting to reconnect", tries=3), rejected, stream("event", "dancing"))
+    assert gateway_states(lab.source) == [
+        State(Level.BAD, "6d: waiting for 192.0.2.9:3020, 3 tries"),
+        State(Level.BAD, "analog: frames come, and all are rejected: x"),
+        State(Level.WAITING, "event: dancing"),
+    ]
+
+
+@pytest.mark.parametrize("has_status", [True, False])
+def test_a_gateway_that_is_not_heard_is_not_said_to_stream(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, has_status: bool
+) -> None:
+    lab.send_markers(True)
+    if has_status:
+        lab.send_status(stream())
+    source = lab.source
+    assert bool(gateway_states(source)) == has_status
+    wait(monkeypatch, 5)
+    text = "gateway not heard for 5.0 s" if has_status else "no gateway heard"
+    assert gateway_states(source) == [State(Level.BAD, text)]
+
+
+def test_states_are_escaped() -> None:
+    assert states_html([State(Level.BAD, "<b>")]) == "<p class=bad>&lt;b&gt;</p>"
+
+
+NOW_S = 1_700_000_000.5
+
+
+def test_live_data_and_their_time(lab: Lab) -> None:
+    """The text differs every second, also without any source."""
+    assert "No source is heard yet." in banner_html([], NOW_S)
+    assert banner_html([], NOW_S) == banner_html([], NOW_S + 0.1) != banner_html([], NOW_S + 1)
+    lab.send_markers(True)
+    assert f"● live|lab|last data {clock_text(NOW_S)}|" in text_of(banner_html([lab.source], NOW_S))
+
+
+def test_data_that_have_stopped_and_why(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send_markers(True)
+    assert lab.source
+    wait(monkeypatch, 3)
+    lab.send_status(stream(state="no measurement"))
+    html = banner_html([lab.source], NOW_S)
+    assert "class=stopped" in html
+    text = (
+        f"|lab: no data for 3.0 s|. The picture is old.|last data {clock_text(NOW_S - 3)} · connected to 192"
+    )
+    assert text in text_of(html)
+
+
+def test_a_take_that_is_paused_is_not_a_failure(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.send_markers(True)
+    source = lab.source
+    assert "● recorded|lab" in text_of(banner_html([source], NOW_S, is_take=True))
+    wait(monkeypatch, 3)
+    assert "● no data for 3.0 s|lab" in text_of(banner_html([source], NOW_S, is_take=True))
+    assert "● paused|lab" in text_of(banner_html([source], NOW_S, is_take=True, is_paused=True))
+
+
+def test_many_sources_with_hostile_names() -> None:
+    sources = [LiveSource("<img src=x>" + "y" * 1000, "MOCAP_X") for _ in range(64)]
+    html = banner_html(sources, time.time())
+    assert "<img" not in html
+    assert html.count("&lt;img") == MAX_SOURCES
+    assert "and 48 more sources" in html
+    assert len(html) < 10_000

@@ -1,33 +1,23 @@
-"""The viewer with pages that are connected, but are no browsers."""
+"""The server of the page, and the viewer with pages that are connected, but are no browsers."""
 
 import contextlib
 import math
+import socket
 import threading
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from gateway.errors import ViewError
 from gateway.rtc3d.components import ComponentType
-from gateway.view.server import ViewServer, open_server
+from gateway.view.server import ViewServer, address_of, open_server
 from gateway.view.viewer import Viewer
 from tests.unit.view.live_lab import Lab
 from tests.unit.view.page_client import PageClient, page_client
 from tests.waiting import wait_until
 
 POINTS = "/sources/MOCAP_LAB/markers"
-
-
-@pytest.fixture
-def server() -> Iterator[ViewServer]:
-    server = open_server("127.0.0.1", 0)
-    yield server
-    server.stop()
-
-
-@pytest.fixture
-def lab() -> Lab:
-    return Lab()
 
 
 @pytest.fixture
@@ -120,15 +110,12 @@ def test_what_a_page_should_not_send_is_ignored(viewer: Viewer, lab: Lab, server
 
 
 def test_a_defect_is_reported_once_and_the_view_goes_on(
-    viewer: Viewer,
-    lab: Lab,
-    server: ViewServer,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    viewer: Viewer, lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: object, **__: object) -> None:
         raise KeyError("plots")
 
+    server = viewer.scene._server
     monkeypatch.setattr(viewer.panel, "update", fail)
     with page_client(server) as page:
         wait_until(lambda: bool(server.get_clients()))
@@ -175,3 +162,49 @@ def _running(viewer: Viewer, lab: Lab) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
+
+
+def test_a_port_in_use_is_one_sentence_with_the_port_and_the_option() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ViewError, match=rf"^port {port} of 127\.0\.0\.1 is in use .* --port$"):
+            open_server("127.0.0.1", port)
+
+
+def test_a_port_that_was_used_a_moment_ago_can_be_used_again() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as former:
+        port = former.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            former.accept()[0].close()  # first, so that the port stays in the state TIME_WAIT
+            assert client.recv(1) == b""
+    open_server("127.0.0.1", port).stop()
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
+def test_an_address_of_another_computer_is_one_sentence_with_the_option(host: str) -> None:
+    with pytest.raises(ViewError, match=f"{host}.*--host"):
+        open_server(host, 0)
+
+
+def test_a_connection_that_is_no_browser_logs_nothing(
+    server: ViewServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    for request in (b"", b"\x16\x03\x01 no HTTP\r\n\r\n"):
+        with socket.create_connection(("127.0.0.1", server.get_port())) as connection:
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(1000):
+                pass
+    assert not caplog.records
+
+
+def test_it_prints_nothing_and_shares_nothing(capfd: pytest.CaptureFixture[str], server: ViewServer) -> None:
+    assert server.request_share_url() is None  # type: ignore[func-returns-value]
+    server.stop()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_address_can_be_opened_on_this_computer() -> None:
+    hosts = ("127.0.0.1", "0.0.0.0", "::1", "lab-pc")  # noqa: S104
+    addresses = ["http://127.0.0.1:8080", "http://localhost:8080", "http://[::1]:8080", "http://lab-pc:8080"]
+    assert [address_of(host, 8080) for host in hosts] == addresses

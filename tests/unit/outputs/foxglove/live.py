@@ -16,6 +16,7 @@ from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog, Plate, Point
+from tests.foxglove_viewer import Viewer, viewing
 from tests.losses import amounts
 from tests.networks import free_port
 from tests.waiting import wait_until_async
@@ -23,30 +24,21 @@ from tests.waiting import wait_until_async
 _Result = TypeVar("_Result")
 
 UTIME: Final = 1_700_000_000_000_000
-
-
-MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
-    ComponentType.MARKERS,
-    ComponentType.TOOLS,
-    ComponentType.ANALOG,
-    ComponentType.FORCE,
-    ComponentType.EVENT,
-)
-PLATE: Final = Plate(
-    "1",
-    "left",
-    corners=tuple(
-        Point(x, y, 0.0, "mm") for x, y in ((600.0, 400.0), (0.0, 400.0), (0.0, 0.0), (600.0, 0.0))
-    ),
-)
+MARKERS, TOOLS, ANALOG, FORCE, EVENT = WIRE_ORDER
+_CORNERS: Final = ((600.0, 400.0), (0.0, 400.0), (0.0, 0.0), (600.0, 0.0))
+PLATE: Final = Plate("1", "left", corners=tuple(Point(x, y, 0.0, "mm") for x, y in _CORNERS))
 QUARTER_TURN: Final = CoordinateFrame(
     "hall", 1e-3, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)), (10.0, 0.0, 0.0)
 )
 """Turns x to y, and then moves 10 m along x."""
-
-
-def pose(x: float, y: float, z: float) -> tuple[float, ...]:
-    return (1, 0, 0, 0, x, y, z, 0.1)
+ITEMS: Final[Mapping[ComponentType, list[Any]]] = {
+    MARKERS: [(1, 2, 3, 0)],
+    TOOLS: [(1, 0, 0, 0, 1, 2, 3, 0.1)],
+    ANALOG: [1],
+    FORCE: [(1, 2, 3, 4, 5, 6)],
+    EVENT: [(7, 0, 1, 2, 3)],
+}
+"""One of each component."""
 
 
 def frame_of(
@@ -62,13 +54,12 @@ def frame_of(
 
 def channels(*labels: str) -> Parameters:
     """Return parameters with these analog channels."""
-    return Parameters(
-        analog=ParametersAnalog(tuple(AnalogChannel(str(n), label) for n, label in enumerate(labels)))
-    )
+    described = tuple(AnalogChannel(str(number), label) for number, label in enumerate(labels))
+    return Parameters(analog=ParametersAnalog(described))
 
 
 class LiveSource:
-    """A source that publishes on ``output``. ``num_changes`` counts the calls of ``on_change``."""
+    """A source that publishes on ``output``."""
 
     def __init__(self, name: str, output: FoxgloveOutput) -> None:
         self.name = name
@@ -78,16 +69,17 @@ class LiveSource:
     def set_parameters(
         self, parsed: Parameters, version: int = 1, frame: CoordinateFrame | None = None
     ) -> None:
-        described = ServerParameters(
-            b"<xml/>", 1, version, parsed=parsed, frame=frame or CoordinateFrame(self.name)
-        )
+        frame = frame or CoordinateFrame(self.name)
+        described = ServerParameters(b"<xml/>", 1, version, parsed=parsed, frame=frame)
         self.output.publish_parameters(self.name, described)
 
     def publish(self, frame: Frame, utime: int = UTIME) -> None:
         self.fan_out.publish(frame, Stamp(utime, utime, 1, 1), frozenset(WIRE_ORDER))
 
-    def publish_items(self, kind: ComponentType, items: Iterable[Any], utime: int = UTIME) -> None:
-        self.publish(frame_of({kind: items}), utime)
+    def publish_items(
+        self, kind: ComponentType, items: Iterable[Any] | None = None, utime: int = UTIME
+    ) -> None:
+        self.publish(frame_of({kind: ITEMS[kind] if items is None else items}), utime)
 
     async def publish_until(self, frame: Frame, condition: Callable[[], _Result]) -> _Result:
         """Publish a frame again and again until a condition holds; return its result."""
@@ -127,3 +119,15 @@ async def serving(*names: str) -> AsyncIterator[tuple[int, list[LiveSource]]]:
             source.fan_out.close()
     finally:
         output.close()
+
+
+@asynccontextmanager
+async def watching(*topics: str, given: Parameters | None = None) -> AsyncIterator[tuple[LiveSource, Viewer]]:
+    """Run an output with the source lab, and a viewer; its topics are wanted, if it has any."""
+    async with serving("lab") as (port, [lab]):
+        if given is not None:
+            lab.set_parameters(given)
+        async with viewing(port, *topics) as viewer:
+            if topics:
+                await lab.wait_until_wanted()
+            yield lab, viewer

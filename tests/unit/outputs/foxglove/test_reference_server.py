@@ -64,20 +64,12 @@ async def test_a_viewer_finds_the_same_on_both_servers() -> None:
 
     context = foxglove.Context()
     reference = foxglove.start_server(host="127.0.0.1", port=0, context=context)
-    logged = [
-        (
-            foxglove.Channel(
-                each.topic.name,
-                schema=foxglove.Schema(
-                    name=each.topic.schema_name, encoding=each.topic.schema_encoding, data=each.topic.schema
-                ),
-                message_encoding=each.topic.encoding,
-                context=context,
-            ),
-            each,
-        )
-        for each in sent
-    ]
+    logged = []
+    for each in sent:
+        name, encoding, schema_name, schema_encoding, data = each.topic
+        schema = foxglove.Schema(name=schema_name, encoding=schema_encoding, data=data)
+        channel = foxglove.Channel(name, schema=schema, message_encoding=encoding, context=context)
+        logged.append((channel, each))
 
     def send_theirs() -> None:
         for channel, each in logged:

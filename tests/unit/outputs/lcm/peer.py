@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import lcm
+import pytest
 import rtc3d
 
 from gateway.log import current_log_fields
@@ -116,3 +117,8 @@ def command_request(number: int = 1, command: str = "take", *options: str, reque
     message.options, message.num_options = list(options), len(options)
     encoded: bytes = message.encode()
     return encoded
+
+
+def with_settings(**settings: Any) -> pytest.MarkDecorator:
+    """Run a test with a ``lab`` that has these settings."""
+    return pytest.mark.parametrize("lab", [settings], indirect=True, ids=[""])

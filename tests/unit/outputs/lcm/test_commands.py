@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
 
 import pytest
 
@@ -10,20 +9,10 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import C3D, JSON
 from gateway.outputs.lcm.commands import MAX_REMEMBERED
-from tests.unit.outputs.lcm.peer import Lab, command_request, request
+from tests.unit.outputs.lcm.peer import Lab, command_request, request, with_settings
 from tests.waiting import wait_until_async
 
 START = ("take", "set=start", "name=walk-1")
-
-
-@pytest.fixture
-async def lab() -> AsyncIterator[Lab]:
-    lab = Lab()
-    lab.open()
-    yield lab
-    lab.service.may_answer.set()
-    await lab.output.stop_queries()
-    lab.output.close()
 
 
 async def test_a_command_gets_the_answer_of_the_service_as_json(lab: Lab) -> None:
@@ -36,44 +25,41 @@ async def test_a_command_gets_the_answer_of_the_service_as_json(lab: Lab) -> Non
     assert lab.output.query_results == {"lab": {"ok": 1}}
 
 
-async def test_an_error_of_the_service_is_the_reply(lab: Lab) -> None:
-    lab.service.answers["take"] = QueryError("remote control is off", code="refused")
-    lab.send(command_request(7, *START), kind="COMMAND")
-    [reply] = await lab.receive()
-    assert (reply.content, reply.error, reply.error_code) == ("", "remote control is off", "refused")
+ON_ZENOH = "ask on Zenoh (a take: rtc3d-gateway take fetch, without --lcm)"
 
 
-@pytest.mark.parametrize("command", ["parameters", "", "c3d", "take/", "x" * 3000])
-async def test_only_commands_are_answered(lab: Lab, command: str) -> None:
-    lab.send(command_request(7, command), kind="COMMAND")
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        *(((name,), "accepted on LCM: recording, take") for name in ("c3d", "", "take/", "x" * 3000)),
+        *((("take", option), "accepted: NAME=VALUE") for option in ("start", "", "ä")),
+        (("take", "read=walk-1", "offset=0"), ON_ZENOH),
+    ],
+)
+async def test_what_is_no_command_on_lcm_is_refused(lab: Lab, command: tuple[str, ...], text: str) -> None:
+    lab.send(command_request(7, *command), kind="COMMAND")
     [reply] = await lab.receive()
     assert reply.error_code == "bad-request"
-    assert "accepted on LCM: recording, take" in reply.error
+    assert text in reply.error
     assert len(reply.error) < 200
     assert lab.service.commands_received == []
 
 
-@pytest.mark.parametrize("option", ["start", "", "ä"])
-async def test_an_option_without_a_value_is_an_error(lab: Lab, option: str) -> None:
-    lab.send(command_request(7, "take", option), kind="COMMAND")
-    [reply] = await lab.receive()
-    assert "accepted: NAME=VALUE" in reply.error
-
-
-async def test_takes_are_not_read_on_lcm_and_the_error_says_what_to_do(lab: Lab) -> None:
-    lab.send(command_request(7, "take", "read=walk-1", "offset=0"), kind="COMMAND")
-    [reply] = await lab.receive()
-    assert reply.error_code == "bad-request"
-    assert "ask on Zenoh (a take: rtc3d-gateway take fetch, without --lcm)" in reply.error
-    assert lab.service.commands_received == []
-
-
-async def test_an_answer_that_is_no_json_is_refused(lab: Lab) -> None:
-    lab.service.answers["take"] = Answer(b"\0" * 100, C3D)
+@pytest.mark.parametrize(
+    ("answer", "code", "text"),
+    [
+        (QueryError("remote control is off", code="refused"), "refused", "remote control is off"),
+        (Answer(b"\0" * 100, C3D), "bad-request", "is no JSON; ask on Zenoh"),
+    ],
+)
+async def test_an_error_of_the_service_and_an_answer_without_json_are_errors(
+    lab: Lab, answer: Answer | Exception, code: str, text: str
+) -> None:
+    lab.service.answers["take"] = answer
     lab.send(command_request(7, "take"), kind="COMMAND")
     [reply] = await lab.receive()
-    assert (reply.content, reply.error_code) == ("", "bad-request")
-    assert "is no JSON; ask on Zenoh" in reply.error
+    assert (reply.content, reply.error_code) == ("", code)
+    assert text in reply.error
 
 
 async def test_a_repeated_command_is_carried_out_once(lab: Lab) -> None:
@@ -115,9 +101,8 @@ async def test_a_command_that_changes_nothing_is_asked_each_time(lab: Lab) -> No
     assert len(lab.service.commands_received) == 2
 
 
-async def test_only_the_newest_commands_are_remembered() -> None:
-    lab = Lab(max_queries_per_source_per_s=1000.0, max_queries_per_s=1000.0)
-    lab.open()
+@with_settings(max_queries_per_source_per_s=1000.0, max_queries_per_s=1000.0)
+async def test_only_the_newest_commands_are_remembered(lab: Lab) -> None:
     for number in range(MAX_REMEMBERED + 1):
         lab.send(command_request(number, *START), kind="COMMAND")
         await lab.receive(number + 1)
@@ -125,19 +110,16 @@ async def test_only_the_newest_commands_are_remembered() -> None:
         lab.send(command_request(number, *START), kind="COMMAND")
     await lab.receive(MAX_REMEMBERED + 3)
     assert len(lab.service.commands_received) == MAX_REMEMBERED + 2
-    await lab.output.stop_queries()
 
 
-async def test_commands_and_requests_for_parameters_share_their_limits() -> None:
-    lab = Lab(max_queries_per_source_per_s=1.0)
-    lab.open()
+@with_settings(max_queries_per_source_per_s=1.0)
+async def test_commands_and_requests_for_parameters_share_their_limits(lab: Lab) -> None:
     for number in range(4):
         lab.send(request(number))
     lab.send(command_request(5, "take"), kind="COMMAND")
     replies = await lab.receive(5)
     assert [reply.error_code for reply in replies if reply.request_id == 5] == ["rate"]
     assert lab.lost("lab")["request beyond the rate"][0] >= 2
-    await lab.output.stop_queries()
 
 
 async def test_another_message_on_the_channel_of_commands_is_malformed(lab: Lab) -> None:

@@ -1,7 +1,5 @@
 """Parameters on LCM in memory: what subscribers receive."""
 
-import logging
-from collections.abc import AsyncIterator
 from types import SimpleNamespace
 
 import lcm
@@ -12,29 +10,20 @@ from gateway.outputs.lcm import parameters as parameters_module
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.parameters import REPEAT_S
 from gateway.outputs.lcm.settings import LcmSettings
+from tests.settable_clock import Clock
 from tests.unit.outputs.lcm.peer import XML, Lab, request
 
 
 @pytest.fixture
-async def lab() -> AsyncIterator[Lab]:
-    lab = Lab()
-    yield lab
-    lab.service.may_answer.set()
-    await lab.output.stop_queries()
-    lab.output.close()
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clocks of the queries; ``now_s`` is the time since the program started."""
-    clock = SimpleNamespace(now_s=100.0)
-    monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    clock = Clock(100.0)
+    monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=clock))
     monkeypatch.setattr(parameters_module, "now_utime", lambda: round(1e6 * clock.now_s))
     return clock
 
 
-async def test_parameters_are_published_now_and_every_few_seconds(lab: Lab, clock: SimpleNamespace) -> None:
-    lab.open()
+async def test_parameters_are_published_now_and_every_few_seconds(lab: Lab, clock: Clock) -> None:
     lab.output.publish_parameters("lab", ServerParameters(XML + b"\0", 3, 4))
     for step_s in (0.0, REPEAT_S - 0.5, 0.5, 0.5, REPEAT_S):
         clock.now_s += step_s
@@ -48,10 +37,7 @@ async def test_parameters_are_published_now_and_every_few_seconds(lab: Lab, cloc
     assert {message.xml for message in lab.parameters} == {XML.decode()}
 
 
-async def test_new_parameters_replace_the_old_ones_and_continue_the_sequence(
-    lab: Lab, clock: SimpleNamespace
-) -> None:
-    lab.open()
+async def test_new_parameters_replace_the_old_ones_and_continue_the_sequence(lab: Lab, clock: Clock) -> None:
     lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
     clock.now_s += 1.0
     lab.output.publish_parameters("lab", ServerParameters(b"<new/>", 2, 4))
@@ -64,10 +50,7 @@ async def test_new_parameters_replace_the_old_ones_and_continue_the_sequence(
     assert [message.capture_utime for message in lab.parameters] == [100_000_000, 101_000_000, 101_000_000]
 
 
-async def test_parameters_of_a_withdrawn_source_are_not_published_again(
-    lab: Lab, clock: SimpleNamespace
-) -> None:
-    lab.open()
+async def test_parameters_of_a_withdrawn_source_are_not_published_again(lab: Lab, clock: Clock) -> None:
     lab.output.publish_parameters("lab", ServerParameters(XML, 3, 4))
     lab.output.withdraw("lab")
     lab.output.withdraw("lab")
@@ -75,18 +58,6 @@ async def test_parameters_of_a_withdrawn_source_are_not_published_again(
     lab.output.maintain()
     lab.deliver()
     assert len(lab.parameters) == 1
-
-
-async def test_parameters_published_before_lcm_opens_follow_later(
-    lab: Lab, clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.parameters")
-    lab.output.publish_parameters("lab", ServerParameters(XML, 3, 4))
-    lab.open()
-    clock.now_s += REPEAT_S
-    lab.output.maintain()
-    lab.deliver()
-    assert [message.xml for message in lab.parameters] == [XML.decode()]
 
 
 async def test_an_output_without_queries_has_no_results() -> None:
@@ -97,10 +68,8 @@ async def test_an_output_without_queries_has_no_results() -> None:
     await output.stop_queries()
 
 
-async def test_long_parameters_are_sent_by_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_long_parameters_are_sent_by_a_thread(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parameters_module, "LONG_REPLY_BYTES", 10)
-    lab = Lab()
-    lab.open()
     sent = lab.output.publish_parameters("lab", ServerParameters(b"<long enough/>", 3, 4))
     assert sent is not None
     await sent
@@ -113,7 +82,6 @@ async def test_long_parameters_are_sent_by_a_thread(monkeypatch: pytest.MonkeyPa
     lab.send(request(1))
     [reply] = await lab.receive()
     assert reply.xml == XML.decode()
-    await lab.output.stop_queries()
 
 
 @pytest.mark.parametrize(
@@ -128,7 +96,18 @@ async def test_long_parameters_are_sent_by_a_thread(monkeypatch: pytest.MonkeyPa
 )
 async def test_xml_is_sent_as_text_without_the_nuls_at_its_end(lab: Lab, xml: bytes, text: str) -> None:
     lab.service.reply = ServerParameters(xml, 1, 4)
-    lab.open()
     lab.send(request())
     [reply] = await lab.receive()
     assert reply.xml == text
+
+
+async def test_parameters_published_before_lcm_opens_follow_later(clock: Clock) -> None:
+    lab = Lab()
+    lab.output.publish_parameters("lab", ServerParameters(XML, 3, 4))
+    lab.open()
+    clock.now_s += REPEAT_S
+    lab.output.maintain()
+    lab.deliver()
+    assert [message.xml for message in lab.parameters] == [XML.decode()]
+    await lab.output.stop_queries()
+    lab.output.close()

@@ -1,31 +1,21 @@
 """What happens to requests and subscriptions when LCM's TCP relay goes away and comes back."""
 
 import logging
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator
 
 import lcm
 import pytest
 import rtc3d
 
 from gateway.messages.decode import decode
-from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.lcm_relay import LcmRelay
+from tests.unit.outputs.lcm.peer import XML, Service, request
 from tests.waiting import wait_until, wait_until_async
 
 REQUEST, REPLY = "MOCAP_LAB_PARAMETERS_REQUEST", "MOCAP_LAB_PARAMETERS_REPLY"
-
-
-class _Service:
-    """Answers every request about parameters with the same XML."""
-
-    def serves(self, _source: str) -> bool:
-        return True
-
-    async def parameters(self, _source: str, _sections: Sequence[str], *, fresh: bool) -> ServerParameters:  # noqa: ARG002 - the contract's name
-        return ServerParameters(b"<The_3D/>", 1, 1)
 
 
 @pytest.fixture
@@ -38,7 +28,7 @@ def relay() -> Iterator[LcmRelay]:
 @pytest.fixture
 async def output(relay: LcmRelay) -> AsyncIterator[LcmOutput]:
     output = LcmOutput(LcmSettings(url=relay.url))
-    output.serve_queries(_Service())  # type: ignore[arg-type]  # it has the methods that LCM calls
+    output.serve_queries(Service())  # type: ignore[arg-type]  # it has the methods that LCM calls
     output.announce("lab")
     output.start()
     yield output
@@ -52,9 +42,7 @@ async def ask(relay: LcmRelay, request_id: int) -> list[str]:
     replies: list[rtc3d.parameters_reply_t] = []
     subscriber = LcmSubscriber(lcm.LCM(relay.url), REPLY, lambda _, data: replies.append(decode(data)))
     await wait_until_async(lambda: REPLY in relay.subscribed and f"^{REQUEST}$" in relay.subscribed)
-    request = rtc3d.parameters_request_t()
-    request.request_id, request.requester = request_id, "test"
-    lcm.LCM(relay.url).publish(REQUEST, request.encode())
+    lcm.LCM(relay.url).publish(REQUEST, request(request_id))
     await wait_until_async(lambda: replies)
     subscriber.close()
     return [reply.xml for reply in replies if reply.request_id == request_id]
@@ -64,11 +52,11 @@ async def test_requests_are_answered_again_after_the_relay_restarts(
     relay: LcmRelay, output: LcmOutput
 ) -> None:
     await wait_until_async(lambda: output.health().connected)
-    assert await ask(relay, 1) == ["<The_3D/>"]
+    assert await ask(relay, 1) == [XML.decode()]
     relay.close()
     await wait_until_async(lambda: not relay.subscribed)
     relay.open()
-    assert await ask(relay, 2) == ["<The_3D/>"]
+    assert await ask(relay, 2) == [XML.decode()]
 
 
 async def test_a_lost_relay_is_logged_with_the_key_to_check(
@@ -89,30 +77,18 @@ async def test_a_lost_relay_is_logged_with_the_key_to_check(
     assert found.startswith("lcm: requests can be received, after ")
 
 
-def test_a_subscriber_logs_a_lost_relay_and_can_be_closed(
+def test_a_subscriber_logs_a_lost_relay_and_receives_again_when_it_is_back(
     relay: LcmRelay, caplog: pytest.LogCaptureFixture
 ) -> None:
-    subscriber = LcmSubscriber(lcm.LCM(relay.url), ".*", lambda *_: None)
-    wait_until(lambda: relay.subscribed)
-    relay.close()
-    wait_until(lambda: caplog.messages)
-    relay.open()
-    subscriber.close()
-    relay.close()  # before LCM frees the connection: it would connect again, and hold up this process
-    [message] = caplog.messages
-    assert message.startswith("lcm: the connection is lost, so no more messages arrive: ")
-
-
-def test_a_subscriber_receives_again_when_the_relay_is_back(relay: LcmRelay) -> None:
     received: list[bytes] = []
     subscriber = LcmSubscriber(lcm.LCM(relay.url), ".*", lambda _channel, data: received.append(data))
     wait_until(lambda: relay.subscribed)
     relay.close()
-    wait_until(lambda: not relay.subscribed)
+    wait_until(lambda: caplog.messages and not relay.subscribed)
     relay.open()
     wait_until(lambda: relay.subscribed)
-    sender = lcm.LCM(relay.url)
-    sender.publish("CHANNEL", b"message")
+    lcm.LCM(relay.url).publish("CHANNEL", b"message")
     wait_until(lambda: b"message" in received)
     subscriber.close()
-    relay.close()
+    relay.close()  # before LCM frees the connection: it would connect again, and hold up this process
+    assert caplog.messages[0].startswith("lcm: the connection is lost, so no more messages arrive: ")

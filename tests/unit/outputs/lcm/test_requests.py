@@ -1,7 +1,6 @@
 """Requests on LCM in memory: what peers receive, and what the output counts."""
 
 import asyncio
-from collections.abc import AsyncIterator
 
 import pytest
 
@@ -12,21 +11,11 @@ from gateway.outputs.lcm.queries import LcmQueries
 from gateway.outputs.lcm.requests import MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.unit.outputs.lcm.peer import XML, Lab, request
+from tests.unit.outputs.lcm.peer import XML, Lab, request, with_settings
 from tests.waiting import wait_until_async
 
 
-@pytest.fixture
-async def lab() -> AsyncIterator[Lab]:
-    lab = Lab()
-    yield lab
-    lab.service.may_answer.set()
-    await lab.output.stop_queries()
-    lab.output.close()
-
-
 async def test_a_reply_has_the_answer_of_the_service(lab: Lab) -> None:
-    lab.open()
     lab.send(request(7, "3d", "force", fresh=True))
     [reply] = await lab.receive()
     assert (reply.request_id, reply.requester) == (7, "test")
@@ -38,7 +27,6 @@ async def test_a_reply_has_the_answer_of_the_service(lab: Lab) -> None:
 
 
 async def test_sources_are_served_whenever_they_are_announced(lab: Lab) -> None:
-    lab.open()
     lab.output.announce("hall")
     lab.output.announce("hall")
     lab.send(request(1), "HALL")
@@ -49,37 +37,7 @@ async def test_sources_are_served_whenever_they_are_announced(lab: Lab) -> None:
     assert lab.service.received == [("hall", [], False), ("lab", [], False)]
 
 
-async def test_an_error_of_the_service_is_the_reply(lab: Lab) -> None:
-    lab.service.reply = QueryError("the server refuses", code="refused")
-    lab.open()
-    lab.send(request(7))
-    [reply] = await lab.receive()
-    assert (reply.request_id, reply.requester) == (7, "test")
-    assert (reply.xml, reply.error, reply.error_code) == ("", "the server refuses", "refused")
-    assert lab.output.query_results == {"lab": {"refused": 1}}
-
-
-async def test_a_defect_is_logged_and_reported_in_the_reply(
-    lab: Lab, caplog: pytest.LogCaptureFixture
-) -> None:
-    lab.service.reply = ZeroDivisionError("of the test")
-    lab.open()
-    lab.send(request(7))
-    [reply] = await lab.receive()
-    assert (reply.error, reply.error_code) == (
-        "a defect in the gateway: ZeroDivisionError('of the test')",
-        "defect",
-    )
-    assert lab.output.query_results == {"lab": {"defect": 1}}
-    [record] = caplog.records
-    assert record.message == "lab: LCM request 7 of 'test'"
-    assert record.exc_info is not None
-
-
-async def test_a_source_that_is_no_longer_served_gets_no_reply(
-    lab: Lab,
-) -> None:
-    lab.open()
+async def test_a_source_that_is_no_longer_served_gets_no_reply(lab: Lab) -> None:
     lab.service.sources.clear()
     lab.send(request(1))
     await asyncio.sleep(0)  # the event loop rejects the request
@@ -113,9 +71,8 @@ async def test_requests_beyond_the_limit_are_dropped_and_counted_by_source(
     await lab.output.stop_queries()
 
 
-async def test_requests_beyond_the_rate_get_an_error_and_are_counted() -> None:
-    lab = Lab(max_queries_per_source_per_s=1.0)
-    lab.open()
+@with_settings(max_queries_per_source_per_s=1.0)
+async def test_requests_beyond_the_rate_get_an_error_and_are_counted(lab: Lab) -> None:
     for number in range(8):
         lab.send(request(number))
     replies = await lab.receive(8)
@@ -126,38 +83,27 @@ async def test_requests_beyond_the_rate_get_an_error_and_are_counted() -> None:
     assert "raise lcm.max_queries_per_source_per_s" in refused[0].error
     assert lab.lost("lab") == {"request beyond the rate": (len(refused), 0)}
     assert lab.output.query_results == {"lab": {"ok": 8 - len(refused), "rate": len(refused)}}
-    await lab.output.stop_queries()
 
 
-async def test_replies_beyond_the_bytes_of_a_second_are_errors() -> None:
-    lab = Lab(max_reply_bytes_per_s=1024)
+@with_settings(max_reply_bytes_per_s=1024)
+async def test_replies_beyond_the_bytes_of_a_second_are_errors(lab: Lab) -> None:
     lab.service.reply = ServerParameters(b"x" * 4000, 3, 4)
-    lab.open()
     lab.send(request(1))
     lab.send(request(2))
     assert [reply.error_code for reply in await lab.receive(2)] == ["", "rate"]
-    await lab.output.stop_queries()
 
 
-async def test_malformed_requests_are_counted_by_source(lab: Lab) -> None:
-    lab.open()
-    lab.output.announce("hall")
-    good = request(1)
-    for data in (b"", good[:-1], bytes(8) + good[8:]):
-        lab.send(data)
-    assert lab.lost("lab") == {"malformed request": (3, 0)}
-    assert lab.lost("hall") == {}
-
-
-async def test_the_limits_of_a_request_are_exact(lab: Lab) -> None:
-    lab.open()
+async def test_malformed_requests_and_those_beyond_the_limits_are_counted_by_source(lab: Lab) -> None:
     lab.send(request(1, requester="ä" * (MAX_REQUESTER_BYTES // 2)))
     lab.send(request(2) + bytes(MAX_REQUEST_BYTES - len(request(2))))
     await lab.receive(2)
+    lab.output.announce("hall")
     assert lab.lost("lab") == {}
     lab.send(request(3, requester="ä" * (MAX_REQUESTER_BYTES // 2) + "x"))
     lab.send(request(4) + bytes(MAX_REQUEST_BYTES + 1 - len(request(4))))
-    assert lab.lost("lab") == {"malformed request": (2, 0)}
+    for data in (b"", request(5)[:-1], bytes(8) + request(6)[8:]):
+        lab.send(data)
+    assert (lab.lost("lab"), lab.lost("hall")) == ({"malformed request": (5, 0)}, {})
 
 
 async def test_after_the_end_of_queries_no_request_is_answered() -> None:
@@ -189,3 +135,27 @@ async def test_a_request_after_the_end_of_the_event_loop_is_ignored(lab: Lab) ->
     queries.add("lab")
     lab.send(request())
     await queries.close()
+
+
+@pytest.mark.parametrize(
+    ("reply", "error", "code", "logged"),
+    [
+        (QueryError("the server refuses", code="refused"), "the server refuses", "refused", []),
+        (
+            ZeroDivisionError("of the test"),
+            "a defect in the gateway: ZeroDivisionError('of the test')",
+            "defect",
+            ["lab: LCM request 7 of 'test'"],
+        ),
+    ],
+)
+async def test_an_error_is_the_reply_and_a_defect_is_logged(
+    lab: Lab, reply: Exception, error: str, code: str, logged: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    lab.service.reply = reply
+    lab.send(request(7))
+    [received] = await lab.receive()
+    assert (received.request_id, received.requester, received.xml) == (7, "test", "")
+    assert (received.error, received.error_code) == (error, code)
+    assert lab.output.query_results == {"lab": {code: 1}}
+    assert [record.message for record in caplog.records if record.exc_info] == logged == caplog.messages

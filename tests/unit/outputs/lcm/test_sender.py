@@ -14,6 +14,7 @@ from gateway.outputs.lcm.connection import DEFAULT_GROUP, multicast_problem, ope
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmPublisher, LcmSender
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
 from tests.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
+from tests.settable_clock import Clock
 
 BAD_URL = "udpm://not-an-address:7667"
 
@@ -24,10 +25,9 @@ def shared() -> lcm.LCM:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """The sender's clock; its attribute ``now_s`` is the time."""
-    clock = SimpleNamespace(now_s=100.0)
-    monkeypatch.setattr(sender_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock(100.0)
+    monkeypatch.setattr(sender_module, "time", SimpleNamespace(monotonic=clock))
     return clock
 
 
@@ -45,44 +45,33 @@ def send(sender: LcmSender) -> None:
 # Opening and closing -------------------------------------------------------------------------
 
 
-def test_a_sender_refuses_messages_before_opening_and_after_closing(shared: lcm.LCM) -> None:
-    sender = LcmSender("memq://", shared, lambda: None)
+def test_messages_go_to_the_shared_object_between_opening_and_closing(
+    shared: lcm.LCM, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    opened: list[str] = []
+    received: list[tuple[str, bytes]] = []
+    shared.subscribe(".*", lambda *each: received.append(each))
+    sender = LcmSender("memq://", shared, lambda: opened.append(sender.problem))
     assert sender.problem == NOT_OPEN
     assert refusal(lambda: send(sender)) == (NOT_OPEN, "not open")
     sender.maintain()
     assert sender.problem == NOT_OPEN
     sender.open()
-    assert sender.problem == ""
+    assert (sender.problem, opened) == ("", [""])
+    assert caplog.messages == ["lcm: sending messages to memq://"]
+    send(sender)
+    shared.handle_timeout(0)
+    assert received == [("CHANNEL", b"message")]
     sender.close()
     sender.maintain()
     assert sender.problem == CLOSED
     assert refusal(lambda: send(sender)) == (CLOSED, "not open")
 
 
-def test_opening_is_reported_and_logged(shared: lcm.LCM, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.outputs")
-    opened: list[str] = []
-    sender = LcmSender("memq://", shared, lambda: opened.append(sender.problem))
-    sender.open()
-    assert opened == [""]
-    assert caplog.messages == ["lcm: sending messages to memq://"]
-    LcmSender("memq://", shared, lambda: None, "replies").open()
-    assert caplog.messages[1] == "lcm: sending replies to memq://"
-
-
-def test_messages_go_to_the_shared_object(shared: lcm.LCM) -> None:
-    received: list[tuple[str, bytes]] = []
-    shared.subscribe(".*", lambda *each: received.append(each))
-    sender = LcmSender("memq://", shared, lambda: None)
-    sender.open()
-    send(sender)
-    shared.handle_timeout(0)
-    assert received == [("CHANNEL", b"message")]
-
-
 @pytest.mark.interpreted
 def test_opening_is_tried_again_after_a_second_and_logged_once(
-    clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
+    clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG, "gateway.outputs")
     sender = LcmSender(BAD_URL, None, lambda: None)
@@ -103,7 +92,7 @@ def test_opening_is_tried_again_after_a_second_and_logged_once(
 
 
 def test_a_sender_that_is_open_is_not_opened_again(
-    shared: lcm.LCM, clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
+    shared: lcm.LCM, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
     sender = LcmSender("memq://", shared, lambda: None)
@@ -201,6 +190,11 @@ def test_failures_in_quick_succession_are_logged_as_one(caplog: pytest.LogCaptur
         assert sender.problem == ""
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     sender.close()
+
+
+@pytest.mark.parametrize("url", ["memq://", "file:///x?mode=w", "tcpq://127.0.0.1:7700", "nosuch://"])
+def test_what_is_not_multicast_has_no_multicast_problem(url: str) -> None:
+    assert multicast_problem(url) == ""
 
 
 # Publishers ----------------------------------------------------------------------------------

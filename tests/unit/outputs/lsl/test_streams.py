@@ -8,7 +8,6 @@ import pytest
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.lsl.streams import (
     MAX_RATE_HZ,
-    Channel,
     DescribedSource,
     LslStream,
     changed_labels,
@@ -33,22 +32,17 @@ from gateway.rtc3d.parameters import (
     Tool,
 )
 
-FORCE_CHANNELS = tuple(
-    ForceChannel(str(at), name, unit)
-    for at, (name, unit) in enumerate(
-        zip(("Fx", "Fy", "Fz", "Mx", "My", "Mz"), ["N"] * 3 + ["Nmm"] * 3, strict=True)
-    )
+UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Mx": "Nmm", "My": "Nmm", "Mz": "Nmm"}
+FORCE_CHANNELS = tuple(ForceChannel(str(at), name, unit) for at, (name, unit) in enumerate(UNITS.items()))
+ANALOG_CHANNELS = (
+    AnalogChannel("1", "EMG left", unit="uV", frequency_hz=2000.0),
+    AnalogChannel("2", "Trigger", unit="V", frequency_hz=2000.0),
 )
 PARAMETERS = Parameters(
     general=General(name="First Principles", version="2.1"),
     markers=Parameters3D(100.0, "mm", (Marker("1", "C7"), Marker("2", "LASI"))),
     tools=Parameters6D(50.0, (Tool("1", "Probe"),)),
-    analog=ParametersAnalog(
-        (
-            AnalogChannel("1", "EMG left", unit="uV", frequency_hz=2000.0),
-            AnalogChannel("2", "Trigger", unit="V", frequency_hz=2000.0),
-        )
-    ),
+    analog=ParametersAnalog(ANALOG_CHANNELS),
     force=ParametersForce((Plate("1", "Walkway", 1000.0, channels=FORCE_CHANNELS),)),
     events=ParametersEvents((EventDefinition("7", "Button"),)),
 )
@@ -65,70 +59,63 @@ def stream_of(
     return lsl_stream(DescribedSource("lab", computer, parameters, frame), component, num_items)
 
 
-def texts(stream: LslStream) -> list[tuple[str, str, str]]:
-    return [channel[:3] for channel in stream.channels]
+def marker(name: str) -> list[tuple[str, str, str]]:
+    positions = [(f"{name}_{axis}", f"Position{axis}", "meters") for axis in "XYZ"]
+    return [*positions, (f"{name}_reliability", "Reliability", "")]
 
 
-def test_markers_have_positions_in_metres_and_their_reliability() -> None:
-    stream = stream_of(ComponentType.MARKERS, 2)
-    assert (stream.name, stream.type, stream.rate_hz, stream.is_text) == ("lab_3d", "MoCap", 100.0, False)
-    assert texts(stream) == [
-        ("C7_X", "PositionX", "meters"),
-        ("C7_Y", "PositionY", "meters"),
-        ("C7_Z", "PositionZ", "meters"),
-        ("C7_reliability", "Reliability", ""),
-        ("LASI_X", "PositionX", "meters"),
-        ("LASI_Y", "PositionY", "meters"),
-        ("LASI_Z", "PositionZ", "meters"),
-        ("LASI_reliability", "Reliability", ""),
-    ]
-    assert {channel.marker for channel in stream.channels} == {"C7", "LASI"}
+ORIENTATIONS = {"X": "B", "Y": "C", "Z": "D", "W": "A"}
+"""As XDF names them."""
 
 
-def test_tools_have_positions_quaternions_as_xdf_names_them_and_errors() -> None:
-    stream = stream_of(ComponentType.TOOLS, 1)
-    assert (stream.name, stream.type, stream.rate_hz) == ("lab_6d", "MoCap", 50.0)
-    assert texts(stream) == [
-        ("Probe_X", "PositionX", "meters"),
-        ("Probe_Y", "PositionY", "meters"),
-        ("Probe_Z", "PositionZ", "meters"),
-        ("Probe_quat_X", "OrientationB", "quaternion"),
-        ("Probe_quat_Y", "OrientationC", "quaternion"),
-        ("Probe_quat_Z", "OrientationD", "quaternion"),
-        ("Probe_quat_W", "OrientationA", "quaternion"),
-        ("Probe_error", "Error", "meters"),
-    ]
-    assert {channel.object for channel in stream.channels} == {"Probe"}
-
-
-def test_analog_channels_keep_the_units_of_the_server() -> None:
-    stream = stream_of(ComponentType.ANALOG, 2)
-    assert (stream.name, stream.type, stream.rate_hz) == ("lab_analog", "Analog", 2000.0)
-    assert texts(stream) == [("EMG left", "EMG", "uV"), ("Trigger", "Analog", "V")]
+@pytest.mark.parametrize(
+    ("component", "num_items", "facts", "channels"),
+    [
+        (ComponentType.MARKERS, 2, ("lab_3d", "MoCap", 100.0, False), marker("C7") + marker("LASI")),
+        (
+            ComponentType.TOOLS,
+            1,
+            ("lab_6d", "MoCap", 50.0, False),
+            [
+                *((f"Probe_{axis}", f"Position{axis}", "meters") for axis in "XYZ"),
+                *(
+                    (f"Probe_quat_{axis}", f"Orientation{ORIENTATIONS[axis]}", "quaternion")
+                    for axis in "XYZW"
+                ),
+                ("Probe_error", "Error", "meters"),
+            ],
+        ),
+        (
+            ComponentType.ANALOG,
+            2,
+            ("lab_analog", "Analog", 2000.0, False),
+            [("EMG left", "EMG", "uV"), ("Trigger", "Analog", "V")],
+        ),
+        (
+            ComponentType.FORCE,
+            1,
+            ("lab_force", "Force", 1000.0, False),
+            [
+                *((f"Walkway_F{axis}", f"Force{axis}", "N") for axis in "XYZ"),
+                *((f"Walkway_M{axis}", f"Moment{axis}", "Nmm") for axis in "XYZ"),
+            ],
+        ),
+        (ComponentType.EVENT, 1, ("lab_event", "Markers", 0.0, True), [("event", "Marker", "")]),
+    ],
+)
+def test_channels_have_the_labels_types_and_units_of_the_server(
+    component: ComponentType, num_items: int, facts: tuple[object, ...], channels: list[tuple[str, str, str]]
+) -> None:
+    stream = stream_of(component, num_items)
+    assert (stream.name, stream.type, stream.rate_hz, stream.is_text) == facts
+    assert [channel[:3] for channel in stream.channels] == channels
+    if component is ComponentType.MARKERS:
+        assert {channel.marker for channel in stream.channels} == {"C7", "LASI"}
 
 
 def test_a_stream_of_nothing_but_emg_is_of_that_type() -> None:
     analog = ParametersAnalog(tuple(AnalogChannel(str(at), f"EMG {at}") for at in range(3)))
     assert stream_of(ComponentType.ANALOG, 3, Parameters(analog=analog)).type == "EMG"
-
-
-def test_plates_have_forces_and_moments_in_the_units_of_the_server() -> None:
-    stream = stream_of(ComponentType.FORCE, 1)
-    assert (stream.name, stream.type, stream.rate_hz) == ("lab_force", "Force", 1000.0)
-    assert texts(stream) == [
-        ("Walkway_FX", "ForceX", "N"),
-        ("Walkway_FY", "ForceY", "N"),
-        ("Walkway_FZ", "ForceZ", "N"),
-        ("Walkway_MX", "MomentX", "Nmm"),
-        ("Walkway_MY", "MomentY", "Nmm"),
-        ("Walkway_MZ", "MomentZ", "Nmm"),
-    ]
-
-
-def test_events_are_text_markers_without_a_rate() -> None:
-    stream = stream_of(ComponentType.EVENT, 1)
-    assert (stream.name, stream.type, stream.rate_hz, stream.is_text) == ("lab_event", "Markers", 0.0, True)
-    assert texts(stream) == [("event", "Marker", "")]
 
 
 @pytest.mark.parametrize("component", WIRE_ORDER)
@@ -147,8 +134,8 @@ def test_the_xml_has_channels_setup_and_acquisition() -> None:
         (("label", "Probe_X"), ("type", "PositionX"), ("unit", "meters"), ("object", "Probe")),
     )
     setup = dict(tree["setup"])
-    assert setup["name"] == "lab"
-    assert setup["objects"] == (("object", (("class", "Rigid"), ("label", "Probe"))),)
+    objects = (("object", (("class", "Rigid"), ("label", "Probe"))),)
+    assert (setup["name"], setup["objects"]) == ("lab", objects)
     frame = dict(setup["coordinate_frame"])
     assert frame["frame_id"] == "world"
     assert frame["translation_from_server"] == (("x", "1.0"), ("y", "2.0"), ("z", "3.0"))
@@ -190,25 +177,22 @@ def test_the_source_id_is_stable_and_differs_for_other_channels() -> None:
     assert stream_of(ComponentType.TOOLS, 1, faster).source_id == first.source_id
 
 
-@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf"), 1e9, MAX_RATE_HZ + 1, None])
-def test_a_rate_that_cannot_be_is_not_announced(rate_hz: float | None) -> None:
+@pytest.mark.parametrize(
+    ("rate_hz", "num_items", "announced_hz"),
+    [
+        *((rate_hz, 1, 0.0) for rate_hz in (0.0, -1.0, float("nan"), float("inf"), MAX_RATE_HZ + 1, None)),
+        pytest.param(1000.0, 600, 1000.0, id="as many values as there can be"),
+        pytest.param(1000.0, 700, 0.0, id="too many values"),
+    ],
+)
+def test_a_rate_that_cannot_be_is_not_announced(
+    rate_hz: float | None, num_items: int, announced_hz: float
+) -> None:
     """liblsl would reserve memory for it."""
-    parameters = Parameters(markers=Parameters3D(rate_hz, "mm", (Marker("1", "C7"),)))
-    assert stream_of(ComponentType.MARKERS, 1, parameters).rate_hz == 0.0
-
-
-def test_a_rate_of_too_many_values_is_not_announced() -> None:
-    parameters = Parameters(markers=Parameters3D(1000.0, "mm"))
-    assert stream_of(ComponentType.MARKERS, 600, parameters).rate_hz == 1000.0
-    assert stream_of(ComponentType.MARKERS, 700, parameters).rate_hz == 0.0
+    parameters = Parameters(markers=Parameters3D(rate_hz, "mm"))
+    assert stream_of(ComponentType.MARKERS, num_items, parameters).rate_hz == announced_hz
 
 
 def test_the_number_of_described_items_comes_from_the_parameters() -> None:
-    assert [num_labels(component, PARAMETERS) for component in WIRE_ORDER] == [
-        {"3d": 2, "6d": 1, "analog": 2, "force": 1, "event": 1}[component.key] for component in WIRE_ORDER
-    ]
+    assert [num_labels(component, PARAMETERS) for component in WIRE_ORDER] == [2, 1, 2, 1, 1]
     assert [num_labels(component, Parameters()) for component in WIRE_ORDER] == [None] * 5
-
-
-def test_channels() -> None:
-    assert Channel("label", "type", "").tree == ("channel", (("label", "label"), ("type", "type")))

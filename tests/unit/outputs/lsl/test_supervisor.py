@@ -10,6 +10,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -18,11 +20,12 @@ from gateway.outputs.lsl import supervisor
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import LslProcesses
-from gateway.outputs.lsl.wire import Kind, Message
+from gateway.outputs.lsl.wire import Kind, Message, Report
 from tests.lsl_receiver import lsl_config
 from tests.waiting import wait_until
 
 TIMEOUT_S = 30.0
+CANNOT_OPEN = Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]')
 
 _GATEWAY = """
 import signal, sys
@@ -38,6 +41,9 @@ signal.pause()
 """
 
 
+# With a process -----------------------------------------------------------------------------
+
+
 @pytest.fixture
 def processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LslProcesses]:
     monkeypatch.setattr(supervisor, "_FIRST_RETRY_S", 0.05)
@@ -51,10 +57,6 @@ def nothing() -> None:
     """There are no streams to open again."""
 
 
-def raise_too_many_files() -> None:
-    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
-
-
 def start(processes: LslProcesses, reopen: Callable[[], None] = nothing) -> int:
     """Start a process and wait until it is ready; return its number."""
     wait_until(lambda: processes.is_due, TIMEOUT_S)
@@ -62,6 +64,12 @@ def start(processes: LslProcesses, reopen: Callable[[], None] = nothing) -> int:
     wait_until(lambda: not processes.problem, TIMEOUT_S)
     assert processes._process is not None
     return processes._process.pid
+
+
+def problem(processes: LslProcesses) -> str:
+    """Return the next problem."""
+    wait_until(lambda: processes.problem, TIMEOUT_S)
+    return processes.problem
 
 
 def test_a_process_loads_liblsl_and_ends_with_its_supervisor(processes: LslProcesses) -> None:
@@ -82,8 +90,7 @@ def test_a_process_that_ended_is_replaced_and_gets_the_streams_again(
     caplog.set_level(logging.INFO)
     first = start(processes)
     os.kill(first, signal.SIGKILL)
-    wait_until(lambda: processes.problem, TIMEOUT_S)
-    assert processes.problem == "the process for LSL ended by SIGKILL; it is started again"
+    assert problem(processes) == "the process for LSL ended by SIGKILL; it is started again"
     reopened: list[bool] = []
     assert start(processes, lambda: reopened.append(True)) != first
     assert reopened == [True]
@@ -92,13 +99,17 @@ def test_a_process_that_ended_is_replaced_and_gets_the_streams_again(
     assert "streams are offered by liblsl" in caplog.records[-1].getMessage()
 
 
-def test_the_signals_that_stop_a_gateway_do_not_end_the_process(processes: LslProcesses) -> None:
+def test_a_stream_that_cannot_open_is_reported_by_a_process_that_ignores_signals(
+    processes: LslProcesses,
+) -> None:
+    """Those that stop a gateway."""
     number = start(processes)
     os.kill(number, signal.SIGTERM)
     os.kill(number, signal.SIGINT)
-    processes.send(Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]'))  # which it reports, if it lives
-    wait_until(lambda: processes.problem, TIMEOUT_S)
-    assert processes.problem.startswith("liblsl cannot open the stream lab_3d: ")
+    processes.send(CANNOT_OPEN)
+    assert problem(processes).startswith("liblsl cannot open the stream lab_3d: ")
+    processes.send(Message(Kind.CLOSE, 1))
+    wait_until(lambda: not processes.problem, TIMEOUT_S)
 
 
 @pytest.mark.parametrize("sends", [False, True], ids=["nothing sent", "a lot sent"])
@@ -113,8 +124,7 @@ def test_a_process_that_hangs_is_killed_and_replaced(
     while sends and processes.send(large):
         sent += 1
         assert sent < 100
-    wait_until(lambda: processes.problem, TIMEOUT_S)
-    assert processes.problem in {
+    assert problem(processes) in {
         "the process for LSL has not answered for 3 s; it is started again",
         "the process for LSL ended by SIGKILL; it is started again",
     }
@@ -122,61 +132,49 @@ def test_a_process_that_hangs_is_killed_and_replaced(
 
 
 def test_a_process_that_hangs_ends_with_a_gateway_that_is_killed(tmp_path: Path) -> None:
-    gateway = subprocess.Popen(
-        [sys.executable, "-c", _GATEWAY, str(lsl_config(tmp_path))], stdout=subprocess.PIPE, text=True
-    )
-    assert gateway.stdout is not None
-    with gateway.stdout as lines:
-        number = int(next(lines))
-    os.kill(number, signal.SIGSTOP)
-    gateway.kill()
-    gateway.wait()
+    command = [sys.executable, "-c", _GATEWAY, str(lsl_config(tmp_path))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as gateway:
+        assert gateway.stdout is not None
+        number = int(gateway.stdout.readline())
+        os.kill(number, signal.SIGSTOP)
+        gateway.kill()
     wait_until(lambda: not Path(f"/proc/{number}/exe").exists(), TIMEOUT_S)
 
 
 def test_why_liblsl_cannot_be_loaded_is_said(
     processes: LslProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Modules in the working directory are not used, but those on the path are."""
     (tmp_path / "pylsl.py").write_text("raise ImportError('libc is too old')")
+    (tmp_path / "queue.py").write_text("raise ImportError('a program of the user')")
+    with monkeypatch.context() as elsewhere:
+        elsewhere.chdir(tmp_path)
+        os.kill(start(processes), signal.SIGKILL)
+        problem(processes)
+    (tmp_path / "queue.py").unlink()
     monkeypatch.syspath_prepend(tmp_path)
+    wait_until(lambda: processes.is_due, TIMEOUT_S)
     processes.restart(nothing)
     wait_until(lambda: "failed" in processes.problem, TIMEOUT_S)
-    assert processes.problem == (
-        "the process for LSL failed: ImportError: libc is too old; it is started again"
-    )
-
-
-def test_modules_in_the_working_directory_are_not_used(
-    processes: LslProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "pylsl.py").write_text("raise ImportError('this is a program of the user')")
-    (tmp_path / "queue.py").write_text("raise ImportError('this too')")
-    monkeypatch.chdir(tmp_path)
-    start(processes)
+    text = "the process for LSL failed: ImportError: libc is too old; it is started again"
+    assert processes.problem == text
 
 
 def test_a_process_that_cannot_be_started_is_tried_again(
     processes: LslProcesses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as without_descriptors:
-        without_descriptors.setattr(socket, "socketpair", raise_too_many_files)
+        error = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        without_descriptors.setattr(socket, "socketpair", Mock(side_effect=error))
         processes.restart(nothing)
-    assert processes.problem == (
-        "the process for LSL cannot be started: Too many open files; it is started again"
-    )
+    text = "the process for LSL cannot be started: Too many open files; it is started again"
+    assert processes.problem == text
     start(processes)
 
 
-def test_a_stream_that_cannot_open_is_reported_and_tried_again(processes: LslProcesses) -> None:
-    start(processes)
-    processes.send(Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]'))
-    wait_until(lambda: processes.problem, TIMEOUT_S)
-    assert processes.problem.startswith("liblsl cannot open the stream lab_3d: ")
-    processes.send(Message(Kind.CLOSE, 1))
-    wait_until(lambda: not processes.problem, TIMEOUT_S)
-
-
-def test_a_missing_package_is_one_sentence_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=r"lsl\.config: /no/such/file cannot be read"):
+        LslOutput(LslSettings(enabled=True, config="/no/such/file"))
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *more: None if name == "pylsl" else find(name, *more)
@@ -185,6 +183,67 @@ def test_a_missing_package_is_one_sentence_with_the_command(monkeypatch: pytest.
         LslOutput(LslSettings(enabled=True))
 
 
-def test_a_configuration_of_liblsl_that_is_not_there_is_a_mistake() -> None:
-    with pytest.raises(ConfigError, match=r"lsl\.config: /no/such/file cannot be read"):
-        LslOutput(LslSettings(enabled=True, config="/no/such/file"))
+# Without a process: sockets in its place, and a clock to set -----------------------------------
+
+
+class Lab:
+    """Processes whose time is ``now_s``. A process ends when the test closes its end of the socket."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 1000.0
+        self.theirs: socket.socket
+        self.changes: list[frozenset[int]] = []
+        monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+        monkeypatch.setattr(supervisor, "_start_process", self._start)
+        self.processes = LslProcesses(LslSettings(enabled=True), self._note)
+
+    def _start(self, _settings: LslSettings) -> tuple[socket.socket, Mock]:
+        ours, self.theirs = socket.socketpair()
+        return ours, Mock(wait=Mock(return_value=3))
+
+    def _note(self) -> None:
+        self.changes.append(self.processes.wanted)
+
+    def live(self, seconds: float) -> None:
+        """Start a process that ends after this time."""
+        assert self.processes.is_due
+        self.processes.restart(nothing)
+        self.now_s += seconds
+        self.theirs.close()
+        wait_until(lambda: self.processes._socket is None and "status 3" in self.processes.problem)
+
+    def delay_s(self) -> float:
+        """Return how long it takes until the next process is due, to a tenth of a second."""
+        began_s = self.now_s
+        while not self.processes.is_due:
+            self.now_s += 0.1
+        return round(self.now_s - began_s, 1)
+
+
+def test_the_wait_for_the_next_process_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that cannot live must not cost all the time; one that lived is replaced soon."""
+    lab = Lab(monkeypatch)
+    delays_s = []
+    for lived_s in (0, 0, 0, 0, 59, 0, 0, 60, 0):
+        lab.live(lived_s)
+        delays_s.append(lab.delay_s())
+    assert delays_s == pytest.approx([1, 2, 4, 8, 16, 30, 30, 1, 2], abs=0.11)
+
+
+def test_each_change_of_what_is_received_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was received stays wanted until the next process knows it; nothing is after the end."""
+    lab = Lab(monkeypatch)
+    lab.processes.restart(nothing)
+    assert not lab.processes.is_due  # there is one
+    for wanted, failed in (((1,), ""), ((1,), "x"), ((1, 2), "x"), ((), "x"), ((3,), "")):
+        report = Report(ready="116", wanted=wanted, not_opened=failed)
+        lab.theirs.sendall(report.encode())
+        wait_until(lambda report=report: lab.processes._report == report)  # type: ignore[misc]
+    assert lab.changes == [{1}, {1, 2}, set(), {3}]
+    lab.theirs.close()
+    wait_until(lambda: lab.processes._socket is None)
+    assert lab.processes.wanted == {3}
+    lab.now_s += 60
+    lab.processes.stop()
+    assert lab.changes[-1] == set()
+    assert not lab.processes.is_due

@@ -5,6 +5,8 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import pytest
+
 from gateway.errors import OutputError
 from gateway.losses import Losses
 from gateway.outputs.contract import ServerParameters
@@ -16,6 +18,14 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from tests.losses import amounts
 from tests.ros_lab import ALL, stamp
+from tests.unit.outputs.ros2 import ros_messages as ros
+
+
+def cause_of(publish: Callable[..., None], *arguments: object) -> str:
+    """Return the cause of the refusal of a message."""
+    with pytest.raises(OutputError) as refused:
+        publish(*arguments)
+    return refused.value.cause
 
 
 class Node:
@@ -24,6 +34,7 @@ class Node:
     def __init__(self) -> None:
         self.events: list[str] = []
         self.sent: dict[str, list[int]] = {}
+        self.source_times_ns: list[int] = []
         self.messages: dict[str, list[bytes]] = {}
         self.matching: set[str] = set()
         self.put: Callable[[], None] = lambda: None
@@ -55,7 +66,9 @@ class _Declared:
 
     def put(self, cdr: bytes, attachment: bytes) -> None:
         self._node.put()
-        self._node.sent.setdefault(self._name, []).append(struct.unpack_from("<q", attachment)[0])
+        number, source_time_ns = struct.unpack_from("<qq", attachment)
+        self._node.sent.setdefault(self._name, []).append(number)
+        self._node.source_times_ns.append(source_time_ns)
         self._node.messages.setdefault(self._name, []).append(cdr)
 
     def undeclare(self) -> None:
@@ -126,8 +139,7 @@ class Source:
         if is_declared:
             self.declare()
         if given is not None:
-            self.publisher.set_parameters(given)
-            self.sender.run()
+            self.use(given)
 
     def _update_wanted(self) -> None:
         self.publisher.update_wanted()
@@ -156,6 +168,15 @@ class Source:
     def sent(self) -> Mapping[str, list[int]]:
         """The numbers of the messages by topic."""
         return {name.removeprefix("/mocap/lab/"): numbers for name, numbers in self.node.sent.items()}
+
+    def message(self, name: str, type_name: str) -> Any:
+        """Return the only message of a topic."""
+        [cdr] = self.node.messages[name if name.startswith("/") else f"/mocap/lab/{name}"]
+        return ros.decoded(cdr, type_name)
+
+    def use(self, given: ServerParameters) -> None:
+        self.publisher.set_parameters(given)
+        self.sender.run()
 
     @property
     def lost(self) -> dict[str, tuple[int, int]]:

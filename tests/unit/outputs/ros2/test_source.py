@@ -1,31 +1,29 @@
-"""A source on ROS 2 without Zenoh: its topics, what is wanted, and the numbers of its messages."""
+"""A source on ROS 2 without Zenoh: its topics, what is wanted, its messages and their numbers."""
 
+import math
 import struct
-from collections.abc import Callable
+import time
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
 import zenoh
 
-from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.ros2.source_topics import MAX_PLATES, MAX_TOOLS
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
 from gateway.rtc3d.parameters import ForceChannel, Plate
-from tests.ros_lab import ALL, ONE_TOOL, frame_of, parameters, tools_frame
-from tests.unit.outputs.ros2.scripted_ros import Source
+from tests.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, tools_frame
+from tests.unit.outputs.ros2 import ros_messages as ros
+from tests.unit.outputs.ros2.scripted_ros import Source, cause_of
 
-MARKERS, ANALOG, TOOLS, FORCE = (
-    ComponentType.MARKERS,
-    ComponentType.ANALOG,
-    ComponentType.TOOLS,
-    ComponentType.FORCE,
-)
+MARKERS, TOOLS, ANALOG, FORCE, _ = WIRE_ORDER
 LOAD = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 NAN = float("nan")
 ONE_MARKER = frame_of((MARKERS, [(1, 2, 3, 0)]))
 ONE_OF_EACH = frame_of((MARKERS, [(1, 2, 3, 0)]), ONE_TOOL, (ANALOG, [1.0]), (FORCE, [LOAD]))
+TWO_TOOLS = tools_frame((1, 2, 3), (1, 2, 3))
 EACH = parameters(("wand",), markers=1, channels=("Fx",), plates=(Plate("1"),))
-FIVE = ["/tf", "analog", "force_1/wrench", "markers", "wand/pose"]
 
 
 # Which topics are open ----------------------------------------------------------------------
@@ -36,14 +34,13 @@ def test_parameters_open_and_close_topics_and_keep_those_that_stay() -> None:
     source = Source(parameters(("wand", "cup"), markers=1))
     assert source.node.open == {"/tf", "/mocap/lab/wand/pose", "/mocap/lab/cup/pose", "/mocap/lab/markers"}
     source.subscribe()
-    source.send(tools_frame((1, 2, 3), (1, 2, 3)))
+    source.send(TWO_TOOLS)
     source.node.events.clear()
-    source.publisher.set_parameters(parameters(("wand", "glass"), markers=1, version=2))
-    source.sender.run()
+    source.use(parameters(("wand", "glass"), markers=1, version=2))
     assert sorted(source.node.events) == ["+/mocap/lab/glass/pose", "-/mocap/lab/cup/pose"]
-    source.send(tools_frame((1, 2, 3), (1, 2, 3)))
+    source.send(TWO_TOOLS)
     assert source.sent["wand/pose"] == [1, 2]
-    source.send(tools_frame((1, 2, 3), (1, 2, 3)))
+    source.send(TWO_TOOLS)
     assert len(source.node.events) == 2  # the same parameters change nothing
 
 
@@ -52,27 +49,16 @@ def test_topics_that_belong_to_parameters_from_before_the_session_are_declared_w
     source = Source(is_declared=False)
     source.sender.is_full = True
     source.publisher.set_parameters(EACH)
-    source.declare()
-    assert len(source.node.open) == 5
-    source.declare()
-    assert len(source.node.events) == 5
-
-
-def test_a_frame_uses_the_parameters_that_were_valid_when_it_came() -> None:
-    """Even if the queue was full when they changed."""
-    source = Source(parameters(("wand",)))
-    source.sender.is_full = True
-    source.publisher.set_parameters(parameters(("cup",), version=2))
-    source.sender.is_full = False
-    source.send(tools_frame((1, 2, 3)))
-    assert source.node.open == {"/tf", "/mocap/lab/cup/pose"}
+    for _ in range(2):
+        source.declare()
+        assert (len(source.node.open), len(source.node.events)) == (5, 5)
 
 
 def test_items_beyond_the_parameters_get_topics_before_they_are_wanted() -> None:
     """Nobody could subscribe otherwise; a layout that opens nothing costs the thread nothing."""
     source = Source(parameters(("wand",)))
     num_calls = len(source.sender.offered_bytes)
-    two, one = tools_frame((0, 0, 0), (0, 0, 0)).layout, tools_frame((0, 0, 0)).layout
+    two, one = TWO_TOOLS.layout, tools_frame((0, 0, 0)).layout
     assert not source.publisher.prepare(two, frozenset({MARKERS}))
     source.sender.is_full = True
     assert not source.publisher.prepare(two, ALL)
@@ -82,7 +68,7 @@ def test_items_beyond_the_parameters_get_topics_before_they_are_wanted() -> None
         source.sender.run()
     assert len(source.sender.offered_bytes) == num_calls + 2
     source.subscribe()
-    source.send(tools_frame((1, 0, 0), (2, 0, 0)))
+    source.send(TWO_TOOLS)
     assert source.sent == {"wand/pose": [1], "tool_2/pose": [1], "/tf": [1]}
     assert source.node.open == {"/tf", "/mocap/lab/wand/pose", "/mocap/lab/tool_2/pose"}
     source.subscribe(is_there=False)
@@ -92,39 +78,40 @@ def test_items_beyond_the_parameters_get_topics_before_they_are_wanted() -> None
     assert source.node.open == {"/tf", "/mocap/lab/cup/pose", "/mocap/lab/tool_2/pose"}
 
 
-def test_items_get_topics_under_the_parameters_of_their_frames() -> None:
-    """A full queue may have kept the thread from the newest parameters."""
-    source = Source(parameters(("wand",)))
-    source.sender.is_full = True
-    source.publisher.set_parameters(parameters(("cup",), version=2))
-    source.sender.is_full = False
-    source.publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
-    source.sender.run()
-    assert source.node.open == {"/tf", "/mocap/lab/cup/pose", "/mocap/lab/tool_2/pose"}
+def test_frames_and_their_items_use_the_parameters_that_were_valid_when_they_came() -> None:
+    """Even if the queue was full when they changed."""
+    for is_prepared, others in ((False, set[str]()), (True, {"/mocap/lab/tool_2/pose"})):
+        source = Source(parameters(("wand",)))
+        source.sender.is_full = True
+        source.publisher.set_parameters(parameters(("cup",), version=2))
+        source.sender.is_full = False
+        if is_prepared:
+            source.publisher.prepare(TWO_TOOLS.layout, ALL)
+            source.sender.run()
+        else:
+            source.send(tools_frame((1, 2, 3)))
+        assert source.node.open == {"/tf", "/mocap/lab/cup/pose"} | others
 
 
 def test_thousands_of_items_are_bounded_and_counted() -> None:
     """The server determines how many there are; just as many as fit are no loss."""
     plates = tuple(Plate(str(number)) for number in range(MAX_PLATES + 1))
-    tools = tuple(f"tool {number}" for number in range(MAX_TOOLS + 1))
-    source = Source(parameters(tools, plates=plates))
+    source = Source(parameters(tuple(f"tool {number}" for number in range(MAX_TOOLS + 1)), plates=plates))
     assert len(source.node.open) == 1 + MAX_TOOLS + MAX_PLATES
     source.subscribe()
-    source.send(tools_frame(*[(1, 2, 3)] * MAX_TOOLS))
-    source.send(frame_of((FORCE, [LOAD] * MAX_PLATES)))
-    assert source.lost == {}
-    source.send(tools_frame(*[(1, 2, 3)] * (MAX_TOOLS + 3)))
-    source.send(frame_of((FORCE, [LOAD] * (MAX_PLATES + 5))))
-    assert source.lost == {"too many tools": (3, 1), "too many force plates": (5, 1)}
+    for beyond, lost in (((0, 0), {}), ((3, 5), {"too many tools": (3, 1), "too many force plates": (5, 1)})):
+        source.send(tools_frame(*[(1, 2, 3)] * (MAX_TOOLS + beyond[0])))
+        source.send(frame_of((FORCE, [LOAD] * (MAX_PLATES + beyond[1]))))
+        assert source.lost == lost
     assert len(source.sent) == 1 + MAX_TOOLS + MAX_PLATES
 
 
 def test_names_that_differ_from_labels_are_shown() -> None:
     """Nodes look for labels; those that are valid names need no explanation."""
-    source = Source(parameters(("wand", "Left Foot"), plates=(Plate("1", "left"),)))
-    assert source.topics.names == {"6d": {"Left Foot": "Left_Foot"}, "force": {"left": "force_1"}}
-    source.publisher.set_parameters(parameters(("wand",), version=2))
-    source.sender.run()
+    source = Source(parameters(("wand", "Left Foot"), plates=(Plate("1", "left"), Plate("2"))))
+    names = {"6d": {"Left Foot": "Left_Foot"}, "force": {"left": "force_1", "plate 2": "force_2"}}
+    assert source.topics.names == names
+    source.use(parameters(("wand",), version=2))
     assert source.topics.names == {"6d": {}}
 
 
@@ -180,11 +167,53 @@ def test_new_parameters_have_the_items_of_the_next_frame_noted_again() -> None:
     source = Source()
     source.num_changes = 0
     source.publisher.set_parameters(EACH)
-    assert source.num_changes == 1
-    assert source.sender.offered_bytes[-1] == len(EACH.xml)
+    assert (source.num_changes, source.sender.offered_bytes[-1]) == (1, len(EACH.xml))
 
 
-# Frames -------------------------------------------------------------------------------------
+# Messages -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_messages_are_in_metres_in_the_frame_of_the_source(order: ByteOrder) -> None:
+    """With the capture time; tools out of view have no pose, and markers out of view are NaN."""
+    half = math.sqrt(0.5)
+    frame = CoordinateFrame("world", 1e-3, (half, 0.0, 0.0, half), (10.0, 0.0, 0.0))  # y up becomes z up
+    given = {"markers": 2, "channels": ("Fx", "a,b"), "plates": (Plate("1"),), "frame": frame}
+    source = Source(parameters(("wand", "cup"), **given))  # type: ignore[arg-type]
+    source.subscribe()
+    header, before_ns = ros.header(UTIME, "world"), time.time_ns()
+    source.send(
+        frame_of(
+            (MARKERS, [(0.0, 1000.0, 0.0, 0.25), None]),
+            (TOOLS, [None, (1.0, 0.0, 0.0, 0.0, 0.0, 1000.0, 0.0, 0.0)]),
+            (FORCE, [(0.0, 700.0, 0.0, 1.0, 0.0, 0.0)]),
+            (ANALOG, [1.0, 2.0, -3.0]),
+            byte_order=order,
+        )
+    )
+    assert before_ns <= min(source.node.source_times_ns) <= max(source.node.source_times_ns) <= time.time_ns()
+    stamped = source.message("cup/pose", "geometry_msgs/msg/PoseStamped")
+    [transform] = source.message("/tf", "tf2_msgs/msg/TFMessage").transforms
+    assert (transform.header, stamped.header, transform.child_frame_id) == (header, header, "lab/cup")
+    moved = transform.transform
+    for p, q in (
+        (stamped.pose.position, stamped.pose.orientation),
+        (moved.translation, moved.rotation),
+    ):
+        assert (p.x, p.y, p.z) == pytest.approx((10.0, 0.0, 1.0), abs=1e-9)
+        assert (q.x, q.y, q.z, q.w) == pytest.approx((half, 0.0, 0.0, half), abs=1e-9)
+    cloud = source.message("markers", "sensor_msgs/msg/PointCloud2")
+    assert (cloud.header, cloud.width, cloud.is_dense) == (header, 2, False)
+    points = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(2, 5)
+    assert points[0, :4] == pytest.approx([10.0, 0.0, 1.0, 0.25])
+    assert np.isnan(points[1, :3]).all()
+    assert points[:, 4].view("<u4").tolist() == [0, 1]
+    stamped = source.message("force_1/wrench", "geometry_msgs/msg/WrenchStamped")
+    force, torque = stamped.wrench.force, stamped.wrench.torque  # turned, not moved
+    assert stamped.header == header
+    assert (force.x, force.y, force.z, torque.x) == pytest.approx((0.0, 0.0, 700.0, 1.0), abs=1e-9)
+    array = source.message("analog", "std_msgs/msg/Float32MultiArray")
+    assert (array.layout.dim[0].label, array.data.tolist()) == ("Fx,a_b,channel 3", [1.0, 2.0, -3.0])
 
 
 def test_only_components_and_topics_that_are_wanted_are_published() -> None:
@@ -198,13 +227,8 @@ def test_only_components_and_topics_that_are_wanted_are_published() -> None:
     source.subscribe()
     source.send(ONE_OF_EACH, frozenset({MARKERS, FORCE}))
     source.send(ONE_OF_EACH)
-    assert source.sent == {
-        "wand/pose": [1, 2],
-        "/tf": [1],
-        "markers": [1, 2],
-        "force_1/wrench": [1, 2],
-        "analog": [1],
-    }
+    twice = {"wand/pose": [1, 2], "markers": [1, 2], "force_1/wrench": [1, 2]}
+    assert source.sent == twice | {"/tf": [1], "analog": [1]}
     assert source.sender.offered_bytes[-1] == len(ONE_OF_EACH.body)
     source.subscribe("/mocap/lab/wand/pose", is_there=False)
     source.send(ONE_OF_EACH)
@@ -245,6 +269,9 @@ def test_the_number_of_items_can_change_from_frame_to_frame(counts: tuple[int, .
         assert array.endswith(struct.pack(f"<I{count}f", count, *[1.0] * count))
 
 
+# Losses -------------------------------------------------------------------------------------
+
+
 def test_an_unknown_unit_is_counted_by_the_messages_that_somebody_misses() -> None:
     """Lengths that are not in metres must not reach robots; analog values do."""
     frame = CoordinateFrame("lab", None)
@@ -257,9 +284,6 @@ def test_an_unknown_unit_is_counted_by_the_messages_that_somebody_misses() -> No
     assert source.sent == {"analog": [1]}
 
 
-# Losses -------------------------------------------------------------------------------------
-
-
 def test_frames_that_find_no_place_use_up_the_numbers_of_their_topics() -> None:
     """ROS notices the gap: of the lost components, with a subscriber, and each frame once."""
     source = Source(EACH)
@@ -268,9 +292,7 @@ def test_frames_that_find_no_place_use_up_the_numbers_of_their_topics() -> None:
     for lost in (2, 3):
         source.sender.is_full = True
         for _ in range(lost):
-            with pytest.raises(OutputError) as refused:
-                source.offer(ONE_OF_EACH, frozenset({MARKERS, FORCE}))
-            assert refused.value.cause == "queue full"
+            assert cause_of(source.offer, ONE_OF_EACH, frozenset({MARKERS, FORCE})) == "queue full"
         source.sender.is_full = False
         source.offer(ONE_OF_EACH)
     source.offer(ONE_OF_EACH)
@@ -287,9 +309,7 @@ def test_frames_are_refused_while_the_router_is_away() -> None:
     source.subscribe("/mocap/lab/markers")
     source.offer(ONE_MARKER)
     source.router.is_cut_off = True
-    with pytest.raises(OutputError) as refused:
-        source.offer(ONE_MARKER)
-    assert refused.value.cause == "no router"
+    assert cause_of(source.offer, ONE_MARKER) == "no router"
     source.sender.run()
     assert (source.lost, source.sent) == ({"no router": (1, 1)}, {})
     source.router.is_cut_off = False
@@ -297,13 +317,18 @@ def test_frames_are_refused_while_the_router_is_away() -> None:
     assert source.sent == {"markers": [1]}
 
 
-def test_what_zenoh_refuses_is_counted_unless_the_session_is_gone() -> None:
-    """At the gateway's end, the session closes before the last messages."""
+def test_what_is_not_sent_is_counted_unless_the_session_is_gone() -> None:
+    """A defect ends nothing. At the gateway's end, the session closes before the last messages."""
     source = Source(EACH)
     source.subscribe("/mocap/lab/markers")
-    source.node.put = failing(zenoh.ZError("no"))
+    for error in (zenoh.ZError("no"), ZeroDivisionError("x")):
+        source.node.put = Mock(side_effect=error)
+        source.send(ONE_MARKER)
+    lost = {"put failed": (1, 1), "ZeroDivisionError": (1, 1)}
+    assert source.lost == lost
+    source.node.put = lambda: None
     source.send(ONE_MARKER)
-    assert source.lost == {"put failed": (1, 1)}
+    assert source.sent["markers"] == [3]
 
     def cut_off() -> None:
         source.router.is_cut_off = True
@@ -311,25 +336,7 @@ def test_what_zenoh_refuses_is_counted_unless_the_session_is_gone() -> None:
 
     source.node.put = cut_off
     source.send(ONE_MARKER)
-    assert source.lost == {"put failed": (1, 1)}
-
-
-def failing(error: Exception) -> Callable[[], None]:
-    def put() -> None:
-        raise error
-
-    return put
-
-
-def test_a_defect_is_counted_and_the_next_frame_is_published() -> None:
-    """The thread serves all sources."""
-    source = Source(EACH)
-    source.subscribe("/mocap/lab/markers")
-    source.node.put = failing(ZeroDivisionError("x"))
-    source.send(ONE_MARKER)
-    source.node.put = lambda: None
-    source.send(ONE_MARKER)
-    assert (source.lost, source.sent["markers"]) == ({"ZeroDivisionError": (1, 1)}, [2])
+    assert source.lost == lost
 
 
 def test_a_closed_source_publishes_nothing_more_and_its_topics_go() -> None:
@@ -342,13 +349,9 @@ def test_a_closed_source_publishes_nothing_more_and_its_topics_go() -> None:
     assert source.num_changes == 1
     assert not source.publisher.wants(ALL)
     source.sender.run()
-    assert source.sent == {}
-    assert source.node.open == {"/tf"}
-    assert source.topics.topics == ()
+    assert (source.sent, source.node.open, source.topics.topics) == ({}, {"/tf"}, ())
     source.subscribe()
     source.publisher.update_wanted()
     assert not source.publisher.wants(ALL)
-    with pytest.raises(OutputError) as refused:
-        source.offer(ONE_OF_EACH)
-    assert refused.value.cause == "closed"
+    assert cause_of(source.offer, ONE_OF_EACH) == "closed"
     assert source.topics.wanted == frozenset()

@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 
 from gateway.outputs.rtc3d.live_scene import LiveScene
-from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
@@ -12,6 +12,8 @@ from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
 from tests.unit.rtc3d_server.wire import COMMAND, EVENT, WireComponent, components_in, packets_in
 
 _ITEM = {1: "4f", 2: "f", 3: "6f", 4: "8f", EVENT: "iqiii"}
+Kinds = frozenset[ComponentType]
+ALL_KINDS: Kinds = frozenset(WIRE_ORDER)
 SLOW, FAST = 1, 2  # the numbers of streams
 TOOL_OUT_OF_VIEW = bytes.fromhex("00000038 00000004 00000007 0000000000002710 00000001" + "ff" * 32)
 
@@ -42,31 +44,55 @@ def event(number: int, timestamp_us: int, event_id: int) -> bytes:
     return component(EVENT, number, timestamp_us, [(event_id, timestamp_us, -1, -1, -1)])
 
 
+def frame_of_markers(number: int, *others: bytes) -> bytes:
+    """Return the body of frame ``number`` of 100 Hz."""
+    return body(markers(number, 10_000 * number), *others)
+
+
+def event_of(number: int) -> bytes:
+    return event(number, 10_000 * number, number)
+
+
 class LiveSource:
     """A live source with clients; time passes only by ``wait``."""
 
-    def __init__(self, *, is_new: bool = False) -> None:
-        """With ``is_new``, nothing is known of its streams, so frames wait at first."""
+    def __init__(
+        self, *, is_new: bool = False, played: int = 0, fast_first: bool = False, **announced_hz: float
+    ) -> None:
+        """With ``is_new``, nothing is known of its streams, so frames wait at first; see ``play``."""
         self.scene = LiveScene("lab")
+        self.scene._announced_hz = {ComponentType[name]: rate_hz for name, rate_hz in announced_hz.items()}
         if not is_new:
             self.scene._arrivals.began_us = -1_000_000_000
         self.now_us = 0
         self._clients: list[LiveClient] = []
         self.scene.start()
+        self.play(1, played, fast_first=fast_first)
 
-    def client(self) -> "LiveClient":
+    def client(self, *commands: str) -> "LiveClient":
         self._clients.append(LiveClient(self))
+        for command in commands:
+            self._clients[-1].send(command)
         return self._clients[-1]
 
+    def play(self, first: int, last: int, *, fast_first: bool = False, base_us: int = 0) -> None:
+        """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
+        for number in range(first, last + 1):
+            timestamp_us = base_us + 10_000 * number
+            slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
+            fast = (body(analog(10 * number, timestamp_us)), FAST)
+            for each in (fast, slow) if fast_first else (slow, fast):
+                self.arrive(*each)
+            for step in range(1, 10):
+                self.wait(1000)
+                self.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
+            self.wait(1000)
+
     def arrive(
-        self,
-        frame: bytes,
-        stream: int = SLOW,
-        byte_order: ByteOrder = "big",
-        wanted: frozenset[object] = frozenset(WIRE_ORDER),
+        self, frame: bytes, stream: int = SLOW, byte_order: ByteOrder = "big", wanted: Kinds = ALL_KINDS
     ) -> None:
         """Let a frame arrive, and send what is due then."""
-        self.scene.add(split_frame(frame, byte_order), stream, wanted, self.now_us)  # type: ignore[arg-type]
+        self.scene.add(split_frame(frame, byte_order), stream, wanted, self.now_us)
         self.send()
 
     def wait(self, us: int) -> None:
@@ -109,20 +135,10 @@ class LiveClient:
         bodies, self.bodies = self.bodies, []
         return [components_in(each, byte_order) for each in bodies]
 
+    def event_ids(self) -> list[list[int]]:
+        """Return the ids of the events in each of these frames."""
+        return [[int(item[0]) for c in frame if c.type == EVENT for item in c.items] for frame in self.take()]
+
     def numbers(self) -> list[list[int]]:
         """Return the frame numbers of the components of each of these frames."""
         return [[each.frame_number for each in frame] for frame in self.take()]
-
-
-def play(source: LiveSource, first: int, last: int, *, fast_first: bool, base_us: int = 0) -> None:
-    """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
-    for number in range(first, last + 1):
-        timestamp_us = base_us + 10_000 * number
-        slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
-        fast = (body(analog(10 * number, timestamp_us)), FAST)
-        for each in (fast, slow) if fast_first else (slow, fast):
-            source.arrive(*each)
-        for step in range(1, 10):
-            source.wait(1000)
-            source.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
-        source.wait(1000)

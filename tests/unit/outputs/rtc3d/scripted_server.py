@@ -1,10 +1,12 @@
 """A LiveServer whose clients are scripted: no sockets, no threads, and the event loop's time is virtual."""
 
 import asyncio
+import inspect
 import io
 import logging
 import struct
 from collections.abc import Callable, Coroutine
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,10 +18,31 @@ from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import ClientConnection
 from tests.unit.outputs.rtc3d.live_client import body, markers
-from tests.unit.rtc3d_server.wire import command, packets_in
+from tests.unit.rtc3d_server.wire import DATA, command, packets_in
+from tests.virtual_time import run_in_virtual_time
 
 _Result = TypeVar("_Result")
 _CLIENT, _SERVER = ("192.0.2.7", 4711), ("192.0.2.1", 3120)
+
+
+def in_virtual_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Run a test in virtual time, with a new ``server`` and a ``client`` of it if the test takes them."""
+    names = inspect.signature(test).parameters
+
+    async def with_server(fixtures: dict[str, Any]) -> None:
+        made: dict[str, Any] = {}
+        if not names.keys().isdisjoint({"server", "client"}):
+            made["server"] = ScriptedServer()
+            made["client"] = made["server"].client() if "client" in names else None
+        await test(**fixtures, **{name: each for name, each in made.items() if name in names})
+
+    @wraps(test)
+    def run(**fixtures: Any) -> None:
+        run_in_virtual_time(with_server(fixtures))
+
+    others = [each for name, each in names.items() if name not in {"server", "client"}]
+    run.__signature__ = inspect.Signature(others)  # type: ignore[attr-defined]
+    return run
 
 
 async def settle() -> None:
@@ -29,10 +52,8 @@ async def settle() -> None:
 
 def parameters(label: str, version: int = 1) -> ServerParameters:
     """Return the parameters of a server with one marker."""
-    xml = (
-        "<Parameters><The_3D><Frequency>100</Frequency><Markers>1</Markers>"
-        f"<Marker><Label>{label}</Label></Marker></The_3D></Parameters>"
-    ).encode()
+    marker = f"<Markers>1</Markers><Marker><Label>{label}</Label></Marker>"
+    xml = f"<Parameters><The_3D><Frequency>100</Frequency>{marker}</The_3D></Parameters>".encode()
     return ServerParameters(xml, 1, version, parsed=parse_parameters(xml).parameters)
 
 
@@ -133,20 +154,16 @@ class ScriptedServer(LiveServer):
         self.changes: list[bool] = []
         self.asked: list[tuple[str, bool, str]] = []
         self.answers: asyncio.Queue[Exception | None] = asyncio.Queue()
-        super().__init__(
-            self.state,
-            "127.0.0.1",
-            0,
-            max_clients,
-            lambda: self.changes.append(self.state.wanted),
-            self._control,
-        )
+        super().__init__(self.state, "127.0.0.1", 0, max_clients, self._wanted_changed, self._control)
         self.files = self.disk = Disk()  # type: ignore[assignment]
         self._live_scene._arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
 
     @property
     def is_listening(self) -> bool:
         return True
+
+    def _wanted_changed(self) -> None:
+        self.changes.append(self.state.wanted)
 
     def _control(self, source: str, start: bool, name: str) -> Coroutine[Any, Any, None]:
         self.asked.append((source, start, name))
@@ -175,9 +192,9 @@ class ScriptedServer(LiveServer):
         return self.elapsed_us() is not None
 
 
-def number_in(data: bytes) -> int:
-    """Return the frame number of a data frame."""
-    return int(struct.unpack_from(">i", data, 12)[0])
+def frame_numbers(packets: list[tuple[int, bytes]]) -> list[int]:
+    """Return the numbers of the data frames among the packets."""
+    return [struct.unpack_from(">i", data, 12)[0] for kind, data in packets if kind == DATA]
 
 
 def write_file(folder: Path, name: str, content: bytes) -> Path:

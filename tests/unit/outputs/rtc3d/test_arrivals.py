@@ -1,7 +1,7 @@
 """What is kept of a live source, the rates of its streams, and the limits of both."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -24,24 +24,23 @@ from tests.unit.outputs.rtc3d.live_client import (
 )
 from tests.unit.rtc3d_server.wire import EVENT, components_in
 
-MARKERS, ANALOG, TOOLS = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.TOOLS
+MARKERS, ANALOG = ComponentType.MARKERS, ComponentType.ANALOG
 BOTH = (MARKERS, ANALOG)
+Kinds = Sequence[ComponentType]
 
 
 class Source:
     """Frames that arrive at chosen times, and the frames of a client's choice of components."""
 
     def __init__(
-        self,
-        requested: Sequence[ComponentType] = BOTH,
-        announced_hz: dict[ComponentType, float] | None = None,
-        *,
-        is_new: bool = False,
+        self, requested: Kinds = BOTH, *, is_new: bool = False, played: int = 0, **announced_hz: Any
     ) -> None:
         self.arrivals = Arrivals()
         if not is_new:
             self.arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
-        self.frames = LiveFrames(requested, self.arrivals, announced_hz or {})
+        rates_hz = {ComponentType[name]: rate_hz for name, rate_hz in announced_hz.items()}
+        self.frames = LiveFrames(requested, self.arrivals, rates_hz)
+        self.play(played)
 
     def add(self, at_us: int, *components: bytes, stream: int = SLOW) -> Arrival:
         arrival = self.arrivals.add(
@@ -54,8 +53,10 @@ class Source:
         self.add(at_us, *components, stream=stream)
         return self.frames.update(at_us)
 
-    def play(self, count: int = 3, period_us: int = 10_000) -> None:
+    def play(self, count: int, period_us: int = 10_000) -> None:
         """Let pairs of markers and analog channels arrive on two streams whose rates are known."""
+        if not count:
+            return
         for kind, stream in ((MARKERS, SLOW), (ANALOG, FAST)):
             self.arrivals.stream_of[kind] = stream
             self.arrivals.rates[stream] = rate = StreamRate()
@@ -70,6 +71,12 @@ class Source:
 
     def numbers(self) -> list[list[int]]:
         return [[each.frame_number for each in components_in(packet.packet[8:])] for packet in self.packets()]
+
+    def arrive_regularly(self, numbers: Iterable[int], *, with_events: bool = False) -> None:
+        """Let markers arrive, whose number is also their time stamp."""
+        for number in numbers:
+            events = [event(number, number, number)] if with_events else []
+            self.arrive(number * 10, markers(number, number), *events)
 
     def forget(self) -> None:
         self.arrivals.frames.clear()
@@ -94,7 +101,7 @@ def test_the_newest_items_are_kept_up_to_a_number_and_a_size() -> None:
     assert [kept.append(item) for item in (b"h" * 9, b"i")] == [None, None]
 
 
-def test_the_rate_is_the_median_of_the_newest_time_stamps() -> None:
+def test_the_rate_is_the_median_of_the_newest_time_stamps_or_that_of_the_arrivals() -> None:
     """Two intervals are needed, because the first frame can come late."""
     source, rate = Source(), StreamRate()
     for number, period_us in ((1, None), (2, None), (3, 10_000)):
@@ -103,14 +110,10 @@ def test_the_rate_is_the_median_of_the_newest_time_stamps() -> None:
     for number in range(4, 40):
         rate.add(source.add(10_500 * number, markers(number, 10_000 + 5_000 * number)))
     assert rate.period_us == 5_000
-
-
-def test_without_time_stamps_the_rate_is_that_of_the_arrivals() -> None:
-    """Some servers send zeros."""
-    source, rate = Source(), StreamRate()
+    without_times = StreamRate()  # some servers send zeros
     for number in (1, 2, 3):
-        rate.add(source.add(7_000 * number, markers(number, 0)))
-    assert (rate.period_us, rate.has_times) == (7_000, False)
+        without_times.add(source.add(10**9 + 7_000 * number, markers(number, 0)))
+    assert (without_times.period_us, without_times.has_times) == (7_000, False)
 
 
 @pytest.mark.parametrize("pause", ["restart", "skip"])
@@ -152,8 +155,7 @@ def test_a_pause_without_frames_is_left_out_of_the_age_of_streams() -> None:
 
 def test_a_new_connection_takes_over_the_rate_and_the_old_one_is_forgotten() -> None:
     """A source that reconnects for days must not leave traces."""
-    source = Source()
-    source.play(3)
+    source = Source(played=3)
     source.add(40_000, markers(4, 40_000), stream=7)
     assert source.arrivals.rates[7].period_us == 10_000
     assert set(source.arrivals.rates) == {7, FAST}
@@ -169,11 +171,9 @@ def test_a_new_connection_takes_over_the_rate_and_the_old_one_is_forgotten() -> 
 def test_frames_are_found_by_time_after_older_ones_were_forgotten() -> None:
     """Clients keep the numbers of frames over a pause."""
     source = Source([MARKERS])
-    for at_us in (10, 20):
-        source.arrive(at_us, markers(1, at_us))
+    source.arrive_regularly([1, 2])
     source.forget()
-    for at_us in (30, 40, 50):
-        source.arrive(at_us, markers(1, at_us))
+    source.arrive_regularly([3, 4, 5])
     frames = source.frames
     assert [frames.tick_after(at_us) for at_us in (0, 29, 30, 39, 40, 49, 50, 60)] == [2, 2, 3, 3, 4, 4, 5, 5]
     assert [frames.time_us(tick) for tick in (1, 2, 4)] == [-1, 30, 50]
@@ -185,11 +185,11 @@ def test_frames_are_found_by_time_after_older_ones_were_forgotten() -> None:
 
 def test_the_announced_rate_of_the_slowest_component_counts_until_it_is_measured() -> None:
     """Joined frames have the rate of the slowest component."""
-    announced: dict[ComponentType, float] = {MARKERS: 200.0, TOOLS: 50.0, ANALOG: 1000.0}
-    assert Source([], announced).frames.rate == 50
-    assert Source(BOTH, announced).frames.rate == 200
+    announced: dict[str, Any] = {"MARKERS": 200.0, "TOOLS": 50.0, "ANALOG": 1000.0}
+    assert Source([], **announced).frames.rate == 50
+    assert Source(BOTH, **announced).frames.rate == 200
     assert Source().frames.rate == Fraction(100)
-    source = Source([], announced)
+    source = Source([], **announced)
     source.arrive(1, markers(1, 10), TOOL_OUT_OF_VIEW)
     assert source.frames.rate == 50
     for number in range(2, 9):
@@ -200,8 +200,7 @@ def test_the_announced_rate_of_the_slowest_component_counts_until_it_is_measured
 def test_the_packets_that_clients_share_are_bounded() -> None:
     """Clients with different choices of events would fill the memory."""
     source = Source([MARKERS])
-    for number in range(1, 201):
-        source.arrive(number * 10, markers(number, number * 10))
+    source.arrive_regularly(range(1, 201))
     assert source.numbers()[-1] == [200]
     assert len(source.frames._packets) == 64
     source.forget()
@@ -212,16 +211,14 @@ def test_the_packets_that_clients_share_are_bounded() -> None:
 
 
 def events_in(packet: Any) -> list[int]:
-    return [
-        int(item[0]) for each in components_in(packet.packet[8:]) if each.type == EVENT for item in each.items
-    ]
+    events = [each for each in components_in(packet.packet[8:]) if each.type == EVENT]
+    return [int(item[0]) for each in events for item in each.items]
 
 
 def test_a_frame_has_the_events_from_a_time_up_to_its_own() -> None:
     """No event is sent twice, and none is left out."""
     source = Source([MARKERS, ComponentType.EVENT])
-    for number in range(1, 5):
-        source.arrive(number * 10, markers(number, number), event(number, number, number))
+    source.arrive_regularly(range(1, 5), with_events=True)
     found = [events_in(source.frames.packet("big", 2, from_us)) for from_us in (0, 10, 11, 20, 30, 31)]
     assert found == [[1, 2, 3], [1, 2, 3], [2, 3], [2, 3], [3], []]
     assert source.frames.packet("big", 2, 20).components == (MARKERS, ComponentType.EVENT)
@@ -231,8 +228,7 @@ def test_a_frame_has_the_events_from_a_time_up_to_its_own() -> None:
 def test_a_frame_lacks_events_only_if_one_of_its_own_was_dropped() -> None:
     """Clients are told of their losses exactly."""
     source = Source([MARKERS, ComponentType.EVENT])
-    for number in range(1, KEPT_EVENTS + 2):
-        source.arrive(number * 10, markers(number, number), event(number, number, number))
+    source.arrive_regularly(range(1, KEPT_EVENTS + 2), with_events=True)
     newest = source.frames.next_frame - 1
     assert source.frames.packet("big", newest, 10).lacks_events
     assert not source.frames.packet("big", newest, 11).lacks_events
@@ -260,32 +256,22 @@ def test_events_of_several_frames_become_one_component_of_each_size() -> None:
 # Joining ------------------------------------------------------------------------------------
 
 
-def test_a_joined_packet_names_the_components_of_all_its_streams() -> None:
-    """What was sent is counted by component."""
-    source = Source()
-    source.play()
+def test_a_joined_packet_has_and_names_the_components_of_all_its_streams() -> None:
+    """Of a component in two frames the first counts: it sets the rate, and its time stamp is the frame's."""
+    source = Source(played=3)
     assert source.packets()[-1].components == (MARKERS, ANALOG)
     assert source.numbers() == [[1, 1], [2, 2], [3, 3]]
-
-
-def test_of_a_component_in_two_frames_the_first_counts() -> None:
-    """The frame that sets the rate comes first, and its markers belong to its time stamp."""
-    source = Source()
     arrivals = [source.add(1, markers(1, 10)), source.add(2, markers(2, 20), analog(2, 20), stream=FAST)]
-    joined = encode_joined(arrivals, frozenset(BOTH), [], "big")
-    assert joined == body(markers(1, 10), analog(2, 20))
+    assert encode_joined(arrivals, frozenset(BOTH), [], "big") == body(markers(1, 10), analog(2, 20))
 
 
 @pytest.mark.parametrize(
     ("analog_us", "is_joined", "waits"),
     [(39_997, True, True), (39_998, True, False), (40_002, True, False), (40_003, False, False)],
 )
-def test_time_stamps_of_one_moment_can_differ_by_rounding(
-    analog_us: int, is_joined: bool, waits: bool
-) -> None:
+def test_time_stamps_of_a_moment_differ_by_rounding(analog_us: int, is_joined: bool, waits: bool) -> None:
     """By 2 µs and not more: a later sample belongs to the next frame, an earlier one may not be the last."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     source.arrive(40_000, analog(4, analog_us), stream=FAST)
     due_us = source.arrive(40_001, markers(4, 40_000))
     assert due_us == (40_001 + 250_000 if waits else None)
@@ -295,10 +281,8 @@ def test_time_stamps_of_one_moment_can_differ_by_rounding(
 
 def test_a_frame_waits_exactly_a_quarter_of_a_second_for_its_samples() -> None:
     """A connection can stand still for a moment; after that the frame goes without."""
-    source = Source()
-    source.play()
-    assert source.arrive(40_000, markers(4, 40_000)) == 290_000
-    assert source.frames.update(289_999) == 290_000
+    source = Source(played=3)
+    assert source.arrive(40_000, markers(4, 40_000)) == source.frames.update(289_999) == 290_000
     assert len(source.numbers()) == 3
     assert source.frames.update(290_000) is None
     assert source.numbers()[3:] == [[4]]
@@ -307,21 +291,11 @@ def test_a_frame_waits_exactly_a_quarter_of_a_second_for_its_samples() -> None:
 def test_a_stream_without_times_is_not_waited_for_and_gives_its_newest_sample() -> None:
     """Its time stamps say nothing: neither how far it is, nor where its samples belong."""
     for stuck_us in (0, 900_000):
-        source = Source()
-        source.play()
+        source = Source(played=3)
         for number in range(4, 8):
             source.arrive(number * 10_000, analog(number, stuck_us), stream=FAST)
             source.arrive(number * 10_000 + 1, markers(number, number * 10_000))
         assert source.numbers()[-3:] == [[5, 5], [6, 6], [7, 7]]
-
-
-def test_a_stream_with_another_clock_is_not_waited_for() -> None:
-    """More than a second behind is another time base."""
-    source = Source()
-    source.play()
-    source.arrive(40_000, analog(4, 40_000), stream=FAST)
-    assert source.arrive(40_001, markers(4, 5_000_000)) is None
-    assert source.numbers()[3:] == [[4, 4]]
 
 
 def test_of_two_streams_with_nearly_one_rate_the_first_sets_it() -> None:
@@ -347,7 +321,7 @@ def test_a_stream_of_one_frame_in_a_second_goes_on_setting_the_rate() -> None:
 def test_frames_that_wait_are_bounded() -> None:
     """Frames can arrive faster than time passes."""
     source = Source()
-    source.play(period_us=900)
+    source.play(3, 900)
     for number in range(4, 4 + 1024 + 2):
         source.arrive(4_000 + number, markers(number, 900 * number))
     assert source.numbers()[3:] == [[4], [5]]
@@ -355,53 +329,49 @@ def test_frames_that_wait_are_bounded() -> None:
 
 def test_frames_get_later_times_even_if_they_have_waited() -> None:
     """Clients look for frames by time, so a frame that comes later must not be earlier."""
-    source = Source((*BOTH, ComponentType.EVENT))
-    source.play()
+    source = Source((*BOTH, ComponentType.EVENT), played=3)
     source.arrive(40_000, markers(4, 40_000))
     source.arrive(2_000_000, event(5, 50_000, 5))
     times_us = [source.frames.time_us(tick) for tick in range(source.frames.next_frame)]
     assert times_us == sorted(set(times_us))
 
 
-def test_the_first_frame_that_begins_before_its_samples_is_left_out() -> None:
-    """It is from before the client asked; a stream of another clock or without frames is no reason."""
-    for analog_us, sent in ((45_000, []), (1_039_999, []), (1_040_000, [[4]])):
-        source = Source()
-        source.play()
-        source.forget()
-        source.arrive(41_000, analog(9, analog_us), stream=FAST)
-        source.arrive(41_001, markers(4, 40_000))
-        assert source.numbers() == sent
+@pytest.mark.parametrize(
+    ("forgotten", "arrivals", "sent"),
+    [
+        pytest.param("", [(40_000, 4, 40_000), (40_001, -4, 5_000_000)], [[4, 4]], id="another clock"),
+        pytest.param("", [(40_000, -4, 40_000), (41_000, 5, 50_000)], [[4]], id="a lost sample"),
+        pytest.param("all", [(41_000, 9, 45_000), (41_001, -4, 40_000)], [], id="before the samples"),
+        pytest.param("all", [(41_000, 9, 1_039_999), (41_001, -4, 40_000)], [], id="long before them"),
+        pytest.param("all", [(41_000, 9, 1_040_000), (41_001, -4, 40_000)], [[4]], id="another clock again"),
+        pytest.param("frames", [(280_000, -4, 280_000)], [[4]], id="a silent stream, which may stay silent"),
+    ],
+)
+def test_whether_a_frame_goes_without_a_sample_or_is_left_out(
+    forgotten: str, arrivals: list[tuple[int, int, int]], sent: list[list[int]]
+) -> None:
+    """The first frame after a pause is left out if it is from before the client asked.
 
-
-def test_a_frame_is_not_left_out_for_a_stream_that_is_silent() -> None:
-    """Nobody knows whether it begins again."""
-    source = Source()
-    source.play()
-    source.frames.forget()
-    source.arrive(30_000 + 250_000, markers(4, 280_000))
-    assert source.numbers() == [[4]]
-
-
-def test_a_stream_that_has_begun_may_skip_a_frame() -> None:
-    """Lost samples do not cost the frame."""
-    source = Source()
-    source.play()
-    source.arrive(40_000, markers(4, 40_000))
-    source.arrive(41_000, analog(5, 50_000), stream=FAST)
-    assert source.numbers()[3:] == [[4]]
+    Positive numbers are those of analog frames, negative ones those of markers.
+    """
+    source = Source(played=3)
+    {"": lambda: None, "all": source.forget, "frames": source.frames.forget}[forgotten]()
+    for at_us, number, timestamp_us in arrivals:
+        if number > 0:
+            source.arrive(at_us, analog(number, timestamp_us), stream=FAST)
+        else:
+            source.arrive(at_us, markers(-number, timestamp_us))
+    assert source.numbers()[0 if forgotten else 3 :] == sent
 
 
 def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
     """The present frame of a client that asks now is a new one, with new samples."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     source.arrive(40_000, analog(4, 40_000), stream=FAST)  # a sample that no frame has taken
     source.arrive(40_001, markers(5, 50_000))  # a frame that waits
     source.add(40_002, analog(6, 60_000), stream=FAST)  # not looked at yet
     source.frames.forget()
-    assert source.frames.update(40_003) is None
-    assert source.frames.update(400_000) is None
+    assert source.frames.update(40_003) is source.frames.update(400_000) is None  # no timer is set any more
     assert source.numbers() == []
     source.arrivals.frames.clear()
     source.arrive(500_000, markers(7, 70_000))
@@ -412,36 +382,21 @@ def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
     assert source.numbers() == [[8, 8]]
 
 
-def test_a_frame_that_waits_is_forgotten_in_a_pause() -> None:
-    """No timer is set for it any more."""
-    source = Source()
-    source.play()
-    assert source.arrive(40_000, markers(4, 40_000)) is not None
-    source.frames.forget()
-    assert source.frames.update(40_001) is None
-
-
 # What is not known yet ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("announced_hz", "until_us"), [({}, 110_000), ({ANALOG: 1000.0}, 310_000)])
-def test_frames_of_a_new_source_wait_until_its_streams_are_known(
-    announced_hz: dict[ComponentType, float], until_us: int
-) -> None:
+@pytest.mark.parametrize(("announced_hz", "until_us"), [({}, 110_000), ({"ANALOG": 1000.0}, 310_000)])
+def test_frames_wait_until_streams_are_known(announced_hz: dict[str, Any], until_us: int) -> None:
     """For 0.1 s, or for 0.3 s if the server announces more than has come."""
-    source = Source(BOTH, announced_hz, is_new=True)
+    source = Source(is_new=True, **announced_hz)
     assert source.frames.update(5) is None  # nothing waits
     assert source.arrive(10_000, markers(1, 10_000)) == until_us
     assert source.frames.update(until_us - 1) == until_us
     assert source.numbers() == []
     assert source.frames.update(until_us) is None
     assert source.numbers() == [[1]]
-
-
-def test_frames_that_wait_for_a_new_source_are_forgotten_with_the_others() -> None:
-    """Nobody asks for them any more."""
-    source = Source(is_new=True)
-    source.arrive(10_000, markers(1, 10_000))
-    source.forget()
-    source.frames.update(500_000)
-    assert source.numbers() == []
+    forgotten = Source(is_new=True, **announced_hz)
+    forgotten.arrive(10_000, markers(1, 10_000))
+    forgotten.forget()
+    forgotten.frames.update(500_000)
+    assert forgotten.numbers() == []

@@ -1,13 +1,229 @@
-"""Which packets of clients control recordings, and which names they give them."""
+"""What the gateway adds to a client's connection: the first command, control of recordings, files."""
 
+import asyncio
+import socket
 import struct
+from pathlib import Path
 
 import pytest
 
-from gateway.outputs.rtc3d.client_filter import asks_for_parameters, recording_control, recording_name
+from gateway.errors import QueryError
+from gateway.outputs.rtc3d.client_filter import (
+    MAX_HELD_PACKETS,
+    asks_for_parameters,
+    recording_control,
+    recording_name,
+)
+from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
 from gateway.rtc3d.commands import ControlRecording
 from gateway.rtc3d.packets import Packet
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, EVENT
+from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
+from tests.losses import amounts
+from tests.unit.outputs.rtc3d.scripted_server import (
+    Client,
+    ScriptedServer,
+    in_virtual_time,
+    settle,
+    write_file,
+)
+from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, streaming
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, command, packet
+
+C3D = 5
+VERSION = (COMMAND, b"OK-Version 1.0")
+_CHUNK = 256 * 1024
+
+
+@in_virtual_time
+async def test_a_client_without_a_command_is_disconnected_after_ten_seconds(server: ScriptedServer) -> None:
+    """Programs of other protocols must not occupy places; errors are no commands."""
+    good, wrong, silent = await server.greeted(), server.client(), server.client()
+    assert [kind for kind, _ in await wrong.ask("Fly", "Fly higher")] == [ERROR, ERROR]
+    await asyncio.sleep(9.9)
+    assert silent.receive() == []
+    await asyncio.sleep(0.1)
+    for client in (wrong, silent):
+        assert client.receive() == [(ERROR, b"Error-No command within 10 s; closing")]
+        assert client.line.is_closed
+    assert good.receive() == []
+    assert not good.line.is_closed
+
+
+@in_virtual_time
+async def test_the_system_is_asked_to_notice_vanished_clients() -> None:
+    """A computer that loses power sends no end."""
+    options = ScriptedServer().client().line.options
+    assert options[socket.SO_KEEPALIVE] == 1
+    idle, interval, count = socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT
+    assert (options[idle], options[interval], options[count]) == (10, 5, 3)
+    assert options[socket.TCP_USER_TIMEOUT] == 300_000
+
+
+# Recordings ---------------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_a_recording_is_acknowledged_once_it_is_done(server: ScriptedServer, client: Client) -> None:
+    """Commands after it wait, so that a client sees the replies in order."""
+    start, stop = "Recording Start,file=walk.c3d", "Recording Stop"
+    assert await client.ask(start, stop, "Version 1.0") == []
+    assert server.asked == [("lab", True, "walk")]
+    await server.answers.put(None)
+    await settle()
+    assert client.receive() == [(COMMAND, f"OK-{start}".encode())]
+    assert server.asked[1:] == [("lab", False, "")]
+    await server.answers.put(None)
+    await settle()
+    assert client.receive() == [(COMMAND, b"OK-Recording Stop"), VERSION]
+    await asyncio.sleep(20)
+    assert not client.line.is_closed  # the control of a recording was its first command
+
+
+@pytest.mark.parametrize(("sent", "done"), [("Recording Start", b"started"), ("Recording Stop", b"stopped")])
+@in_virtual_time
+async def test_a_refusal_says_why(server: ScriptedServer, client: Client, sent: str, done: bytes) -> None:
+    """A defect is no reason to leave the client without an answer; it waits for 30 s at most."""
+    for error, reason in (
+        (QueryError("remote control is off"), b"remote control is off"),
+        (KeyError(), b"a defect"),
+    ):
+        await server.answers.put(error)
+        [(kind, text)] = await client.ask(sent)
+        assert kind == ERROR
+        assert text.startswith(b"Error-The recording was not " + done + b": " + reason)
+        assert await client.ask("Version 1.0") == [VERSION]
+    assert await client.ask(sent) == []
+    await asyncio.sleep(29.9)
+    assert client.receive() == []
+    await asyncio.sleep(0.2)
+    assert client.receive() == [(ERROR, b"Error-The recording was not " + done + b": no answer within 30 s")]
+
+
+@in_virtual_time
+async def test_a_client_that_goes_ends_what_waits_for_it(client: Client) -> None:
+    """Nothing is left behind: no timer, no task."""
+    await client.ask("Recording Start")
+    client.line.abort()
+    await settle()
+    assert asyncio.all_tasks() == {asyncio.current_task()}
+    await asyncio.sleep(20)
+    assert client.receive() == []
+
+
+# Files --------------------------------------------------------------------------------------
+
+
+async def stalled(server: ScriptedServer, tmp_path: Path, content: bytes = b"walk", *texts: str) -> Client:
+    """Return a client that does not read, with a file on the way to it."""
+    client = await server.greeted(*texts)
+    client.receive()
+    client.line.num_unread = 2**30
+    server.send_file(write_file(tmp_path, "walk.c3d", content))
+    await settle()
+    return client
+
+
+@in_virtual_time
+async def test_files_go_whole_and_in_order_to_clients_that_have_greeted(tmp_path: Path) -> None:
+    """A half-open connection gets no file, and files are closed."""
+    server = ScriptedServer()
+    client, silent = await server.greeted(), server.client()
+    contents = [bytes([number]) * length for number, length in enumerate((3 * _CHUNK + 7, 1, _CHUNK, 0))]
+    for number, content in enumerate(contents):
+        server.send_file(write_file(tmp_path, f"{number}.c3d", content))
+    await settle()
+    assert client.receive() == [(C3D, content) for content in contents]
+    assert silent.receive() == []
+    assert server.files.opened == []
+    assert not server.losses.report()
+
+
+@in_virtual_time
+async def test_a_file_is_read_no_faster_than_the_client_reads(server: ScriptedServer, tmp_path: Path) -> None:
+    """A long file must not fill the memory."""
+    content = bytes(5 * _CHUNK)
+    client = await stalled(server, tmp_path, content)
+    client.line.num_unread = 1024 * 1024 + 1
+    await asyncio.sleep(10)
+    assert len(client.line.written) == 8 + _CHUNK
+    client.line.num_unread = 1024 * 1024
+    await asyncio.sleep(0.1)
+    assert client.receive() == [(C3D, content)]
+
+
+@in_virtual_time
+async def test_at_most_four_files_wait_for_a_client(server: ScriptedServer, tmp_path: Path) -> None:
+    """Further ones are counted as lost."""
+    await server.greeted()
+    for number in range(6):
+        server.send_file(write_file(tmp_path, f"{number}.c3d", b"x"))
+    assert amounts(server.losses.report()) == {FILE: (2, 0)}
+
+
+@in_virtual_time
+async def test_a_file_that_is_gone_is_counted_and_the_next_one_comes(tmp_path: Path) -> None:
+    """The client stays connected: it has got nothing of it."""
+    server = ScriptedServer()
+    client = await server.greeted()
+    server.send_file(tmp_path / "gone.c3d")
+    server.send_file(write_file(tmp_path, "walk.c3d", b"walk"))
+    await settle()
+    assert client.receive() == [(C3D, b"walk")]
+    assert amounts(server.losses.report()) == {FILE: (1, 0)}
+
+
+@in_virtual_time
+async def test_a_file_that_became_shorter_ends_the_connection(server: ScriptedServer, tmp_path: Path) -> None:
+    """The client expects the rest, and would take further packets for it."""
+    client = await stalled(server, tmp_path, bytes(2 * _CHUNK))
+    write_file(tmp_path, "walk.c3d", b"short")
+    client.line.num_unread = 0
+    await asyncio.sleep(0.1)
+    assert client.line.is_aborted
+    assert amounts(server.losses.report()) == {FILE: (1, 0)}
+    assert server.files.opened == []
+
+
+@in_virtual_time
+async def test_replies_wait_for_the_end_of_a_file_and_frames_are_dropped(tmp_path: Path) -> None:
+    """Nothing may come in the middle of a file, and nothing twice."""
+    server = ScriptedServer()
+    client = await streaming(server)
+    client.line.num_unread = 2**30
+    server.send_file(write_file(tmp_path, "walk.c3d", b"walk"))
+    await settle()
+    client.connection.filter.receive(command("Version 1.0"))
+    server.arrive(2)
+    server.state.is_streaming = False
+    await asyncio.sleep(1)
+    server.apply_state()
+    client.line.num_unread = 0
+    await asyncio.sleep(0.1)
+    assert client.receive() == [(C3D, b"walk"), NO_FRAMES, VERSION]
+    server.send_file(write_file(tmp_path, "run.c3d", b"run"))
+    await settle()
+    assert client.receive() == [(C3D, b"run")]
+    server.arrive(3)
+    await settle()
+    assert [kind for kind, _ in client.receive()] == [DATA]
+    assert client.connection.session.frames_dropped == 1
+
+
+@in_virtual_time
+async def test_packets_that_wait_for_the_end_of_a_file_are_bounded(tmp_path: Path) -> None:
+    """Exactly as many wait as fit; the others are counted."""
+    server = ScriptedServer()
+    client = await stalled(server, tmp_path, b"walk", STREAM)
+    for _ in range(MAX_HELD_PACKETS + 3):
+        client.connection.filter.send(packet(*NO_FRAMES))
+    assert amounts(server.losses.report()) == {SLOW_CLIENT: (3, 0)}
+    client.line.num_unread = 0
+    await asyncio.sleep(0.1)
+    assert client.receive() == [(C3D, b"walk"), *[NO_FRAMES] * MAX_HELD_PACKETS]
+    assert MAX_HELD_PACKETS > MAX_FRAME_REQUESTS
+
+
+# Which packets control recordings ----------------------------------------------------------
 
 
 def switch(event_id: int, sign: str = ">", number: int = -1) -> bytes:
@@ -20,41 +236,30 @@ def switch(event_id: int, sign: str = ">", number: int = -1) -> bytes:
 @pytest.mark.parametrize("sign", [">", "<"])
 @pytest.mark.parametrize("ending", [b"", b"\n"])
 def test_the_recording_packet_starts_and_stops(sign: str, ending: bytes) -> None:
-    assert recording_control(Packet(DATA, switch(1, sign) + ending)) == ControlRecording(True)
-    assert recording_control(Packet(DATA, switch(0, sign) + ending)) == ControlRecording(False)
-
-
-def test_the_recording_commands_start_and_stop() -> None:
-    start = recording_control(Packet(COMMAND, b"Recording Start,file=walk 1.c3d\n"))
-    assert start == ControlRecording(True, ",file=walk 1.c3d")
-    assert recording_control(Packet(COMMAND, b"recording stop\0")) == ControlRecording(False)
+    for is_start in (True, False):
+        found = recording_control(Packet(DATA, switch(int(is_start), sign) + ending))
+        assert found == ControlRecording(is_start)
 
 
 @pytest.mark.parametrize(
-    "packet",
+    ("sent", "control"),
     [
-        Packet(COMMAND, b"Version 1.0"),
-        Packet(COMMAND, b"Recording"),
-        Packet(COMMAND, b""),
-        Packet(DATA, b"\0\0\0\1"),
-        Packet(DATA, switch(2)),
-        Packet(DATA, switch(1, number=7)),
-        Packet(77, switch(1)),
+        (Packet(COMMAND, b"Recording Start,file=walk 1.c3d\n"), ControlRecording(True, ",file=walk 1.c3d")),
+        (Packet(COMMAND, b"recording stop\0"), ControlRecording(False)),
+        *((Packet(COMMAND, text), None) for text in (b"Version 1.0", b"Recording", b"")),
+        *((Packet(DATA, data), None) for data in (b"\0\0\0\1", switch(2), switch(1, number=7))),
+        (Packet(77, switch(1)), None),
     ],
 )
-def test_other_packets_do_not(packet: Packet) -> None:
-    assert recording_control(packet) is None
+def test_only_recording_commands_start_and_stop(sent: Packet, control: ControlRecording | None) -> None:
+    assert recording_control(sent) == control
 
 
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        ("", ""),
-        (",file=walk.c3d", "walk"),
-        (", File = walk 1.c3d ", "walk 1"),
-        (" file=walk", "walk"),
-        (",rate=200", ""),
-        (r",file=C:\data\walk.c3d", r"C:\data\walk"),
+        *(("", ""), (",rate=200", ""), (",file=walk.c3d", "walk"), (" file=walk", "walk")),
+        *((", File = walk 1.c3d ", "walk 1"), (r",file=C:\data\walk.c3d", r"C:\data\walk")),
     ],
 )
 def test_the_name_of_a_recording(options: str, name: str) -> None:
@@ -63,6 +268,9 @@ def test_the_name_of_a_recording(options: str, name: str) -> None:
 
 def test_requests_for_parameters_are_recognised() -> None:
     assert asks_for_parameters(Packet(COMMAND, b"sendparameters 3D\n"))
-    assert not asks_for_parameters(Packet(COMMAND, b"SendCurrentFrame"))
-    assert not asks_for_parameters(Packet(COMMAND, b""))
-    assert not asks_for_parameters(Packet(DATA, b"SendParameters"))
+    for other in (
+        Packet(COMMAND, b"SendCurrentFrame"),
+        Packet(COMMAND, b""),
+        Packet(DATA, b"SendParameters"),
+    ):
+        assert not asks_for_parameters(other)

@@ -1,97 +1,84 @@
-"""Frames of a live source for its clients: passed on unchanged, cut, converted."""
+"""Frames of a live source for its clients: passed on, cut, converted, joined by time stamp, and events."""
 
 from itertools import pairwise
 
 import pytest
 
+from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, WAIT_US
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.unit.outputs.rtc3d.live_client import (
+    FAST,
+    SLOW,
     TOOL_OUT_OF_VIEW,
     LiveSource,
     analog,
     body,
     component,
     event,
+    event_of,
+    frame_of_markers,
     markers,
 )
-from tests.unit.rtc3d_server.wire import COMMAND, ERROR
+from tests.unit.rtc3d_server.wire import COMMAND, ERROR, EVENT, MARKERS, WireComponent
+
+UNKNOWN = bytes.fromhex("0000000c 00000063 01020304")
+WHOLE = body(markers(7, 10_000), TOOL_OUT_OF_VIEW, event(7, 10_000, 3), UNKNOWN) + b"\n"
+ONE_TOOL = body(TOOL_OUT_OF_VIEW)
+AT_7 = (markers(7, 10_000), analog(70, 10_001))
+BOTH = "StreamFrames 3D Analog"
+each_order = pytest.mark.parametrize("fast_first", [False, True])
 
 
-@pytest.mark.parametrize("command", ["StreamFrames", "StreamFrames AllFrames 3D 6D Analog Force Events"])
-def test_a_body_is_passed_on_unchanged(command: str) -> None:
+@pytest.mark.parametrize(
+    ("requested", "arrived", "sent"),
+    [
+        ("", WHOLE, [WHOLE]),
+        ("AllFrames 3D 6D Analog Force Events", WHOLE, [WHOLE]),
+        ("6D Analog", body(*AT_7, TOOL_OUT_OF_VIEW, event(7, 10_000, 3)), [body(TOOL_OUT_OF_VIEW, AT_7[1])]),
+        ("6D Analog", body(TOOL_OUT_OF_VIEW, UNKNOWN), [ONE_TOOL]),
+        ("3D", body(*AT_7, markers(8, 10_100)), [body(AT_7[0], markers(8, 10_100))]),
+        ("", body(), []),
+    ],
+)
+def test_components_are_passed_on_or_cut_out(requested: str, arrived: bytes, sent: list[bytes]) -> None:
     source = LiveSource()
-    client = source.client()
-    client.send(command)
-    unknown = bytes.fromhex("0000000c 00000063 01020304")
-    sent = body(markers(7, 10_000), TOOL_OUT_OF_VIEW, event(7, 10_000, 3), unknown) + b"\n"
-    source.arrive(sent)
-    assert client.bodies == [sent]
-
-
-def test_some_components_are_cut_out_and_keep_their_bytes() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames 6D Analog")
-    source.arrive(body(markers(7, 10_000), TOOL_OUT_OF_VIEW, analog(70, 10_001), event(7, 10_000, 3)))
-    unknown = bytes.fromhex("0000000c 00000063 01020304")
-    source.arrive(body(TOOL_OUT_OF_VIEW, unknown))
-    assert client.bodies == [body(TOOL_OUT_OF_VIEW, analog(70, 10_001)), body(TOOL_OUT_OF_VIEW)]
-
-
-def test_a_repeated_component_is_passed_on_as_often() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames 3D")
-    source.arrive(body(markers(7, 10_000), analog(70, 10_000), markers(8, 10_100)))
-    assert client.bodies == [body(markers(7, 10_000), markers(8, 10_100))]
+    client = source.client(f"StreamFrames {requested}")
+    source.arrive(arrived)
+    assert client.bodies == sent
 
 
 def test_components_that_the_gateway_skips_are_left_out() -> None:
     source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames")
+    client = source.client("StreamFrames")
     source.arrive(body(markers(7, 10_000), event(7, 10_000, 3)), wanted=frozenset({ComponentType.EVENT}))
     assert client.bodies == [body(event(7, 10_000, 3))]
 
 
 def test_a_client_gets_its_byte_order_whatever_the_server_sends() -> None:
     source = LiveSource()
-    big, little = source.client(), source.client()
-    little.send("SetByteOrder LittleEndian")
-    for client in (big, little):
-        client.send("StreamFrames")
+    big, little = source.client("StreamFrames"), source.client("SetByteOrder LittleEndian", "StreamFrames")
     as_big = body(markers(7, 10_000), analog(70, 10_000))
     as_little = body(markers(7, 10_000, "little"), analog(70, 10_000, "little"), byte_order="little")
     source.arrive(as_big)
     source.arrive(as_little, byte_order="little")
-    assert big.bodies == [as_big, as_big]
-    assert little.bodies == [as_little, as_little]
-
-
-def test_out_of_view_is_out_of_view_in_both_byte_orders() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("SetByteOrder LittleEndian")
-    client.send("StreamFrames")
-    source.arrive(body(TOOL_OUT_OF_VIEW))
-    assert client.bodies[0].endswith(b"\xff" * 32)
+    assert (big.bodies, little.bodies) == ([as_big] * 2, [as_little] * 2)
+    source.arrive(ONE_TOOL)
+    assert little.bodies[-1].endswith(b"\xff" * 32)  # out of view in both byte orders
 
 
 def test_frames_without_the_components_of_a_client_are_none_for_it() -> None:
     source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames FrequencyDivisor:2 3D")
+    client = source.client("StreamFrames FrequencyDivisor:2 3D")
     for number in range(1, 7):
-        source.arrive(body(markers(number, 10_000 * number)))
+        source.arrive(frame_of_markers(number))
         source.arrive(body(analog(number, 10_000 * number + 5000)))
     assert client.numbers() == [[1], [3], [5]]
 
 
 def test_a_frequency_is_that_of_the_time_stamps() -> None:
     source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames Frequency:60 3D")  # before the rate is known
+    client = source.client("StreamFrames Frequency:60 3D")  # before the rate is known
     for number in range(1, 401):
         source.arrive(body(markers(number, 5_000 * number)))
     numbers = [frame[0] for frame in client.numbers()][20:]
@@ -101,58 +88,309 @@ def test_a_frequency_is_that_of_the_time_stamps() -> None:
 
 
 def test_the_current_frame_is_the_newest_and_each_is_sent_once() -> None:
+    """What was before a pause is not current."""
     source = LiveSource()
-    watching, client = source.client(), source.client()
-    watching.send("StreamFrames")
+    source.client("StreamFrames")
     for number in (1, 2):
-        source.arrive(body(markers(number, 10_000 * number)))
-    client.send("SendCurrentFrame 3D")
+        source.arrive(frame_of_markers(number))
+    client = source.client("SendCurrentFrame 3D")
     assert client.numbers() == [[2]]
     client.send("SendCurrentFrame 3D")
     assert client.numbers() == []
-    source.arrive(body(markers(3, 30_000)))
-    source.arrive(body(markers(4, 40_000)))
+    source.arrive(frame_of_markers(3))
+    source.arrive(frame_of_markers(4))
     assert client.numbers() == [[3]]
-
-
-def test_requests_for_components_that_never_come_are_bounded() -> None:
-    source = LiveSource()
-    client = source.client()
-    for _ in range(MAX_FRAME_REQUESTS):
-        assert client.send("SendCurrentFrame Force")[0][0] == COMMAND
-    ((kind, text),) = client.send("SendCurrentFrame Force")
-    assert (kind, text) == (ERROR, b"Error-1000 requests for the current frame wait already")
-    assert len(client.session.measurement_stopped()) == MAX_FRAME_REQUESTS
-
-
-def test_what_was_before_a_pause_is_not_the_current_frame() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("SendCurrentFrame 3D")
-    source.arrive(body(markers(1, 10_000)))
-    assert client.numbers() == [[1]]
     source.scene.forget_frames()
-    other = source.client()
-    other.send("SendCurrentFrame 3D")
+    other = source.client("SendCurrentFrame 3D")
     assert other.numbers() == []
-    source.arrive(body(markers(9, 90_000)))
+    source.arrive(frame_of_markers(9))
     assert other.numbers() == [[9]]
 
 
-def test_an_empty_frame_is_nothing() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames")
-    source.arrive(body())
-    assert client.bodies == []
+def test_requests_for_components_that_never_come_are_bounded() -> None:
+    client = LiveSource().client()
+    for _ in range(MAX_FRAME_REQUESTS):
+        assert client.send("SendCurrentFrame Force")[0][0] == COMMAND
+    assert client.send("SendCurrentFrame Force")[0][0] == ERROR
+    assert len(client.session.measurement_stopped()) == MAX_FRAME_REQUESTS
 
 
 def test_little_is_kept_of_large_frames() -> None:
     source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames 3D")
+    client = source.client("StreamFrames 3D")
     large = body(component(1, 1, 10_000, [(0, 0, 0, 0)] * 100_000))
     for _ in range(40):
         source.arrive(large)
         client.bodies.clear()
     assert sum(arrival.num_bytes for arrival in source.scene._arrivals.frames.since(0)) < 10_000_000
+
+
+# Joined frames ------------------------------------------------------------------------------
+
+
+def joined(first: int, last: int) -> list[list[int]]:
+    """Return the frame numbers of markers and analog in complete frames of what is played."""
+    return [[number, 10 * number] for number in range(first, last + 1)]
+
+
+@each_order
+def test_components_of_two_streams_are_joined_by_time_stamp(fast_first: bool) -> None:
+    source = LiveSource(played=3, fast_first=fast_first)
+    client, whole = source.client(BOTH), source.client("StreamFrames")
+    source.play(4, 20, fast_first=fast_first)
+    assert client.numbers() == joined(4, 20)
+    assert whole.bodies[0] == frame_of_markers(4, analog(40, 40_000), event(4, 40_000, 4))
+
+
+def test_a_client_of_one_stream_gets_every_frame_of_it() -> None:
+    source = LiveSource()
+    client = source.client("StreamFrames Analog")
+    source.play(1, 5)
+    assert client.numbers() == [[number] for number in range(10, 60)]
+
+
+def test_at_first_frames_wait_until_the_announced_components_are_known() -> None:
+    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=1000.0)
+    client = source.client(BOTH)
+    for step in range(5):
+        source.arrive(body(analog(5 + step, 5000 + 1000 * step)), FAST)
+        source.wait(1000)
+    assert client.take() == []
+    source.play(1, 3)
+    assert client.numbers() == joined(1, 3)
+
+
+def test_at_first_frames_wait_until_the_rates_are_known() -> None:
+    source = LiveSource(is_new=True)
+    client = source.client(BOTH)
+    source.play(1, 20, fast_first=True)
+    assert client.numbers() == joined(1, 20)
+
+
+def test_the_second_frame_of_a_new_source_waits_for_its_sample() -> None:
+    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=100.0)
+    client = source.client(BOTH)
+    for number in range(1, 4):
+        source.arrive(frame_of_markers(number))
+        source.wait(1000)
+        source.arrive(body(analog(number, 10_000 * number)), FAST)
+        source.wait(9000)
+    assert client.numbers() == [[1, 1], [2, 2], [3, 3]]
+
+
+def test_a_client_that_asks_between_two_samples_gets_complete_frames_only() -> None:
+    source = LiveSource(played=3, fast_first=True)
+    source.scene.forget_frames()
+    source.arrive(body(analog(40, 40_000)), FAST)
+    source.scene.forget_frames()
+    client = source.client(BOTH)
+    source.arrive(frame_of_markers(4))
+    for step in range(1, 10):
+        source.arrive(body(analog(40 + step, 40_000 + 1000 * step)), FAST)
+    source.play(5, 6, fast_first=True)
+    assert client.numbers() == joined(5, 6)
+
+
+@pytest.mark.parametrize("command", ["StreamFrames 3D Analog", "SendCurrentFrame 3D Analog"])
+@pytest.mark.parametrize("pause_us", [300_000, 5_000_000])
+@each_order
+def test_the_first_frames_after_a_pause_are_complete(command: str, pause_us: int, fast_first: bool) -> None:
+    source = LiveSource(played=3, fast_first=True)
+    source.scene.forget_frames()  # nobody asks for any
+    source.wait(pause_us)
+    client = source.client(command)
+    base_us = 40_000 + pause_us
+    for step in range(5, 10):
+        source.arrive(body(analog(step, base_us - 10_000 + 1000 * step)), FAST)
+        source.wait(1000)
+    source.play(0, 2, fast_first=fast_first, base_us=base_us)
+    assert {len(frame) for frame in client.numbers()} == {2}
+
+
+@each_order
+def test_a_measurement_that_begins_late_begins_with_complete_frames(fast_first: bool) -> None:
+    source = LiveSource(played=3, fast_first=fast_first)
+    source.scene.stop()
+    client = source.client(BOTH)
+    source.wait(1_500_000)
+    source.arrive(body(analog(9, 9_000)), FAST)
+    source.play(1, 3, fast_first=fast_first)
+    numbers = client.numbers()
+    assert numbers[-2:] == joined(2, 3)
+    assert {len(frame) for frame in numbers} == {2}
+
+
+def test_requests_with_pauses_between_them_do_not_change_the_rate() -> None:
+    source = LiveSource(played=3)
+    client = source.client()
+    for number in range(100, 300, 10):
+        source.scene.forget_frames()
+        client.send("SendCurrentFrame")
+        source.wait(500_000)
+        source.play(number, number)
+    assert {len(frame) for frame in client.take()} == {3}
+    assert source.scene.frames(()).rate == 100
+
+
+def test_a_frame_waits_for_the_faster_stream_and_not_for_ever() -> None:
+    source = LiveSource(played=5)
+    client = source.client(BOTH)
+    source.arrive(frame_of_markers(6))
+    source.wait(WAIT_US - 1)
+    assert client.take() == []
+    source.wait(1)
+    assert client.numbers() == [[6, 59]]
+    source.wait(1_000_000)
+    source.arrive(frame_of_markers(7))
+    assert client.numbers() == [[7]]
+
+
+def test_while_the_slower_stream_has_no_frames_the_faster_one_sets_the_rate() -> None:
+    source = LiveSource(played=5)
+    client = source.client(BOTH)
+    source.wait(1_100_000)
+    source.arrive(body(analog(2000, 2_000_000)), FAST)
+    assert client.numbers() == [[2000]]
+    source.play(300, 304)
+    assert client.numbers()[-4:] == joined(301, 304)
+
+
+@each_order
+def test_a_new_measurement_is_joined_from_its_first_frames(fast_first: bool) -> None:
+    source = LiveSource()
+    client = source.client(BOTH)
+    source.play(1000, 1010)
+    client.take()
+    source.play(1, 5, fast_first=fast_first)
+    assert client.numbers()[1:] == joined(2, 5)
+
+
+def test_a_connection_that_is_made_again_continues_the_joined_frames() -> None:
+    source = LiveSource(played=5)
+    client = source.client(BOTH)
+    for number in range(6, 10):
+        source.arrive(frame_of_markers(number), SLOW + 2)
+        source.arrive(body(analog(10 * number, 10_000 * number)), FAST)
+        source.wait(10_000)
+    assert client.numbers() == joined(6, 9)
+
+
+def test_time_stamps_that_are_no_times_join_the_newest_without_waiting() -> None:
+    source = LiveSource()
+    client = source.client(BOTH)
+    for number in range(1, 10):
+        source.arrive(body(analog(number, 0)), FAST)
+        source.arrive(body(markers(number, 0)), SLOW)
+    assert client.numbers()[-6:] == [[number, number] for number in range(4, 10)]
+
+
+# Events ----------------------------------------------------------------------------------------
+
+
+def test_no_event_is_lost_at_a_low_rate() -> None:
+    source = LiveSource()
+    client = source.client("StreamFrames FrequencyDivisor:4 3D Events")
+    for number in range(1, 10):
+        source.arrive(frame_of_markers(number, event_of(number)))
+    frames = client.take()
+    assert [frame[0].frame_number for frame in frames] == [1, 5, 9]
+    items: list[tuple[float, ...]] = [(number, 10_000 * number, -1, -1, -1) for number in range(1, 10)]
+    expected = [(1, items[:1]), (5, items[1:5]), (9, items[5:])]
+    assert [frame[1] for frame in frames] == [
+        WireComponent(EVENT, number, 10_000 * number, found) for number, found in expected
+    ]
+
+
+def test_a_client_that_lacks_events_is_counted() -> None:
+    source = LiveSource()
+    slow = source.client("StreamFrames FrequencyDivisor:5000 3D Events")
+    other = source.client("StreamFrames 3D Events")
+    for number in range(1, 5002):
+        source.arrive(frame_of_markers(number, event_of(number)))
+    assert slow.event_ids()[1] == list(range(5002 - KEPT_EVENTS, 5002))
+    assert (slow.session.frames_without_events, other.session.frames_without_events) == (1, 0)
+    for number in range(5002, 10_002):
+        source.arrive(frame_of_markers(number, *([event_of(number)] if number % 10 == 0 else [])))
+    assert [len(ids) for ids in slow.event_ids()] == [500]
+    assert slow.session.frames_without_events == 1
+
+
+def test_events_without_other_components_are_frames_of_their_own() -> None:
+    source = LiveSource()
+    client, other = source.client("StreamFrames Events"), source.client("StreamFrames Events 6D")
+    sent = [body(event_of(number)) for number in range(3)]
+    for each in sent:
+        source.arrive(each)
+    source.arrive(frame_of_markers(4, event_of(4)))
+    assert client.bodies == other.bodies == [*sent, body(event_of(4))]
+
+
+@pytest.mark.parametrize("rate", ["FrequencyDivisor:5", "Frequency:20"])
+def test_an_event_does_not_wait_for_others(rate: str) -> None:
+    source = LiveSource(played=3)
+    client = source.client(f"StreamFrames {rate} Events")
+    for number in range(4, 50):
+        source.arrive(frame_of_markers(number, *([event_of(number)] if number in {7, 8, 22} else [])))
+        source.arrive(body(analog(number, 10_000 * number)), FAST)
+        assert number != 13 or client.event_ids() == [[7, 8]]
+    assert client.event_ids() == [[22]]
+
+
+def test_an_event_on_a_faster_stream_does_not_wait_for_the_slower_one() -> None:
+    source = LiveSource(played=3)
+    client = source.client("StreamFrames Events")
+    source.arrive(body(analog(40, 40_000), event(40, 40_000, 9)), FAST)
+    assert client.bodies == [body(event(40, 40_000, 9))]
+
+
+def test_a_request_for_events_does_not_wait_for_one() -> None:
+    source = LiveSource()
+    client = source.client("SendCurrentFrame Events")
+    source.arrive(frame_of_markers(1))
+    assert client.bodies == [body()]
+    client.send("SendCurrentFrame Events")
+    source.arrive(frame_of_markers(2, event_of(2)))
+    assert client.bodies == [body(), body(event_of(2))]
+
+
+def test_a_request_for_components_that_do_not_come_gets_an_empty_frame() -> None:
+    source = LiveSource(played=3)
+    client, streaming = source.client(), source.client("StreamFrames 6D")
+    source.arrive(frame_of_markers(4))
+    client.send("SendCurrentFrame 6D")
+    assert (client.bodies, streaming.bodies) == ([body()], [])
+    source.arrive(frame_of_markers(5, TOOL_OUT_OF_VIEW))
+    client.send("SendCurrentFrame 6D")
+    tool = body(TOOL_OUT_OF_VIEW)
+    assert (client.bodies, streaming.bodies) == ([body(), tool], [tool])
+
+
+def test_a_request_for_components_that_a_new_server_lacks_gets_an_empty_frame() -> None:
+    source = LiveSource()
+    client = source.client()
+    for number in range(1, 4):
+        source.arrive(frame_of_markers(number, TOOL_OUT_OF_VIEW))
+        source.wait(10_000)
+    source.scene.stop()
+    client.send("SendCurrentFrame 6D")
+    for number in range(1, 4):
+        source.arrive(frame_of_markers(number), SLOW + 2)
+        source.wait(1_000_000)
+    assert client.bodies == [body()]
+
+
+def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
+    source = LiveSource()
+    client = source.client("StreamFrames FrequencyDivisor:2 3D Events")
+    for number in range(1, 7):
+        source.arrive(frame_of_markers(number))
+        source.arrive(body(event_of(number)))
+    frames = client.take()
+    numbers = [[each.frame_number for each in frame if each.type == MARKERS] for frame in frames]
+    assert numbers == [[1], [3], [5]]
+    assert [item[0] for frame in frames for each in frame if each.type == EVENT for item in each.items] == [
+        1,
+        2,
+        3,
+        4,
+    ]

@@ -1,56 +1,95 @@
-"""The section ``rtc3d`` of the configuration."""
+"""The section ``rtc3d`` of the configuration, and the doctor's checks of it."""
 
+import asyncio
+import logging
+import socket
+from contextlib import closing
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
+from gateway.findings import Finding, Result
+from gateway.outputs.rtc3d.checks import CHECKS, check_rtc3d
 from gateway.outputs.rtc3d.kind import RTC3D
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
-
-
-def mistake(**values: Any) -> str:
-    with pytest.raises(ValidationError) as caught:
-        Rtc3dSettings(**values)
-    [error] = caught.value.errors(include_url=False)
-    return f"{'.'.join(map(str, error['loc']))}: {error['msg']}"
+from gateway.simulator.simulator import Simulator
+from tests.networks import free_port
+from tests.settings import mistakes
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.waiting import wait_until_async
 
 
 def test_by_default_it_is_off_and_listens_on_this_computer_only() -> None:
-    settings = Rtc3dSettings()
-    assert not settings.enabled
-    assert not RTC3D.leaves_host(settings)
+    assert (Rtc3dSettings().enabled, RTC3D.leaves_host(Rtc3dSettings())) == (False, False)
     assert Rtc3dSettings(enabled=True, ports={"lab": 3120, "hall-2": 3121}).ports["hall-2"] == 3121
+    for host, leaves in (("::1", False), ("localhost", False), ("::", True), ("lab-pc", True)):
+        assert RTC3D.leaves_host(Rtc3dSettings(host=host)) is leaves
 
 
 @pytest.mark.parametrize(
-    ("host", "leaves"),
-    [("127.0.0.1", False), ("::1", False), ("localhost", False), ("::", True), ("lab-pc", True)],
-)
-def test_frames_leave_this_computer_if_others_can_connect(host: str, leaves: bool) -> None:
-    assert RTC3D.leaves_host(Rtc3dSettings(host=host)) is leaves
-
-
-def test_a_port_for_at_least_one_source_is_needed() -> None:
-    assert mistake(enabled=True) == (
-        "ports: found nothing; expected a port for each source that is served, as in {lab: 3120}"
-    )
-
-
-def test_two_sources_cannot_have_one_port() -> None:
-    assert mistake(ports={"lab": 3120, "hall": 3120}) == (
-        "ports.hall: found 3120, which lab has too; expected another port for each source"
-    )
-
-
-@pytest.mark.parametrize(
-    ("values", "place"),
+    ("values", "place", "text"),
     [
-        ({"ports": {"lab": 0}}, "ports.lab"),
-        ({"ports": {"a lab": 3120}}, "ports.a lab"),
-        ({"ports": 3120}, "ports"),
-        ({"max_clients": 0}, "max_clients"),
+        ({"enabled": True}, "ports", "found nothing; expected a port for each source that is served"),
+        (
+            {"ports": {"lab": 3120, "hall": 3120}},
+            "ports.hall",
+            "found 3120, which lab has too; expected another",
+        ),
+        ({"ports": {"lab": 0}}, "ports.lab", ""),
+        ({"ports": {"a lab": 3120}}, "ports.a lab", ""),
+        ({"ports": 3120}, "ports", ""),
+        ({"max_clients": 0}, "max_clients", ""),
     ],
 )
-def test_mistakes_have_their_place(values: dict[str, Any], place: str) -> None:
-    assert mistake(**values).startswith(place)
+def test_mistakes_have_their_place(values: dict[str, Any], place: str, text: str) -> None:
+    [(found_place, found)] = mistakes(Rtc3dSettings, values)
+    assert found_place.startswith(place)
+    assert found.startswith(text)
+
+
+# Checks -------------------------------------------------------------------------------------
+
+
+def findings(sources: list[str], ports: dict[str, int], host: str = "127.0.0.1") -> list[Finding]:
+    found = check_rtc3d(Rtc3dSettings(enabled=True, host=host, ports=ports), sources, [], 0.3)
+    assert [each.check for each in found][:2] == list(CHECKS)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("sources", "port_of", "result", "text"),
+    [
+        (["lab"], "lab", Result.PASSING, ""),
+        (["lab", "hall"], "lap", Result.WARNING, "rtc3d.ports has a port for lap, which is no source"),
+        (["lab", "hall"], "lab", Result.NOTE, "RTC3D clients cannot connect to hall"),
+    ],
+)
+def test_ports_are_those_of_the_sources(sources: list[str], port_of: str, result: Result, text: str) -> None:
+    names, ports = findings(sources, {port_of: free_port()})
+    assert (names.result, text in names.found, ports.result) == (result, True, Result.PASSING)
+    assert result is not Result.WARNING or names.remedy == "Correct the name; the sources are lab, hall."
+
+
+@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_a_port_of_another_program_fails(answer: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with closing(socket.create_connection(("127.0.0.1", port))), other.accept()[0] as accepted:
+            accepted.sendall(answer)
+            *_, finding = findings(["lab"], {"lab": port})
+    assert finding.result is Result.FAILING
+    assert finding.found.startswith(f"cannot listen on 127.0.0.1, port {port} (for lab): ")
+    assert "rtc3d.ports.lab" in finding.remedy
+
+
+def test_an_address_of_another_computer_fails() -> None:
+    assert findings(["lab"], {"lab": free_port()}, host="192.0.2.1")[-1].result is Result.FAILING
+
+
+async def test_the_port_of_a_running_gateway_passes(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    async with Simulator(CountingScene()) as server:
+        *_, finding = await asyncio.to_thread(findings, ["lab"], {"lab": server.port})
+        await wait_until_async(lambda: "disconnected" in caplog.text)
+    assert "reset" not in caplog.text
+    assert (finding.result, "the gateway, if it runs" in finding.found) == (Result.PASSING, True)

@@ -2,22 +2,29 @@
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 import resource
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from gateway.errors import OutputError, QueryError
 from gateway.losses import Losses
+from gateway.messages.decode import decode
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.parameters_message import encode_parameters
 from gateway.outputs.takes import disk_calls
+from gateway.outputs.takes.disk import RETRY_S, Disk
 from gateway.outputs.takes.folder import ROLLING
+from gateway.outputs.takes.header import FileHeader, SourceDescription
+from gateway.outputs.takes.log_sink import LogSink
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.takes.event_log import encode_event
+from gateway.takes.recording import LogFile
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
 from tests.waiting import wait_until_async
@@ -36,7 +43,7 @@ def files_of_at_most(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-async def test_what_waits_for_a_full_disk_is_written_when_there_is_room(
+async def test_a_full_disk_costs_nothing_if_it_has_room_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A full disk costs nothing if somebody makes room, and is logged once."""
@@ -140,30 +147,21 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
 
 async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_path: Path) -> None:
     """A folder that is missing later is a disk that is not mounted: its mount point must stay empty."""
-    lab = RecordingLab(tmp_path / "disk" / "takes")
-    lab.output.start()
-    try:
-        await until_problem(lab, "")
+    async with recording_lab(tmp_path / "disk" / "takes") as lab:
         (tmp_path / "disk").rename(tmp_path / "unmounted")
         await until_problem(lab, "No such file or directory; is the disk mounted?")
         with pytest.raises(QueryError, match="is the disk mounted") as refused:
             await lab.takes.start("lab", "walk")
         assert refused.value.code == "disk"
+        (tmp_path / "disk").mkdir()
+        (tmp_path / "disk/takes").write_text("no folder")
+        await until_problem(lab, "it is not a folder; choose a folder as takes.directory")
+        (tmp_path / "disk/takes").unlink()
+        (tmp_path / "disk").rmdir()
         (tmp_path / "unmounted").rename(tmp_path / "disk")
-        await until_problem(lab, "")
+        await wait_until_async(lambda: not lab.output.health().problem)
         await lab.takes.start("lab", "walk")
-    finally:
-        lab.output.close()
     assert lab.path("walk.lcmlog").is_file()
-
-
-async def test_a_file_instead_of_the_folder_is_reported(tmp_path: Path) -> None:
-    """The problem says what to choose instead."""
-    (tmp_path / "takes").write_text("no folder")
-    lab = RecordingLab(tmp_path / "takes")
-    lab.output.start()
-    await until_problem(lab, "it is not a folder; choose a folder as takes.directory")
-    lab.output.close()
 
 
 async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +172,7 @@ async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: py
     assert (tmp_path / "state" / "takes" / "lab" / "walk.lcmlog").is_file()
 
 
-async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
+async def test_a_take_without_its_file_gets_a_new_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Messages must not go on into a file that has no name any more."""
@@ -195,9 +193,7 @@ async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
     assert any("was removed while it was recorded" in each for each in caplog.messages)
 
 
-async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_stopping_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The segments wait before the take does; the peer learns the reason instead of "no answer"."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path, keep_last_s=60) as lab:
@@ -211,51 +207,25 @@ async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
         await wait_until_async(lambda: lab.output.health().connected)
 
 
-async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_disk_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The event loop goes on, and the take that was not started does not appear later."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
-        os.mkfifo(lab.path("walk.lcmlog.x"))
-        with _stopped_disk(lab):
-            with pytest.raises(QueryError, match="did not respond") as refused:
-                await lab.takes.start("lab", "walk")
-            assert refused.value.code == "disk"
-            assert not lab.publishers["3d"].wanted
+        responds = threading.Event()
+        lab.takes._started_recorder().call(responds.wait)
+        with pytest.raises(QueryError, match="did not respond") as refused:
+            await lab.takes.start("lab", "walk")
+        assert refused.value.code == "disk"
+        assert not lab.publishers["3d"].wanted
+        responds.set()
         await lab.takes.written()
         await lab.takes.start("lab", "run")
     assert [path.name for path in lab.path("").glob("*.lcmlog")] == ["run.lcmlog"]
 
 
-@contextlib.contextmanager
-def _stopped_disk(lab: RecordingLab) -> Iterator[None]:
-    """Have the thread that writes wait for a pipe that nobody opens, as for a disk that does not respond."""
-    pipe = lab.path("walk.lcmlog.x")
-    recorder = lab.takes._recorder
-    assert recorder is not None
-    recorder.call(lambda: pipe.open("rb").close())
-    yield
-    os.close(os.open(pipe, os.O_WRONLY))
-
-
 async def until_problem(lab: RecordingLab, text: str) -> None:
-    def has_it() -> bool:
-        lab.output.maintain()
-        problem = lab.output.health().problem
-        return text in problem if text else not problem
-
-    await wait_until_async(has_it)
-
-
-async def test_two_gateways_do_not_share_a_folder(tmp_path: Path) -> None:
-    """Each would delete the segments of the other one as left behind."""
-    async with recording_lab(tmp_path):
-        other = RecordingLab(tmp_path)
-        other.output.start()
-        await until_problem(other, "another gateway records in")
-        other.output.close()
+    await wait_until_async(lambda: text in lab.output.health().problem)
 
 
 async def test_the_end_of_the_output_ends_the_take(tmp_path: Path) -> None:
@@ -267,14 +237,139 @@ async def test_the_end_of_the_output_ends_the_take(tmp_path: Path) -> None:
     assert not (tmp_path / ROLLING / "lab").exists()
 
 
-async def test_segments_of_a_gateway_that_was_killed_become_a_take(tmp_path: Path) -> None:
-    """The next start finds them, before the first message is recorded."""
-    left_behind = tmp_path / ROLLING / "lab" / "lab-000000.lcmlog"
-    left_behind.parent.mkdir(parents=True)
-    left_behind.write_bytes(encode_event(0, 5, b"MOCAP_LAB_3D", bytes(16)))
-    async with recording_lab(tmp_path) as lab:
-        await wait_until_async(lambda: not left_behind.exists())
-        await lab.takes.written()
-        [take] = (await lab.takes.list("lab")).takes
-    assert take.name.startswith("lab-20")
-    assert frames(lab.path(take.name)) == [bytes(16)]
+# A disk that accepts everything, a part, or nothing, as the test says ---------------------------
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+Messages = Sequence[tuple[bytes, bytes]]
+
+
+def message(number: int, channel: str = "3D") -> tuple[bytes, bytes]:
+    """Return a message with this ``utime``, and its channel."""
+    return f"MOCAP_LAB_{channel}".encode(), bytes(8) + number.to_bytes(8, "big")
+
+
+def parameters(version: int) -> tuple[bytes, bytes]:
+    """Return a ``parameters_t`` and its channel."""
+    content = ServerParameters(b"<a/>", 1, version)
+    return b"MOCAP_LAB_PARAMETERS", encode_parameters(content, utime=1, arrived_utime=1, sequence=0)
+
+
+class ScriptedLog:
+    """A log that does what ``steps`` say, one per call: take so many messages, or fail; then take all."""
+
+    def __init__(self, *steps: int | OSError) -> None:
+        self.steps = [*steps]
+        self.content: list[tuple[bytes, bytes]] = []
+        self.sizes: list[int] = []
+        self.on_failure: Callable[[], None] = lambda: None
+
+    def append(self, messages: Messages) -> int:
+        step = self.steps.pop(0) if self.steps else len(messages)
+        if isinstance(step, OSError):
+            self.on_failure()
+            raise step
+        self.sizes.append(step)
+        self.content += messages[:step]
+        return step
+
+
+class Waits(threading.Event):
+    """The event by which a sink gives up; it notes how long the sink waits for it, and does not wait."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seconds: list[float | None] = []
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.seconds.append(timeout)
+        return self.is_set()
+
+
+class Sink(LogSink):
+    """A sink whose log is scripted."""
+
+    def __init__(self, log: ScriptedLog) -> None:
+        self.losses = Losses(logging.getLogger("gateway"), "lab to takes")
+        super().__init__(FileHeader(SourceDescription("lab", "MOCAP", ""), None), Disk(), self.losses)
+        self.log = log
+        self.utimes: list[int] = []
+        self.waits = Waits()
+        self._gives_up = self.waits
+        self.newest_version: list[int | None] = []
+
+    @property
+    def path(self) -> Path:
+        return Path("/takes/lab/walk.lcmlog")
+
+    def log_for(self, utime: int) -> LogFile:
+        self.utimes.append(utime)
+        newest = self.header.parameters
+        self.newest_version.append(None if newest is None else decode(newest).parameters_version)
+        return cast(LogFile, self.log)
+
+
+def test_what_the_disk_does_not_take_at_once_is_written_again_after_a_wait() -> None:
+    """Nothing is lost, doubled or reordered; without the wait, a full disk would keep a processor busy."""
+    sink = Sink(ScriptedLog(3, FULL, FULL, 1))
+    problems: list[str] = []
+    sink.log.on_failure = lambda: problems.append(sink.disk.problem)
+    sent = [message(number) for number in range(10)]
+    sink.write(sent)
+    assert sink.log.content == sent
+    assert sink.utimes == [0, 3, 3, 3, 4]  # of the first message that is left
+    assert sink.waits.seconds == [RETRY_S, RETRY_S]
+    assert "No space left on device; make room on it" in problems[1]
+    assert (sink.disk.problem, sink.num_lost, sink.losses.report()) == ("", 0, [])
+
+
+def test_what_is_given_up_is_counted_in_messages_and_in_frames() -> None:
+    """A frame has a message on each channel: six messages of three frames are three frames lost."""
+    sink = Sink(ScriptedLog(2, FULL, FULL))
+    sink.log.on_failure = sink.give_up
+    frames = [message(number, channel) for number in range(3) for channel in ("3D", "6D", "ANALOG")]
+    sink.write(frames[:-1])
+    assert sink.log.content == frames[:2]
+    assert sink.num_lost == 6
+    assert amounts(sink.losses.report()) == {"not written": (6, 2)}
+    assert "No space left" in sink.losses.report()[0].text
+    sink.write([message(9)])  # a loss is added to those before
+    assert sink.num_lost == 7
+    assert amounts(sink.losses.report()) == {"not written": (7, 3)}
+    sink.write([message(10)])  # the disk has room again
+    assert sink.log.content[-1] == message(10)
+
+
+def test_a_file_that_cannot_begin_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty file of that name would refuse the next attempt."""
+
+    def write(_descriptor: int, _content: memoryview) -> int:
+        raise FULL
+
+    header = FileHeader(SourceDescription("lab", "MOCAP", ""), None)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write)
+        with pytest.raises(OSError, match="No space left"):
+            header.begin_log(tmp_path / "walk.lcmlog", "walk", 1)
+    header.begin_log(tmp_path / "walk.lcmlog", "walk", 1).close()
+
+
+@pytest.mark.parametrize(
+    ("number", "sizes"), [(1, [1]), (512, [512]), (513, [512, 1]), (1300, [512, 512, 276])]
+)
+def test_many_messages_are_written_in_pieces(number: int, sizes: list[int]) -> None:
+    """Between pieces, a segment may end; one piece of a stall of minutes would make it much too long."""
+    sink = Sink(ScriptedLog())
+    sent = [message(each) for each in range(number)]
+    sink.write(sent)
+    assert sink.log.sizes == sizes
+    assert sink.log.content == sent
+
+
+def test_a_new_file_begins_with_the_parameters_that_were_written_last() -> None:
+    """Otherwise, the labels of the next segment would be those of an earlier configuration."""
+    sink = Sink(ScriptedLog())
+    some = [message(each) for each in range(510)]
+    sink.write([parameters(1), *some, parameters(2), *some])
+    sink.write([message(1)])
+    assert sink.newest_version == [None, 2, 2]

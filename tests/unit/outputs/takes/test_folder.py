@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,10 +13,9 @@ from gateway.outputs.takes import folder as folder_module
 from gateway.outputs.takes.disk_calls import Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
-from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
 from gateway.takes.event_log import encode_event
-from tests.recording_output import Clock, NoThread
+from tests.recording_output import Clock, NoThread, settings_in
 
 NOW_S = 1_700_000_000.0
 DAY_S = 86_400.0
@@ -55,9 +54,7 @@ def left(takes: TakesFolder, max_bytes: int, *protected: str, max_age_s: float |
         (0, ["hall/c", "lab/d"]),  # the newest of each source stays
     ],
 )
-def test_the_oldest_takes_of_all_sources_are_deleted_until_the_rest_fits(
-    takes: TakesFolder, max_bytes: int, expected: list[str]
-) -> None:
+def test_the_oldest_takes_are_deleted_first(takes: TakesFolder, max_bytes: int, expected: list[str]) -> None:
     """Deleting too much, or the newest take, would lose what the user has just recorded."""
     for name, age_s in (("lab/a", 300), ("lab/b", 400), ("hall/c", 200), ("lab/d", 100)):
         stored(takes.directory / f"{name}.lcmlog", 1000, age_s)
@@ -121,26 +118,22 @@ def test_deleting_a_take_whose_segments_are_still_kept_makes_no_room(takes: Take
     assert kept.exists()
 
 
-def test_c3d_files_belong_to_their_take_and_other_files_to_nobody(
-    takes: TakesFolder, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_c3d_files_go_with_their_take_only(takes: TakesFolder, caplog: pytest.LogCaptureFixture) -> None:
     """The C3D files count and go with the take; what a user has put there stays."""
     caplog.set_level(logging.INFO)
     lab = takes.directory / "lab"
-    stored(lab / "a-2.lcmlog", 100, 900)  # a take of its own, not the second C3D file of "a"
-    stored(lab / "a.lcmlog", 100, 800)
-    stored(lab / "newest.lcmlog", 100, 100)
+    # "a-2" is a take of its own, not the second C3D file of "a".
+    for name, age_s in (("a-2", 900), ("a", 800), ("newest", 100)):
+        stored(lab / f"{name}.lcmlog", 100, age_s)
     for name in ("a.c3d", "a-3.c3d", "a-2.c3d", "walk.c3d", "notes.txt"):
         stored(lab / name, 50)
     assert takes.delete_old(max_bytes=399, max_age_s=None, protected=set()) == 0
-    assert {path.name for path in lab.iterdir()} == {
-        *("a.lcmlog", "a.c3d", "a-3.c3d", "newest.lcmlog", "walk.c3d", "notes.txt")
-    }
-    assert f"deleted {lab}/a-2, the oldest one: the folder has 450 bytes, and takes.max_bytes is 399" in (
-        caplog.text
-    )
+    kept = {"newest.lcmlog", "walk.c3d", "notes.txt"}
+    assert {path.name for path in lab.iterdir()} == {"a.lcmlog", "a.c3d", "a-3.c3d", *kept}
+    deleted = f"deleted {lab}/a-2, the oldest one: the folder has 450 bytes, and takes.max_bytes is 399"
+    assert deleted in caplog.text
     takes.delete_old(max_bytes=150, max_age_s=None, protected=set())
-    assert {path.name for path in lab.iterdir()} == {"newest.lcmlog", "walk.c3d", "notes.txt"}
+    assert {path.name for path in lab.iterdir()} == kept
 
 
 # Lists and pieces ----------------------------------------------------------------------------
@@ -152,29 +145,23 @@ def log(*utimes: int) -> bytes:
 
 def test_a_list_has_the_newest_take_first_with_its_time_and_length(takes: TakesFolder) -> None:
     """A saved take begins in its first file and ends in its last one, whatever the order on the disk."""
-    stored(takes.directory / "lab/walk.lcmlog", log(1_000_000, 3_500_000), 50)
+    lab = takes.directory / "lab"
+    stored(lab / "walk.lcmlog", log(1_000_000, 3_500_000), 50)
     for number in (2, 1, 3):
-        stored(
-            takes.directory / f"lab/fall/fall-00{number}.lcmlog", log(number * 10**7, number * 10**7 + 5), 99
-        )
-    stored(takes.directory / "lab/empty.lcmlog", b"", 70)
+        stored(lab / f"fall/fall-00{number}.lcmlog", log(number * 10**7, number * 10**7 + 5), 99)
+    stored(lab / "empty.lcmlog", b"", 70)
     assert takes.takes("lab", {"walk"}) == [
         StoredTake("walk", len(log(1, 2)), 1_000_000, 2.5, is_running=True),
         StoredTake("empty", 0, 0, 0.0),
         StoredTake("fall", 3 * len(log(1, 2)), 10_000_000, 20.000005),
     ]
-    assert takes.take_at(takes.directory / "lab/fall").seconds == 20.000005
-    stored(takes.directory / "lab/walk.lcmlog", log(1_000_000, 3_500_000, 4_000_000), 49)
-    assert takes.take_at(takes.directory / "lab/walk").seconds == 3.0
+    assert takes.take_at(lab / "fall").seconds == 20.000005
+    stored(lab / "walk.lcmlog", log(1_000_000, 3_500_000, 4_000_000), 49)
+    assert takes.take_at(lab / "walk").seconds == 3.0
+    stored(lab / "long.lcmlog", log(*range(0, 10**9, 10**6)))  # is measured by its end
+    assert takes.take_at(lab / "long").seconds == 999.0
     with pytest.raises(QueryError, match="somebody has removed it"):
-        takes.take_at(takes.directory / "lab/wal")
-
-
-def test_a_long_take_is_measured_by_its_end(takes: TakesFolder) -> None:
-    """Only the last part is read; reading all of a folder of takes would take minutes."""
-    stored(takes.directory / "lab/long.lcmlog", log(*range(0, 10**9, 10**6)))
-    [take] = takes.takes("lab", ())
-    assert take.seconds == 999.0
+        takes.take_at(lab / "wal")
 
 
 @pytest.mark.parametrize("offset", [0, 1, 999, 1000, 1001, 2500, 3_000_999, 3_001_000, 10**9])
@@ -262,9 +249,7 @@ def test_what_a_killed_gateway_has_left_behind_becomes_a_take(takes: TakesFolder
 class SlowThread(NoThread):
     """A thread whose present call takes ``age_s`` already."""
 
-    def __init__(self) -> None:
-        super().__init__("slow")
-        self.age_s = 0.0
+    age_s = 0.0
 
     @property
     def call_age_s(self) -> float:
@@ -272,25 +257,21 @@ class SlowThread(NoThread):
 
 
 class Watched:
-    """A watched folder; each call of ``open`` takes ``check_s`` by the clock."""
+    """A watched folder; each call of ``open`` takes a second by the clock."""
 
-    def __init__(self, directory: Path, monkeypatch: pytest.MonkeyPatch, **settings: object) -> None:
+    def __init__(self, directory: Path, **settings: object) -> None:
         self.clock = Clock()
-        self.thread = SlowThread()
-        self.settings = TakesSettings.model_validate(
-            {"enabled": True, "directory": str(directory), **settings}
-        )
+        self.thread = SlowThread("slow")
+        self.settings = settings_in(directory, **settings)
         self.watch = FolderWatch(self.settings, Host(self.clock, lambda _name: self.thread))
-        self.check_s = 1.0
         self.num_checks = 0
-        original: Callable[[], str] = self.watch.folder.open
+        self._open = self.watch.folder.open
+        self.watch.folder.open = self._open_slowly  # type: ignore[method-assign]
 
-        def open_slowly() -> str:
-            self.num_checks += 1
-            self.clock.now_s += self.check_s
-            return original()
-
-        monkeypatch.setattr(self.watch.folder, "open", open_slowly)
+    def _open_slowly(self) -> str:
+        self.num_checks += 1
+        self.clock.now_s += 1.0
+        return self._open()
 
     def check(self, after_s: float = 0.0) -> int:
         """Ask for a check; return how many were made so far."""
@@ -299,19 +280,22 @@ class Watched:
         return self.num_checks
 
 
-def test_after_a_slow_check_the_disk_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With thousands of takes, a check every second would keep a disk busy."""
-    watched = Watched(tmp_path, monkeypatch)
-    assert [watched.check(), watched.check(49.9), watched.check(0.2), watched.check(1.0)] == [1, 1, 2, 2]
-    assert watched.watch.is_checked
+@pytest.fixture
+def watched(tmp_path: Path) -> Iterator[Watched]:
+    watched = Watched(tmp_path)
+    yield watched
     watched.watch.close()
 
 
-def test_after_a_problem_the_folder_is_checked_again_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_after_a_slow_check_the_disk_rests(watched: Watched) -> None:
+    """With thousands of takes, a check every second would keep a disk busy."""
+    assert [watched.check(), watched.check(49.9), watched.check(0.2), watched.check(1.0)] == [1, 1, 2, 2]
+    assert watched.watch.is_checked
+
+
+def test_after_a_problem_the_folder_is_checked_again_at_once(watched: Watched, tmp_path: Path) -> None:
     """The former gateway may just be ending; two that share a folder would delete each other's segments."""
-    former, watched = TakesFolder(tmp_path), Watched(tmp_path, monkeypatch)
+    former = TakesFolder(tmp_path)
     assert former.open() == ""
     assert watched.check() == 1
     assert "another gateway records" in watched.watch.problem
@@ -319,7 +303,6 @@ def test_after_a_problem_the_folder_is_checked_again_at_once(
     assert former.open() == f"{tmp_path} is closed"  # a late check must not lock it again
     assert watched.check() == 2
     assert watched.watch.problem == ""
-    watched.watch.close()
 
 
 def test_a_lock_that_somebody_deletes_is_taken_again(tmp_path: Path) -> None:
@@ -335,21 +318,19 @@ def test_a_lock_that_somebody_deletes_is_taken_again(tmp_path: Path) -> None:
     other.close()
 
 
-def test_a_disk_that_does_not_respond_is_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_does_not_respond_is_a_problem(watched: Watched) -> None:
     """A network drive that hangs makes no error; only the time shows it."""
-    watched = Watched(tmp_path, monkeypatch)
     assert "is not checked yet" in watched.watch.problem
     watched.check()
     watched.thread.age_s = 4.9
     assert watched.watch.problem == ""
     watched.thread.age_s = 5.1
     assert "does not respond" in watched.watch.problem
-    watched.watch.close()
 
 
 def test_the_limits_of_the_settings_are_applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Days and bytes mean what they say."""
-    watched = Watched(tmp_path, monkeypatch, max_age_days=2, max_bytes=1024 * 1024)
+    watched = Watched(tmp_path, max_age_days=2, max_bytes=1024 * 1024)
     monkeypatch.setattr(folder_module, "time", SimpleNamespace(time=lambda: NOW_S))
     old = stored(tmp_path / "lab/a.lcmlog", 10, 2.1 * DAY_S)
     new = stored(tmp_path / "lab/b.lcmlog", 1024 * 1024 + 5, 1.9 * DAY_S)

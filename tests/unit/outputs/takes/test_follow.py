@@ -3,6 +3,8 @@
 import asyncio
 import logging
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,6 @@ from tests.vectors import LONG_EVENTS
 from tests.waiting import wait_until_async
 
 
-@pytest.fixture
-def clock() -> Clock:
-    """The clock of the followers."""
-    return Clock()
-
-
 class Followed:
     """A source whose takes follow its server; its clock is the test's."""
 
@@ -31,9 +27,11 @@ class Followed:
         self.clock = clock
         self.follower = lab.output._follower("lab")
 
-    def show(self, is_running: bool | None, after_s: float = 0.0) -> None:
-        self.clock.now_s += after_s
+    def show(self, is_running: bool | None, then_s: float = 0.0) -> None:
+        """Show whether a measurement runs; wait so long."""
         self.lab.output.show_measurement("lab", is_running)
+        if then_s:
+            self.wait(then_s)
 
     def wait(self, seconds: float) -> None:
         self.clock.now_s += seconds
@@ -44,10 +42,20 @@ class Followed:
         take = self.lab.takes.running("lab")
         return "" if take is None else take.name
 
+    async def settled(self) -> None:
+        await wait_until_async(lambda: not self.follower._tasks)
+
     async def names(self) -> list[str]:
         """Return the names of the takes when the disk has them all, the oldest first."""
-        await wait_until_async(lambda: not self.follower._tasks)
+        await self.settled()
         return sorted(take.name for take in (await self.lab.takes.list("lab")).takes)
+
+
+@asynccontextmanager
+async def following(folder: Path, follow: str, **settings: Any) -> AsyncIterator[Followed]:
+    clock = Clock()
+    async with still_lab(folder, clock, follow=follow, **settings) as lab:
+        yield Followed(lab, clock)
 
 
 def frames_of(lab: RecordingLab, name: str) -> list[bytes]:
@@ -56,9 +64,9 @@ def frames_of(lab: RecordingLab, name: str) -> list[bytes]:
 
 
 @pytest.fixture
-async def measured(tmp_path: Path, clock: Clock) -> AsyncIterator[Followed]:
-    async with still_lab(tmp_path, clock, follow="measurement") as lab:
-        yield Followed(lab, clock)
+async def measured(tmp_path: Path) -> AsyncIterator[Followed]:
+    async with following(tmp_path, "measurement") as followed:
+        yield followed
 
 
 async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Followed) -> None:
@@ -68,8 +76,7 @@ async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Fol
         measured.show(True)
         names.append(measured.running)
         published = [measured.lab.publish() for _ in range(5)]
-        measured.show(False)
-        measured.wait(END_S - 0.1)
+        measured.show(False, END_S - 0.1)
         assert measured.running == names[-1]
         measured.wait(0.2)
         assert measured.running == ""
@@ -80,25 +87,16 @@ async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Fol
 
 
 @pytest.mark.parametrize(("gap", "gap_s"), [(None, LOST_S - 1), (False, END_S - 0.1)])
-async def test_a_stall_a_reconnection_or_a_short_no_data_does_not_split_a_take(
-    measured: Followed, gap: bool | None, gap_s: float
-) -> None:
+async def test_a_short_gap_does_not_split_a_take(measured: Followed, gap: bool | None, gap_s: float) -> None:
     """One movement in two files is hard to use."""
     measured.show(True)
     for _ in range(5):
-        measured.show(gap)
-        measured.wait(gap_s)
+        measured.show(gap, gap_s)
         measured.show(True)
     measured.wait(1000.0)
     assert measured.running
     assert len(await measured.names()) == 1
-
-
-async def test_a_measurement_that_does_not_come_back_ends(measured: Followed) -> None:
-    """Otherwise, a server that is switched off would have a take for ever."""
-    measured.show(True)
-    measured.show(None)
-    measured.wait(LOST_S + 0.1)
+    measured.show(None, LOST_S + 0.1)  # a server that is switched off
     assert measured.running == ""
 
 
@@ -110,8 +108,7 @@ async def test_a_stopped_take_is_not_started_again_before_the_next_measurement(m
     measured.show(None)
     measured.show(True)
     assert measured.running == ""
-    measured.show(False)
-    measured.wait(END_S + 0.1)
+    measured.show(False, END_S + 0.1)
     measured.show(True)
     assert measured.running
 
@@ -122,22 +119,21 @@ async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.Log
     await measured.lab.takes.start("lab", "of a peer")
     measured.show(True)
     assert "take 'of a peer' is running already, so no other one is started" in caplog.text
-    measured.show(False)
-    measured.wait(END_S + 0.1)
+    measured.show(False, END_S + 0.1)
     assert measured.running == "of a peer"
 
 
-async def test_a_take_that_cannot_start_is_tried_again_and_logged_once(
+async def test_a_take_that_cannot_start_is_tried_again(
     measured: Followed, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It begins as soon as the disk allows; the log does not fill meanwhile."""
     folder = measured.lab.directory / "lab"
     folder.write_text("in the way")
     measured.show(True)
-    await wait_until_async(lambda: not measured.follower._tasks)
+    await measured.settled()
     for _ in range(3):
         measured.wait(1.0)
-        await wait_until_async(lambda: not measured.follower._tasks)
+        await measured.settled()
     [warning] = [record for record in caplog.records if "a take is not started" in record.message]
     assert warning.levelno == logging.WARNING
     folder.unlink()
@@ -152,21 +148,19 @@ async def test_a_take_that_cannot_start_is_tried_again_and_logged_once(
 async def test_a_take_follows_a_recording_under_the_same_name(tmp_path: Path) -> None:
     """Both files of a recording are found by one name, and the peer learns of each take."""
     async with still_lab(tmp_path, follow="recording") as lab:
-        output = lab.output
-        assert await output.follow_recording("lab", start=True, name="walk") == {"take": "walk"}
+        start = partial(lab.output.follow_recording, "lab", start=True)
+        stop = partial(lab.output.follow_recording, "lab", start=False, name="")
+        assert await start(name="walk") == {"take": "walk"}
         published = lab.publish()
-        assert await output.follow_recording("lab", start=False, name="") == {"take": "walk"}
+        assert await stop() == {"take": "walk"}
         assert frames_of(lab, "walk") == [published]
-        assert await output.follow_recording("lab", start=False, name="") == {}
-        assert await output.follow_recording("lab", start=True, name="walk") == {"take": "walk-2"}
-        reply = await output.follow_recording("lab", start=True, name="run")
-        assert "'walk-2' of source 'lab' is running already" in reply["take_problem"]
+        assert await stop() == {}
+        assert await start(name="walk") == {"take": "walk-2"}
+        assert "'walk-2' of source 'lab' is running already" in (await start(name="run"))["take_problem"]
         await lab.takes.stop("lab")
         await lab.takes.start("lab", "of a peer")
-        assert await output.follow_recording("lab", start=False, name="") == {}
-        running = lab.takes.running("lab")
-        assert running is not None
-        assert running.name == "of a peer"
+        assert await stop() == {}
+        assert lab.takes.running("lab") is not None
 
 
 @pytest.mark.parametrize("setting", ["none", "measurement"])
@@ -184,19 +178,16 @@ def event_message(*ids: int) -> bytes:
     message = rtc3d.events_t()
     message.num_events = len(ids)
     for event_id in ids:
-        event = rtc3d.event_t()
-        event.id = event_id
-        message.events.append(event)
+        message.events.append(rtc3d.event_t())
+        message.events[-1].id = event_id
     encoded: bytes = message.encode()
     return encoded
 
 
-async def test_events_start_and_stop_takes(tmp_path: Path, clock: Clock) -> None:
+async def test_events_start_and_stop_takes(tmp_path: Path) -> None:
     """The events that start and stop a take are in it; the ids are unsigned."""
-    settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 0xFFFF_FFFE}
-    async with still_lab(tmp_path, clock, **settings) as lab:
-        followed = Followed(lab, clock)
-        publisher = lab.publishers["event"]
+    async with following(tmp_path, "events", start_event_id=5, stop_event_id=0xFFFF_FFFE) as followed:
+        publisher = followed.lab.publishers["event"]
         assert publisher.wanted
         publisher.publish(event_message(7))
         publisher.publish(event_message(-2))
@@ -210,27 +201,24 @@ async def test_events_start_and_stop_takes(tmp_path: Path, clock: Clock) -> None
         publisher.publish(event_message(7))
         assert followed.running == ""
         [name] = await followed.names()
-        assert frames_of(lab, name) == [start, both, stop]
+        assert frames_of(followed.lab, name) == [start, both, stop]
 
 
-async def test_a_message_with_both_events_is_a_take_by_itself(tmp_path: Path, clock: Clock) -> None:
+async def test_a_message_with_both_events_is_a_take_by_itself(tmp_path: Path) -> None:
     """Two events in one frame must not be lost between two takes."""
-    async with still_lab(tmp_path, clock, follow="events", start_event_id=5, stop_event_id=6) as lab:
-        followed = Followed(lab, clock)
+    async with following(tmp_path, "events", start_event_id=5, stop_event_id=6) as followed:
         message = event_message(5, 6)
-        lab.publishers["event"].publish(message)
+        followed.lab.publishers["event"].publish(message)
         assert followed.running == ""
         [name] = await followed.names()
-        assert frames_of(lab, name) == [message]
+        assert frames_of(followed.lab, name) == [message]
 
 
-async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: Clock) -> None:
+async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path) -> None:
     """A remote control with one button."""
-    settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 5}
-    async with still_lab(tmp_path, clock, **settings) as lab:
-        followed = Followed(lab, clock)
+    async with following(tmp_path, "events", start_event_id=5, stop_event_id=5) as followed:
         for is_running in (True, False, True, False):
-            lab.publishers["event"].publish(event_message(5))
+            followed.lab.publishers["event"].publish(event_message(5))
             assert bool(followed.running) is is_running
             await asyncio.sleep(0)
         assert len(await followed.names()) == 2
@@ -238,6 +226,9 @@ async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: Cloc
 
 def test_the_ids_of_events_are_read_from_a_message() -> None:
     """They are read without decoding each message."""
-    assert event_ids(component_message(LONG_EVENTS)) == [0x123456, 2]
-    assert event_ids(event_message()) == []
-    assert event_ids(event_message(-1)) == [0xFFFF_FFFF]
+    for message, ids in (
+        (component_message(LONG_EVENTS), [0x123456, 2]),
+        (event_message(), []),
+        (event_message(-1), [0xFFFF_FFFF]),
+    ):
+        assert event_ids(message) == ids

@@ -2,7 +2,6 @@
 
 import logging
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -97,7 +96,7 @@ def test_for_hours_what_is_kept_is_the_last_minute_rounded_up_to_a_segment(rolli
     ("last_s", "first"),
     [(0.5, 30), (4.9, 30), (5, 20), (5.1, 20), (14.9, 20), (15.1, 10), (25.1, 0), (1e9, 0)],
 )
-def test_a_saved_take_begins_with_the_segment_in_which_its_time_lies(
+def test_a_saved_take_begins_with_the_segment_of_its_time(
     rolling: Rolling, last_s: float, first: int
 ) -> None:
     """A segment that ends after the beginning has wanted messages, even if it begins long before."""
@@ -115,7 +114,7 @@ def test_a_saved_take_ends_at_once_and_its_segments_are_shared(rolling: Rolling)
     assert [path.name for path in logs] == [f"fall-00{number}.lcmlog" for number in (1, 2, 3)]
     assert [path.stat().st_ino for path in logs] == [path.stat().st_ino for path in rolling.files[:3]]
     assert [numbers(path) for path in rolling.files] == [
-        *([*range(10)], [*range(10, 20)], [*range(20, 25)], [25]),
+        *([*range(10)], [*range(10, 20)], [*range(20, 25)], [25])
     ]
     for log in logs:
         assert next(EventLogReader(log).events()).channel == "MOCAP_LAB_TAKE"
@@ -210,7 +209,7 @@ def test_a_save_that_fails_leaves_nothing(rolling: Rolling, monkeypatch: pytest.
     assert numbers(rolling.takes / "fall") == list(range(15))
 
 
-def test_a_segment_that_cannot_be_linked_or_deleted_is_a_problem_of_the_disk(
+def test_a_segment_that_cannot_be_linked_is_a_problem(
     rolling: Rolling, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The recording goes on without it, and the user learns why a part is missing."""
@@ -230,28 +229,16 @@ def test_a_segment_that_cannot_be_linked_or_deleted_is_a_problem_of_the_disk(
     assert numbers(save.folder) == [*range(10), *range(20, 30)]
 
 
-def remove_oldest(rolling: Rolling) -> list[int]:
-    rolling.files[0].unlink()
-    return list(range(10, 25))
-
-
-def remove_present(rolling: Rolling) -> list[int]:
-    rolling.segments.sync()
-    rolling.files[-1].unlink()
-    rolling.segments.sync()  # finds that it is gone
-    return [*range(20), *range(22, 25)]
-
-
-@pytest.mark.parametrize("remove", [remove_oldest, remove_present])
-def test_a_segment_that_somebody_removes_costs_only_itself(
-    rolling: Rolling, remove: Callable[[Rolling], list[int]]
-) -> None:
+@pytest.mark.parametrize(("place", "left"), [(0, [*range(10, 25)]), (-1, [*range(20), *range(22, 25)])])
+def test_a_segment_that_is_removed_costs_only_itself(rolling: Rolling, place: int, left: list[int]) -> None:
     """The others are saved, and messages do not go on into a file that has no name."""
     rolling.write(22)
-    expected = remove(rolling)
+    rolling.segments.sync()
+    rolling.files[place].unlink()
+    rolling.segments.sync()  # finds that the present one is gone
     rolling.write(3)
     rolling.save(60)
-    assert numbers(rolling.takes / "fall") == expected
+    assert numbers(rolling.takes / "fall") == left
 
 
 def test_a_name_that_is_taken_gets_a_number_or_is_refused(rolling: Rolling) -> None:

@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NoReturn
@@ -19,16 +19,15 @@ from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.stored import StoredTake
-from tests.recording_output import (
-    Clock,
-    RecordingLab,
-    events,
-    frames,
-    still_lab,
-)
+from tests.recording_output import Clock, events, frames, still_lab
 from tests.virtual_time import run_in_virtual_time
 
-MIB = 1024 * 1024
+
+async def refused(call: Coroutine[Any, Any, Any], text: str) -> str:
+    """Await a call that is refused with this text; return the code of the error."""
+    with pytest.raises(QueryError, match=text) as caught:
+        await call
+    return caught.value.code
 
 
 async def test_a_take_has_everything_that_is_published_between_start_and_stop(tmp_path: Path) -> None:
@@ -58,14 +57,15 @@ async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_
         lab.publish()
         lab.output.publish_parameters("lab", ServerParameters(b"<changed/>", 1, 6))
         lab.publish()
-    take, new, first, changed, second = events(lab.path("walk.lcmlog"))
-    description = decode(take.message)
-    assert (description.name, description.source, description.channels) == ("walk", "lab", "MOCAP_LAB")
-    assert description.server == "lab:3020"
-    assert (decode(new.message).xml, decode(new.message).parameters_version) == ("<new/>", 5)
-    assert (decode(changed.message).xml, decode(changed.message).sequence) == ("<changed/>", 2)
-    assert (new.channel, changed.channel) == ("MOCAP_LAB_PARAMETERS", "MOCAP_LAB_PARAMETERS")
-    times = [event.utime for event in (take, new, first, changed, second)]
+    found = events(lab.path("walk.lcmlog"))
+    ends = ("TAKE", "PARAMETERS", "3D", "PARAMETERS", "3D")
+    assert [event.channel for event in found] == [f"MOCAP_LAB_{end}" for end in ends]
+    take, new, _, changed, _ = (decode(event.message) for event in found)
+    assert (take.name, take.source, take.channels) == ("walk", "lab", "MOCAP_LAB")
+    assert take.server == "lab:3020"
+    assert (new.xml, new.parameters_version) == ("<new/>", 5)
+    assert (changed.xml, changed.sequence) == ("<changed/>", 2)
+    times = [event.utime for event in found]
     assert times == sorted(times)
 
 
@@ -105,32 +105,16 @@ async def test_parameters_that_do_not_fit_into_the_queue_follow_later(tmp_path: 
 async def test_only_one_take_of_a_source_runs(tmp_path: Path) -> None:
     """What is not possible is refused with a reason, and harms neither a file nor the running take."""
     async with still_lab(tmp_path) as lab:
-        with pytest.raises(QueryError, match="no take of source 'lab' is running") as nothing:
-            await lab.takes.stop("lab")
-        assert nothing.value.code == "nothing-yet"
-        await lab.takes.start("lab", "walk")
-        with pytest.raises(QueryError, match="take 'walk' of source 'lab' is running already"):
-            await lab.takes.start("lab", "run")
+        takes = lab.takes
+        assert await refused(takes.stop("lab"), "no take of source 'lab' is running") == "nothing-yet"
+        await takes.start("lab", "walk")
+        await refused(takes.start("lab", "run"), "take 'walk' of source 'lab' is running already")
         published = lab.publish()
-        await lab.takes.stop("lab")
-        with pytest.raises(QueryError, match="there is a take 'walk' of this source already"):
-            await lab.takes.start("lab", "walk")
-        await lab.takes.start("lab", "run")
-        with pytest.raises(QueryError, match="no source 'hall'"):
-            await lab.takes.start("hall")
+        await takes.stop("lab")
+        await refused(takes.start("lab", "walk"), "there is a take 'walk' of this source already")
+        await takes.start("lab", "run")
+        await refused(takes.start("hall"), "no source 'hall'")
     assert frames(lab.path("walk.lcmlog")) == [published]
-
-
-async def test_takes_without_a_name_get_one_of_source_and_time(tmp_path: Path) -> None:
-    """Three takes in the same second have different names."""
-    async with still_lab(tmp_path) as lab:
-        names = []
-        for _ in range(3):
-            names.append((await lab.takes.start("lab")).name)
-            await lab.takes.stop("lab")
-    assert all(name.startswith("lab-20") for name in names)
-    assert {path.stem for path in lab.path("").iterdir()} == set(names)
-    assert len(set(names)) == 3
 
 
 @pytest.mark.parametrize("name", ["a/b", "..", ".x", " x", "x" * 101, "a\nb", "a\0b", "a*b", "/etc/x"])
@@ -138,23 +122,23 @@ async def test_names_that_are_no_names_of_files_are_refused(tmp_path: Path, name
     """Peers must not write outside the folder."""
     async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
-        for call in (
-            lab.takes.start("lab", name),
-            lab.takes.save("lab", 1, 0, name),
-            lab.takes.read("lab", name, 0),
-        ):
-            with pytest.raises(QueryError, match="cannot be the name of a take") as refused:
-                await call
-            assert refused.value.code == "bad-request"
+        takes = lab.takes
+        for call in (takes.start("lab", name), takes.save("lab", 1, 0, name), takes.read("lab", name, 0)):
+            assert await refused(call, "cannot be the name of a take") == "bad-request"
 
 
-async def test_names_may_have_letters_of_any_script(tmp_path: Path) -> None:
-    """Names are for people."""
+async def test_names_may_have_letters_of_any_script_or_follow_from_source_and_time(tmp_path: Path) -> None:
+    """Names are for people; without one, three takes in the same second have different names."""
+    given = ["Käfig 1", "歩行_2", "a+b-c.d", "x" * 100]
     async with still_lab(tmp_path) as lab:
-        for name in ("Käfig 1", "歩行_2", "a+b-c.d", "x" * 100):
-            await lab.takes.start("lab", name)
+        names = []
+        for name in (*given, "", "", ""):
+            names.append((await lab.takes.start("lab", name)).name)
             await lab.takes.stop("lab")
-            assert lab.path(f"{name}.lcmlog").is_file()
+        assert names[:4] == given
+        assert all(name.startswith("lab-20") for name in names[4:])
+        assert {path.stem for path in lab.path("").iterdir()} == set(names)
+        assert len(set(names)) == 7
 
 
 async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
@@ -180,12 +164,11 @@ async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
             pieces.append(piece.content)
         assert b"".join(pieces) == lab.path("walk.lcmlog").read_bytes()
         assert len(pieces) > 1
-        for name, offset, text in (("jump", 0, "has no take 'jump'"), ("walk", -1, "an offset of 0 or more")):
-            with pytest.raises(QueryError, match=text):
-                await lab.takes.read("lab", name, offset)
+        await refused(lab.takes.read("lab", "jump", 0), "has no take 'jump'")
+        await refused(lab.takes.read("lab", "walk", -1), "an offset of 0 or more")
 
 
-async def test_a_take_that_ends_while_it_is_listed_is_not_running(
+async def test_a_take_that_ends_while_listed_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk is read without blocking the event loop, so anything may have changed since."""
@@ -204,7 +187,7 @@ async def test_a_take_that_ends_while_it_is_listed_is_not_running(
         assert (await ends[0]).name == "walk"
 
 
-async def test_a_take_that_could_not_start_in_time_leaves_no_file(
+async def test_a_take_that_starts_too_late_has_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The peer was told that there is none; it would be recorded for ever, as nobody knows of it."""
@@ -215,8 +198,7 @@ async def test_a_take_that_could_not_start_in_time_leaves_no_file(
     async with still_lab(tmp_path) as lab:
         with monkeypatch.context() as patch:
             patch.setattr(recorded_takes, "disk_result", too_late)
-            with pytest.raises(QueryError, match="did not respond"):
-                await lab.takes.start("lab", "walk")
+            await refused(lab.takes.start("lab", "walk"), "did not respond")
         assert [*lab.path("").iterdir()] == []
         assert not lab.publishers["3d"].wanted
         assert lab.takes.running("lab") is None
@@ -242,39 +224,19 @@ async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
     assert channels == ["HALL_LAB_TAKE", "HALL_LAB_EVENT", "HALL_LAB_6D_3D", "HALL_LAB_6D_3D_2"]
 
 
-def of_running(lab: RecordingLab) -> Coroutine[Any, Any, Any]:
-    return lab.takes.start("lab", "walk")
-
-
-async def _stopped(lab: RecordingLab) -> None:
-    await lab.takes.start("lab", "walk")
-    await lab.takes.stop("lab")
-
-
-async def _saved(lab: RecordingLab) -> None:
-    lab.publish()
-    await lab.takes.save("lab", 10, 0, "walk")
-
-
-async def _being_saved(lab: RecordingLab) -> None:
-    lab.publish()
-    await lab.takes.save("lab", 10, 600, "earlier")
-    await lab.takes.save("lab", 10, 600, "walk")
-
-
 @pytest.mark.parametrize(
-    ("before", "after_s", "name"),
+    ("before", "after_s", "is_named"),
     [
-        (of_running, 1000.0, "walk.c3d"),
-        (_being_saved, 100.0, "walk.c3d"),
-        (_stopped, 60.0, "walk.c3d"),
-        (_stopped, 60.1, None),
-        (_saved, 60.0, "walk.c3d"),
-        (_saved, 60.1, None),
+        ("running", 1000.0, True),
+        ("being saved", 100.0, True),
+        ("stopped", 60.0, True),
+        ("stopped", 60.1, False),
+        ("saved", 60.0, True),
+        ("saved", 60.1, False),
     ],
 )
-async def test_a_file_of_the_server_gets_the_name_of_its_take(
-    tmp_path: Path, before: Callable[[RecordingLab], Any], after_s: float, name: str | None
+async def test_a_c3d_file_gets_the_name_of_its_take(
+    tmp_path: Path, before: str, after_s: float, is_named: bool
 ) -> None:
     """It arrives some seconds after the take has ended; later, it belongs to something else."""
     file = tmp_path / "lab-1.c3d"
@@ -282,11 +244,21 @@ async def test_a_file_of_the_server_gets_the_name_of_its_take(
     clock = Clock()
     async with still_lab(tmp_path / "takes", clock, keep_last_s=60) as lab:
         lab.output.announce_file("lab", ServerFile(file, 3))  # before any take
-        await before(lab)
+        lab.publish()
+        match before:
+            case "running" | "stopped":
+                await lab.takes.start("lab", "walk")
+            case "being saved":
+                await lab.takes.save("lab", 10, 600, "earlier")
+                await lab.takes.save("lab", 10, 600, "walk")
+            case _:
+                await lab.takes.save("lab", 10, 0, "walk")
+        if before == "stopped":
+            await lab.takes.stop("lab")
         clock.now_s += after_s
         lab.output.announce_file("lab", ServerFile(file, 3))
         found = [path for path in lab.path("").iterdir() if path.suffix == ".c3d"]
-        assert [path.name for path in found] == ([] if name is None else [name])
+        assert [path.name for path in found] == ["walk.c3d"] * is_named
         assert all(path.samefile(file) for path in found)
 
 
@@ -296,8 +268,7 @@ async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
         await lab.takes.start("lab", "walk")
         published = [lab.publish()]
         lab.output.withdraw("lab")
-        with pytest.raises(QueryError, match="no source 'lab'"):
-            await lab.takes.stop("lab")
+        await refused(lab.takes.stop("lab"), "no source 'lab'")
         lab.output.announce("lab")
         await lab.takes.start("lab", "run")
     assert frames(lab.path("walk.lcmlog")) == published
@@ -306,9 +277,7 @@ async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
 # Saving --------------------------------------------------------------------------------------
 
 
-def test_a_saved_take_goes_on_for_some_seconds_from_the_command_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_saved_take_goes_on_from_the_command_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The time that the disk needs is part of the seconds, not added to them."""
 
     async def save() -> None:
@@ -380,9 +349,7 @@ async def test_takes_can_be_saved_beside_a_running_one_up_to_a_limit(tmp_path: P
         for number in range(MAX_SAVES):
             published.append(lab.publish())
             await lab.takes.save("lab", 60, 30, f"fall {number}")
-        with pytest.raises(QueryError, match="are being saved already") as caught:
-            await lab.takes.save("lab", 30, 60)
-        assert caught.value.code == "refused"
+        assert await refused(lab.takes.save("lab", 30, 60), "are being saved already") == "refused"
         await lab.takes.save("lab", 30, 0, "at once")
     assert frames(lab.path("walk.lcmlog")) == published[1:]
     assert all(frames(lab.path(f"fall {number}")) == published for number in range(MAX_SAVES))
@@ -392,17 +359,13 @@ async def test_saving_needs_something_that_is_kept(tmp_path: Path) -> None:
     """The peer learns whether to change the configuration, to wait, or to ask otherwise."""
     async with still_lab(tmp_path / "off") as lab:
         lab.publish()
-        with pytest.raises(QueryError, match="keep_last_s is 0") as nothing:
-            await lab.takes.save("lab", 60)
-        assert nothing.value.code == "nothing-yet"
+        assert await refused(lab.takes.save("lab", 60), "keep_last_s is 0") == "nothing-yet"
     async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
         for last_s, after_s in ((0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0), (1.0, -1.0), (1.0, 3600.1)):
-            with pytest.raises(QueryError, match="expected last above 0"):
-                await lab.takes.save("lab", last_s, after_s)
+            await refused(lab.takes.save("lab", last_s, after_s), "expected last above 0")
         await lab.takes.save("lab", 0.1, 3600, "fall")
-        with pytest.raises(QueryError, match="there is a take 'fall'"):
-            await lab.takes.start("lab", "fall")
+        await refused(lab.takes.start("lab", "fall"), "there is a take 'fall'")
 
 
 async def test_a_publisher_that_closes_frees_its_channel(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ async def test_the_older_half_of_the_segments_makes_room_if_no_take_does(tmp_pat
         ({"keep_last_s": 0.0}, 0.0),
     ],
 )
-async def test_a_reload_keeps_the_segments_if_their_files_stay_the_same(
+async def test_a_reload_keeps_segments_that_fit(
     tmp_path: Path, changes: dict[str, Any], kept_s: float
 ) -> None:
     """The last seconds must survive a change of limits, but not be mixed with other channels."""

@@ -33,34 +33,13 @@ PING_IS_7 = (
 PING_WAND = words("00000018 65f00000 00000001 00000003 00000007 00000000")
 
 
-def ready_reader(*messages: bytes) -> ClientReader:
-    reader = ClientReader()
-    assert reader.receive(CLIENT_COOKIE + b"".join(messages)) == []
-    return reader
-
-
-def test_cookie_has_24_bytes_with_version_and_no_logging() -> None:
+def test_cookie_and_descriptions_are_padded_to_8_bytes() -> None:
     assert COOKIE == b"vrpn: ver. 07.35  0\0\0\0\0\0"
-
-
-def test_description_of_tracker() -> None:
-    assert describe_tracker(3, "wand") == words(
-        "00000021 00000000 00000000 00000003 ffffffff 00000000 00000005 77616e64 00000000 00000000"
-    )
-
-
-def test_descriptions_of_types_are_padded_to_8_bytes() -> None:
-    pose = (
-        words("00000032 00000000 00000000 00000000 fffffffe 00000000 00000016")  # 24 + 4 + 22
-        + b"vrpn_Tracker Pos_Quat\0"
-        + bytes(6)
-    )
-    pong = (
-        words("00000033 00000000 00000000 00000001 fffffffe 00000000 00000017")
-        + b"vrpn_Base pong_message\0"
-        + bytes(5)
-    )
-    assert pose + pong == TYPE_DESCRIPTIONS
+    assert describe_tracker(3, "wand") == WAND
+    pose = words("00000032 00000000 00000000 00000000 fffffffe 00000000 00000016")  # 24 + 4 + 22
+    pong = words("00000033 00000000 00000000 00000001 fffffffe 00000000 00000017")
+    names = (b"vrpn_Tracker Pos_Quat\0" + bytes(6), b"vrpn_Base pong_message\0" + bytes(5))
+    assert pose + names[0] + pong + names[1] == TYPE_DESCRIPTIONS
 
 
 def test_pose_is_sensor_0_then_position_then_quaternion_with_scalar_last() -> None:
@@ -81,39 +60,34 @@ def test_extreme_times_fit(utime: int, seconds: int, microseconds: int) -> None:
     assert header == words(f"00000018 {seconds:08x} {microseconds:08x} 00000005 00000001 00000000")
 
 
-def test_ping_returns_the_name_of_the_device() -> None:
-    reader = ready_reader(PING_IS_7, WAND)
-    assert reader.receive(PING_WAND) == ["wand"]
+UNKNOWN = words("0000001d 00000000 00000000 00000003 00000009 00000000") + b"12345\0\0\0"
+UDP = words("00000022 00000000 00000000 0000c813 fffffffd 00000000") + b"127.0.0.1\0" + bytes(6)
+NO_UTF_8 = words("0000001e 00000000 00000000 00000003 ffffffff 00000000 00000002") + b"\xffa" + bytes(2)
 
 
-def test_pings_arrive_byte_by_byte() -> None:
+@pytest.mark.parametrize(
+    ("messages", "pinged"),
+    [
+        pytest.param([PING_IS_7, WAND, PING_WAND, PING_WAND], ["wand", "wand"], id="the name of the device"),
+        pytest.param([PING_IS_7, PING_WAND], [], id="an unknown number"),
+        pytest.param(
+            [PING_IS_7, WAND, PING_IS_7.replace(b"ping", b"pong"), PING_WAND], [], id="another type"
+        ),
+        pytest.param([PING_IS_7, WAND, UNKNOWN, UDP, PING_WAND], ["wand"], id="padding is skipped"),
+        pytest.param([PING_IS_7, NO_UTF_8, PING_WAND], ["�a"], id="neither NUL nor UTF-8"),
+    ],
+)
+def test_pings_are_read_from_any_pieces(messages: list[bytes], pinged: list[str]) -> None:
+    stream = b"".join([CLIENT_COOKIE, *messages])
+    assert ClientReader().receive(stream) == pinged
     reader = ClientReader()
-    stream = CLIENT_COOKIE + PING_IS_7 + WAND + PING_WAND + PING_WAND
-    pinged = [name for byte in stream for name in reader.receive(bytes([byte]))]
-    assert pinged == ["wand", "wand"]
-
-
-def test_ping_of_unknown_number_is_ignored() -> None:
-    reader = ready_reader(PING_IS_7)
-    assert reader.receive(PING_WAND) == []
-
-
-def test_type_number_that_gets_another_name_is_no_ping_any_more() -> None:
-    other = PING_IS_7.replace(b"ping", b"pong")
-    reader = ready_reader(PING_IS_7, WAND, other)
-    assert reader.receive(PING_WAND) == []
-
-
-def test_unknown_messages_are_skipped_with_their_padding() -> None:
-    unknown = words("0000001d 00000000 00000000 00000003 00000009 00000000") + b"12345\0\0\0"
-    udp = words("00000022 00000000 00000000 0000c813 fffffffd 00000000") + b"127.0.0.1\0" + bytes(6)
-    reader = ready_reader(PING_IS_7, WAND)
-    assert reader.receive(unknown + udp + PING_WAND) == ["wand"]
+    assert [name for byte in stream for name in reader.receive(bytes([byte]))] == pinged
 
 
 def test_body_that_is_skipped_is_not_kept() -> None:
     large = words("0000fa18 00000000 00000000 00000003 00000009 00000000")  # 64 000 bytes follow
-    reader = ready_reader(PING_IS_7, WAND, large, bytes(63_999))
+    reader = ClientReader()
+    assert reader.receive(CLIENT_COOKIE + PING_IS_7 + WAND + large + bytes(63_999)) == []
     assert reader.num_waiting_bytes == 0
     assert reader.receive(b"\0" + PING_WAND) == ["wand"]
 
@@ -124,38 +98,27 @@ def test_body_that_is_skipped_is_not_kept() -> None:
         (b"GET / HTTP/1.1\r\n", "it does not speak VRPN 07; its first bytes are 'GET / HTTP/1.1'"),
         (b"\x16\x03\x01", r"its first bytes are '\x16\x03\x01'"),
         (b"vrpn: ver. 06.00  0\0\0\0\0\0", "its first bytes are 'vrpn: ver. 06.'"),
+        *(
+            (CLIENT_COOKIE + length.to_bytes(4, "big") + PING_WAND[4:], f"a message of {length} bytes")
+            for length in (0, 23, 24 + 64_001, 0xFFFF_FFFF)
+        ),
+        (
+            CLIENT_COOKIE + words("0000007d 00000000 00000000 00000003 ffffffff 00000000"),
+            "a description of 101 bytes",
+        ),
+        *(
+            (
+                CLIENT_COOKIE + WAND[:12] + number.to_bytes(4, "big", signed=True) + WAND[16:],
+                f"describes number {number}",
+            )
+            for number in (-1, 2000, 0x7FFF_FFFF)
+        ),
     ],
 )
-def test_other_protocols_are_refused_at_their_first_bytes(begin: bytes, text: str) -> None:
+def test_what_breaks_the_protocol_is_refused(begin: bytes, text: str) -> None:
     with pytest.raises(PeerError) as refused:
         ClientReader().receive(begin)
     assert text in str(refused.value)
-
-
-@pytest.mark.parametrize("length", [0, 23, 24 + 64_001, 0xFFFF_FFFF])
-def test_impossible_lengths_are_refused(length: int) -> None:
-    message = length.to_bytes(4, "big") + PING_WAND[4:]
-    with pytest.raises(PeerError, match=f"a message of {length} bytes"):
-        ready_reader().receive(message)
-
-
-def test_long_description_is_refused() -> None:
-    message = words("0000007d 00000000 00000000 00000003 ffffffff 00000000")  # 24 + 101
-    with pytest.raises(PeerError, match="a description of 101 bytes"):
-        ready_reader().receive(message)
-
-
-@pytest.mark.parametrize("number", [-1, 2000, 0x7FFF_FFFF])
-def test_number_outside_the_tables_is_refused(number: int) -> None:
-    message = WAND[:12] + number.to_bytes(4, "big", signed=True) + WAND[16:]
-    with pytest.raises(PeerError, match=f"describes number {number}"):
-        ready_reader().receive(message)
-
-
-def test_name_without_nul_and_name_that_is_not_utf_8() -> None:
-    name = words("0000001e 00000000 00000000 00000003 ffffffff 00000000 00000002") + b"\xffa" + bytes(2)
-    reader = ready_reader(PING_IS_7, name)
-    assert reader.receive(PING_WAND) == ["�a"]
 
 
 @pytest.mark.parametrize(

@@ -1,90 +1,62 @@
 """The names and numbers of trackers."""
 
-from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker, Trackers
+import pytest
+
+from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker, TrackerNames, Trackers
 
 
-def names(trackers: Trackers, source: str) -> list[str]:
+def names(trackers: Trackers, source: str = "lab") -> list[str]:
     return ["" if tracker is None else tracker.name for tracker in trackers.of_source(source).values()]
 
 
-def test_tools_of_the_only_source_give_the_names() -> None:
-    trackers = Trackers("auto")
-    trackers.set_tools("lab", ["wand", "Left Foot", "a@b", "Füße-2.1"])
-    assert names(trackers, "lab") == ["wand", "Left_Foot", "a_b", "Füße-2.1"]
+@pytest.mark.parametrize(
+    ("style", "tools", "expected"),
+    [
+        pytest.param(
+            "auto", ["wand", "Left Foot", "a@b", "Füße-2.1"], ["wand", "Left_Foot", "a_b", "Füße-2.1"]
+        ),
+        pytest.param("source/tool", ["wand"], ["lab/wand"]),
+        pytest.param("auto", ["w nd", "w@nd", "w_nd"], ["w_nd", "w_nd_2", "w_nd_3"], id="alike"),
+        pytest.param("auto", ["ü" * 60, "ü" * 61], ["ü" * 47, "ü" * 46 + "_2"], id="cut between characters"),
+    ],
+)
+def test_names_of_the_tools_of_one_source(style: TrackerNames, tools: list[str], expected: list[str]) -> None:
+    trackers = Trackers(style)
+    trackers.set_tools("lab", tools)
+    assert names(trackers) == expected
 
 
-def test_several_sources_are_in_the_names() -> None:
+def test_the_source_is_in_the_names_while_there_are_several() -> None:
     trackers = Trackers("auto")
     trackers.set_tools("lab", ["wand"])
     trackers.set_tools("stage", [])  # a source that has told nothing yet is one, too
-    assert names(trackers, "lab") == ["lab/wand"]
+    assert names(trackers) == ["lab/wand"]
     trackers.set_tools("stage", ["wand", "foot"])
     assert names(trackers, "stage") == ["stage/wand", "stage/foot"]
-
-
-def test_name_without_source_returns_when_the_other_source_is_removed() -> None:
-    trackers = Trackers("auto")
-    trackers.set_tools("lab", ["wand"])
-    trackers.set_tools("stage", ["wand"])
-    trackers.remove("lab")
-    assert names(trackers, "stage") == ["wand"]
-    trackers.remove("lab")  # again
-    assert names(trackers, "lab") == []
-
-
-def test_names_with_the_source_always() -> None:
-    trackers = Trackers("source/tool")
-    trackers.set_tools("lab", ["wand"])
-    assert names(trackers, "lab") == ["lab/wand"]
+    for _ in range(2):
+        trackers.remove("lab")
+        assert (names(trackers), names(trackers, "stage")) == ([], ["wand", "foot"])
 
 
 def test_names_without_the_source_while_they_are_different() -> None:
     trackers = Trackers("tool")
     trackers.set_tools("lab", ["wand", "foot"])
     trackers.set_tools("stage", ["wand", "hand"])
-    assert names(trackers, "lab") == ["wand", "foot"]
-    assert names(trackers, "stage") == ["stage/wand", "hand"]
-
-
-def test_names_that_become_equal_are_numbered() -> None:
-    trackers = Trackers("auto")
-    trackers.set_tools("lab", ["w nd", "w@nd", "w\tnd", "w_nd"])
-    assert names(trackers, "lab") == ["w_nd", "w_nd_2", "w_nd_3", "w_nd_4"]
-
-
-def test_long_names_are_cut_between_characters() -> None:
-    trackers = Trackers("auto")
-    trackers.set_tools("lab", ["ü" * 60, "ü" * 61])
-    assert names(trackers, "lab") == ["ü" * 47, "ü" * 46 + "_2"]
+    assert (names(trackers), names(trackers, "stage")) == (["wand", "foot"], ["stage/wand", "hand"])
 
 
 def test_tool_keeps_its_tracker_while_it_comes_and_goes() -> None:
+    """Only a present one is found by its name, and the version grows with each change only."""
     trackers = Trackers("auto")
     trackers.set_tools("lab", ["wand", "foot"])
-    before = dict(trackers.of_source("lab"))
-    trackers.set_tools("lab", ["hand"])
-    trackers.set_tools("lab", ["foot", "hand", "wand"])
-    after = trackers.of_source("lab")
-    assert {tool: after[tool] for tool in ("wand", "foot")} == before
-    assert after["hand"] == Tracker(2, "hand")
-
-
-def test_only_present_tools_have_a_name() -> None:
-    trackers = Trackers("auto")
-    trackers.set_tools("lab", ["wand"])
-    trackers.set_tools("lab", ["foot"])
-    assert trackers.named("wand") is None
-    assert trackers.named("foot") == Tracker(1, "foot")
-
-
-def test_version_grows_with_each_change_only() -> None:
-    trackers = Trackers("auto")
-    trackers.set_tools("lab", ["wand"])
-    version = trackers.version
-    trackers.set_tools("lab", ["wand"])
+    before, version = dict(trackers.of_source("lab")), trackers.version
+    trackers.set_tools("lab", ["wand", "foot"])
     assert trackers.version == version
-    trackers.set_tools("lab", ["foot"])
+    trackers.set_tools("lab", ["hand"])
     assert trackers.version > version
+    assert (trackers.named("wand"), trackers.named("hand")) == (None, Tracker(2, "hand"))
+    trackers.set_tools("lab", ["foot", "hand", "wand"])
+    assert trackers.of_source("lab") == {**before, "hand": Tracker(2, "hand")}
 
 
 def test_former_tools_make_room_for_new_ones() -> None:
@@ -92,7 +64,7 @@ def test_former_tools_make_room_for_new_ones() -> None:
     trackers.set_tools("lab", ["wand"])
     for first in range(0, 5 * MAX_TRACKERS, 100):
         trackers.set_tools("lab", ["wand", *(f"tool {number}" for number in range(first, first + 100))])
-        assert "" not in names(trackers, "lab")
+        assert "" not in names(trackers)
     assert trackers.named("wand") == Tracker(0, "wand")
     assert {tracker.number for tracker in trackers.current} <= set(range(MAX_TRACKERS))
 
@@ -100,10 +72,10 @@ def test_former_tools_make_room_for_new_ones() -> None:
 def test_tools_beyond_the_limit_get_no_tracker() -> None:
     trackers = Trackers("auto")
     trackers.set_tools("lab", [f"tool {number}" for number in range(MAX_TRACKERS + 3)])
-    assert names(trackers, "lab")[MAX_TRACKERS - 1 :] == [f"tool_{MAX_TRACKERS - 1}", "", "", ""]
+    assert names(trackers)[MAX_TRACKERS - 1 :] == [f"tool_{MAX_TRACKERS - 1}", "", "", ""]
     assert len(list(trackers.current)) == MAX_TRACKERS
     trackers.set_tools("lab", ["wand"])
-    assert names(trackers, "lab") == ["wand"]
+    assert names(trackers) == ["wand"]
 
 
 def test_the_tool_that_has_been_away_longest_makes_room_first() -> None:

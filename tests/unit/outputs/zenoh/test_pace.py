@@ -16,20 +16,18 @@ from gateway.outputs.zenoh.json_keys import JsonKeys
 from gateway.outputs.zenoh.publisher import BURST_BYTES, BURST_S, ZenohLink
 from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
+from tests.settable_clock import Clock
 from tests.virtual_time import run_in_virtual_time
 
 PARAMETERS = ServerParameters(b"<RT_Parameters/>", 1, 4)
 
 
-class Clock:
+class WaitingClock(Clock):
     """``waits_s`` has the length of each wait."""
 
     def __init__(self) -> None:
-        self.now_s = 100.0
+        super().__init__()
         self.waits_s: list[float] = []
-
-    def __call__(self) -> float:
-        return self.now_s
 
     def wait(self, seconds: float) -> None:
         self.waits_s.append(seconds)
@@ -37,14 +35,14 @@ class Clock:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> WaitingClock:
+    clock = WaitingClock()
     monkeypatch.setattr(time, "monotonic", clock)
     monkeypatch.setattr(time, "sleep", clock.wait)
     return clock
 
 
-def test_a_burst_begins_two_milliseconds_after_the_one_before_it(clock: Clock) -> None:
+def test_a_burst_begins_two_milliseconds_after_the_one_before_it(clock: WaitingClock) -> None:
     """Without this pace, a subscriber that reads as fast as it can loses more than half of a long burst."""
     link = ZenohLink(lambda: OutputError("not open", cause="not open"))
     waits_s = []
@@ -58,7 +56,7 @@ def test_a_burst_begins_two_milliseconds_after_the_one_before_it(clock: Clock) -
     assert waits_s == pytest.approx([0, BURST_S, BURST_S - 0.0015, 0, BURST_S])
 
 
-def test_the_thread_for_json_rests_four_times_as_long_as_a_conversion_took(clock: Clock) -> None:
+def test_the_thread_for_json_rests_four_times_as_long_as_a_conversion_took(clock: WaitingClock) -> None:
     """So a web page costs the gateway a fifth of a core at most."""
     keys = JsonKeys(100)
     keys._closing = SimpleNamespace(wait=clock.wait)  # type: ignore[assignment]  # a threading.Event

@@ -1,4 +1,4 @@
-"""What each kind of fault does to replies and to the byte stream, and the times at which faults begin."""
+"""The kinds of faults: their names, and what each does to replies, to the byte stream and to frames."""
 
 import math
 import struct
@@ -8,40 +8,138 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.errors import ConfigError, FrameError
+from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
-from gateway.simulator.faults.base import Fault
+from gateway.simulator.faults.base import Fault, LastingConnectionFault
+from gateway.simulator.faults.frame_faults import (
+    FrozenTimestamps,
+    JumpingTimestamps,
+    Occlusion,
+    ShortEvents,
+    UnknownComponent,
+    WrongByteOrder,
+    WrongCounts,
+)
 from gateway.simulator.faults.held_replies import HeldReplies
+from gateway.simulator.faults.kinds import KINDS, describe_kinds, parse_fault, summary_of
 from gateway.simulator.faults.momentary_faults import Cut, Oversize, Undersize
 from gateway.simulator.faults.outgoing import PendingWrite, Reply
 from gateway.simulator.faults.reply_faults import MinimalServer, RefusedCommands
+from gateway.simulator.faults.server_faults import Restart
 from gateway.simulator.faults.stream_faults import Delay, Jitter, Merge, Split
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, packet
-from tests.unit.simulator.faults.faulty_client import FaultyClient
-from tests.unit.simulator.faults.faulty_packets import active, writes_for
-from tests.virtual_time import run_in_virtual_time
+from gateway.simulator.scene_settings import SceneSettings
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, packet, packets_in
+from tests.unit.simulator.faults.faulty_client import (
+    FaultyClient,
+    active,
+    changed,
+    components_in_packet,
+    frame,
+    markers,
+    played,
+    writes_for,
+)
+
+
+def test_every_kind_of_fault_has_defaults_for_all_parameters() -> None:
+    assert set(KINDS) == {
+        *("delay", "jitter", "split", "merge", "cut", "half_open", "slow_reader", "garbage"),
+        *("oversize", "undersize", "wrong_counts", "wrong_byte_order", "unknown_component"),
+        *("refused_commands", "minimal_server", "reply_text", "frames_first"),
+        *("doubled_acknowledgements", "missing_acknowledgements", "late_acknowledgements"),
+        *("no_measurement", "restart", "change_scene", "rename", "occlusion"),
+        *("frozen_timestamps", "jumping_timestamps", "constant_frame_numbers", "short_events"),
+    }
+    for name, kind in KINDS.items():
+        assert parse_fault(name) == kind()
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("delay,delay_ms=80,at_s=5,for_s=3", Delay(delay_ms=80, at_s=5, for_s=3)),
+        ("jitter,mean_ms=5", Jitter(mean_ms=5)),
+        (
+            "restart,scene.markers=12,scene.marker_label=M",
+            Restart(scene=SceneSettings(markers=12, marker_label="M")),
+        ),
+        ("refused_commands,commands=[version,bye]", RefusedCommands(commands=("version", "bye"))),
+        ("refused_commands,commands=bye,times=2", RefusedCommands(commands=("bye",), times=2)),
+        (
+            "wrong_byte_order,byte_order=little,connection=2",
+            WrongByteOrder(byte_order="little", connection=2),
+        ),
+    ],
+)
+def test_a_fault_is_parsed_from_the_form_in_which_it_is_printed(text: str, fault: Fault) -> None:
+    assert parse_fault(text) == fault
+    assert parse_fault(str(fault)) == fault
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "dely,at_s=1",
+            r"fault 'dely,at_s=1': fault: found 'dely' \(did you mean 'delay'\?\); expected no_me",
+        ),
+        ("", "fault '': fault: found ''; expected no_measurement,"),
+        ("cut,at=1", r"at: unknown key \(did you mean 'at_s'\?\); known keys: at_s, every_s, times"),
+        ("cut,reset=1", "reset: found 1; expected true or false"),
+        *(
+            (f"cut,{each}", f"found '{each.split(',')[-1]}'; expected NAME=VALUE, each name once")
+            for each in ("reset", "at_s=1,at_s=2", "fault=delay")
+        ),
+        ("delay,delay_ms=-1", "delay_ms: found -1; expected a number of milliseconds above 0, up to 600000"),
+        ("delay,delay_ms=[", r"delay_ms: found '\['; expected a number"),
+        ("delay,delay_ms=.nan", "delay_ms: found nan; expected a number"),
+        ("delay,every_s=2", "every_s: found every_s without for_s; expected both"),
+        ("restart,scene=3", "scene: found 3; expected a mapping with any of the keys markers, tools"),
+        ("restart,scene=3,scene.markers=1", "scene has both a value and keys; expected only one of them"),
+        ("restart,scene.markers=1.5", "scene.markers: found 1.5; expected a whole number from 0 to 10000"),
+        ("refused_commands,commands=[]", "found an empty list; expected the first word of a command"),
+        ("refused_commands,commands=[fly]", "commands.0: found 'fly'; expected version, setbyteorder"),
+    ],
+)
+def test_an_invalid_fault_is_reported_in_a_sentence(text: str, expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        parse_fault(text)
+
+
+def test_the_description_of_the_kinds_has_each_with_its_parameters() -> None:
+    text = describe_kinds()
+    for name, kind in KINDS.items():
+        assert f"\n{name}" in f"\n{text}"
+        assert f"    {summary_of(kind)}" in text
+        for parameter in kind.model_fields:
+            assert parameter in text
+    assert "delay_ms=100  The delay in milliseconds." in text
+
 
 # Replies --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("texts", "is_refused"),
+    ("refused", "texts"),
     [
-        (["StreamFrames", "STREAMFRAMES\0", "StreamFrames FrequencyDivisor:4", "StreamFrames Stop"], False),
-        (["SendCurrentFrame"], False),
+        (False, ["StreamFrames", "STREAMFRAMES\0", "StreamFrames FrequencyDivisor:4", "StreamFrames Stop"]),
+        (False, ["SendCurrentFrame"]),
         (
-            ["Version 1.0", "SetByteOrder LittleEndian", "SendParameters", "SendParameters All", "Bye", ""],
             True,
+            ["Version 1.0", "SetByteOrder LittleEndian", "SendParameters", "SendParameters All", "Bye", ""],
         ),
-        (["StreamFrames AllFrames", "StreamFrames Frequency:60", "StreamFrames 3D"], True),
-        (["StreamFrames FrequencyDivisor:4 3D", "SendCurrentFrame 3D"], True),
+        (
+            True,
+            ["StreamFrames AllFrames", "StreamFrames Frequency:60", "StreamFrames 3D", "SendCurrentFrame 3D"],
+        ),
+        (True, ["StreamFrames FrequencyDivisor:4 3D"]),
     ],
 )
-def test_a_minimal_server_accepts_only_the_commands_of_field_note_2(
-    texts: list[str], is_refused: bool
-) -> None:
+def test_a_minimal_server_accepts_only_the_commands_of_field_note_2(refused: bool, texts: list[str]) -> None:
     """The gateway's fallback to simpler commands is tested against this server."""
     for text in texts:
-        assert (MinimalServer().refusal(Packet(COMMAND, text.encode())) is not None) == is_refused, text
+        assert (MinimalServer().refusal(Packet(COMMAND, text.encode())) is not None) == refused, text
 
 
 def test_refused_commands_are_recognised_by_their_first_word() -> None:
@@ -51,7 +149,6 @@ def test_refused_commands_are_recognised_by_their_first_word() -> None:
         "SetByteOrder BigEndian": "setbyteorder is refused",
         "bye\0": "bye is refused",
         "Version 1.0": None,
-        "StreamFrames": None,
         "": None,
     }
     assert {text: fault.refusal(Packet(COMMAND, text.encode())) for text in texts} == texts
@@ -114,25 +211,19 @@ def test_jitter_is_exponential_with_the_configured_mean() -> None:
 @pytest.mark.parametrize(
     ("fault", "size", "calls"),
     [
-        (Oversize(), 0xFFFFFFFF, []),
-        (Oversize(size_bytes=20_000_000), 20_000_000, []),
-        (Undersize(), 0, []),
-        (Undersize(size_bytes=7), 7, []),
-        (Cut(), 1000, ["close"]),
+        *((Oversize(), 0xFFFFFFFF, []), (Oversize(size_bytes=20_000_000), 20_000_000, [])),
+        *((Undersize(), 0, []), (Undersize(size_bytes=7), 7, []), (Cut(), 1000, ["close"])),
     ],
 )
-def test_a_header_can_announce_what_does_not_follow(fault: Fault, size: int, calls: list[str]) -> None:
+@played
+async def test_a_header_can_announce_what_does_not_follow(
+    client: FaultyClient, fault: Fault, size: int, calls: list[str]
+) -> None:
     """A reader must not wait for it forever, or allocate memory for it."""
-
-    async def scenario() -> None:
-        client = FaultyClient()
-        client.begin(fault)
-        [(_, data)] = client.writes
-        assert data[:8] == struct.pack(">II", size, DATA)
-        assert (len(data) > 8) is bool(calls)
-        assert client.calls == calls
-
-    run_in_virtual_time(scenario())
+    client.begin(fault)
+    [(_, data)] = client.writes
+    assert data[:8] == struct.pack(">II", size, DATA)
+    assert (len(data) > 8, client.calls) == (bool(calls), calls)
 
 
 # Times ----------------------------------------------------------------------------------------
@@ -144,26 +235,122 @@ def delays_s(fault: Fault, seed: int) -> list[float]:
 
 
 def test_a_repeated_fault_begins_at_random_intervals_that_are_the_same_for_the_same_seed() -> None:
-    """A failure in the lab can be provoked again, and faults do not keep step with the frames."""
+    """A failure in the lab can be provoked again, and neither frames nor the load of the machine matter."""
     fault = Delay(every_s=4, for_s=1)
     first = delays_s(fault, 1)
     assert all(2 <= delay_s <= 6 for delay_s in first)
     assert np.mean(first) == pytest.approx(4, rel=0.1)
-    assert first == delays_s(fault, 1)
-    assert first != delays_s(fault, 2)
-
-
-def test_when_a_fault_begins_does_not_depend_on_how_many_packets_it_changed() -> None:
-    """Otherwise the load of the machine would change a scenario."""
-    fault = Jitter(every_s=4, for_s=1)
-    idle, busy = active(fault), active(fault)
+    assert first == delays_s(fault, 1) != delays_s(fault, 2)
+    jitter = Jitter(every_s=4, for_s=1)
+    idle, busy = active(jitter), active(jitter)
     for _ in range(10):
-        writes_for(fault, b"x", busy)
+        writes_for(jitter, b"x", busy)
     assert idle.first_delay_s() == busy.first_delay_s()
 
 
 def test_a_fault_first_begins_at_its_time_or_at_once() -> None:
     """``every_s`` alone postpones it, so that a client can connect first."""
-    assert active(Delay(at_s=3, every_s=5, for_s=1)).first_delay_s() == 3
-    assert active(Delay()).first_delay_s() == 0
-    assert math.isclose(active(Delay(at_s=0, every_s=5, for_s=1)).first_delay_s(), 0)
+    for fault, delay_s in (
+        (Delay(at_s=3, every_s=5, for_s=1), 3),
+        (Delay(), 0),
+        (Delay(at_s=0, every_s=5, for_s=1), 0),
+    ):
+        assert active(fault).first_delay_s() == delay_s
+
+
+# Frames ----------------------------------------------------------------------------------------
+
+
+MISSING = b"\xff" * 4
+
+
+@pytest.mark.parametrize(("fraction", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
+def test_occlusion_hides_a_fraction_of_the_markers_while_it_lasts(fraction: float, hidden: int) -> None:
+    [component] = components_in_packet(changed(Occlusion(markers=fraction), frame(markers(count=8))))
+    seen = [item for item in component.items if not math.isnan(item[0])]
+    assert len(seen) == 8 - hidden
+    assert all(item[1:] == (1.5, -2.0, 0.25) for item in seen)
+    fault, data = Occlusion(markers=0.5), frame(markers(count=100))
+    occlusion = active(fault)
+    occlusion.begin()
+    first, second = (changed(fault, data, occlusion) for _ in range(2))
+    occlusion.begin()
+    assert first == second != changed(fault, data, occlusion)
+
+
+def test_hidden_markers_and_tools_have_the_bytes_of_field_note_7() -> None:
+    tool = struct.pack(">IIiqI8f", 24 + 32, TOOLS, 7, 9000, 1, 1, 0, 0, 0, 10, 20, 30, 0.5)
+    data = changed(Occlusion(), frame(markers(count=1), tool))
+    assert data[8 + 4 + 24 : 8 + 4 + 40] == MISSING * 3 + struct.pack(">f", 999.0)
+    assert data[-32:] == MISSING * 8
+    heads = [each[:3] for each in components_in_packet(data)]
+    assert heads == [(MARKERS, 7, 9000), (TOOLS, 7, 9000)]
+
+
+def test_frozen_time_stamps_are_those_of_the_first_frame_since_the_fault_began() -> None:
+    frozen = active(FrozenTimestamps())
+    changed(FrozenTimestamps(), frame(markers(number=1, timestamp_us=1234)), frozen)
+    data = changed(FrozenTimestamps(), frame(markers(number=2, timestamp_us=5)), frozen)
+    assert data == frame(markers(number=2, timestamp_us=1234))
+    frozen.begin()
+    assert changed(FrozenTimestamps(), data := frame(markers(timestamp_us=77)), frozen) == data
+
+
+@pytest.mark.parametrize(("jump_ms", "timestamp_us"), [(-5, 4000), (0.5, 9500), (1e12, 10**15 + 9000)])
+def test_time_stamps_jump(jump_ms: float, timestamp_us: int) -> None:
+    data = changed(JumpingTimestamps(jump_ms=jump_ms), frame(markers()))
+    assert data == frame(markers(timestamp_us=timestamp_us))
+
+
+def test_events_can_have_16_bytes() -> None:
+    header = struct.Struct(">IIiqI")
+    items = struct.pack(">iqiiiiqiii", 1, 8000, 2, 3, 4, 5, 8500, 6, 7, 8)
+    long = header.pack(24 + 48, 5, 7, 9000, 2) + items
+    short = header.pack(24 + 32, 5, 7, 9000, 2) + struct.pack(">8i", 1, 2, 3, 4, 5, 6, 7, 8)
+    assert changed(ShortEvents(), frame(markers(), long)) == frame(markers(), short)
+
+
+@pytest.mark.parametrize(
+    ("order", "requested", "sent"),
+    [
+        *(("big", "little", "big"), ("little", "little", "little"), ("little", "big", "little")),
+        *(("other", "big", "little"), ("other", "little", "big")),
+    ],
+)
+def test_frames_can_have_another_byte_order(order: str, requested: ByteOrder, sent: ByteOrder) -> None:
+    fault = WrongByteOrder.model_validate({"byte_order": order})
+    data = changed(fault, frame(markers(requested), byte_order=requested))
+    assert data == frame(markers(sent), byte_order=sent)
+
+
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+def test_an_unknown_component_comes_last_with_a_header_like_any_other(byte_order: ByteOrder) -> None:
+    sign = ">" if byte_order == "big" else "<"
+    unknown = struct.pack(sign + "IIiq", 20 + 5, 99, 0, 0) + bytes(5)
+    data = changed(
+        UnknownComponent(component_type=99, data_bytes=5), frame(markers(byte_order), byte_order=byte_order)
+    )
+    assert data == frame(markers(byte_order), unknown, byte_order=byte_order)
+
+
+@pytest.mark.parametrize("field", ["components", "size", "items"])
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+def test_wrong_counts_are_invalid_in_either_byte_order(field: str, byte_order: ByteOrder) -> None:
+    good = frame(markers(byte_order), markers(byte_order), byte_order=byte_order)
+    [(_, body)] = packets_in(changed(WrongCounts.model_validate({"field": field}), good))
+    assert len(body) == len(good) - 8
+    for order in ("big", "little"):
+        with pytest.raises(FrameError):
+            split_frame(body, order)
+
+
+FRAME_KINDS = [kind for kind in KINDS.values() if kind.__module__.endswith("frame_faults")]
+
+
+@pytest.mark.parametrize("kind", FRAME_KINDS)
+@pytest.mark.parametrize(
+    "data",
+    [packet(COMMAND, b"OK-Version 1.0"), packet(4), packet(DATA, b"no frame"), packet(2, b"<x/>"), b"half"],
+)
+def test_faults_of_frames_change_no_other_packets(kind: type[LastingConnectionFault], data: bytes) -> None:
+    assert changed(kind(), data) == data

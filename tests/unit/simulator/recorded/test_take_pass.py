@@ -15,7 +15,7 @@ DEFAULT = RecordedParameters(b"<RT_Parameters/>")
 
 
 def read(
-    path: Path, messages: list[Message], *, first_utime: int | None = None, end_utime: int | None = None
+    path: Path, messages: list[Message], first_utime: int | None = None, end_utime: int | None = None
 ) -> tuple[list[Moment], TakePass]:
     found = TakePass(TakeReader(write_take(path, messages)), "lab", first_utime, end_utime, DEFAULT)
     return list(found.moments()), found
@@ -35,20 +35,11 @@ def test_moments_have_the_content_of_the_messages_from_byte_40_on(path: Path) ->
     assert [moment.due_us for moment in moments] == [0, 10_000, 20_000, 30_000, 40_000]
 
 
-def test_only_the_chosen_source_is_read(path: Path) -> None:
-    moments, _ = read(
-        path, [description(), description("other"), markers(3, 0), markers(3, 1, source="other")]
-    )
-    assert len(moments) == 1
-
-
-def test_a_range_begins_anywhere_and_its_end_is_not_included(path: Path) -> None:
-    moments, _ = read(
-        path,
-        [markers(3, number) for number in range(100)],
-        first_utime=START_UTIME + 200_000,
-        end_utime=START_UTIME + 500_000,
-    )
+def test_only_the_chosen_source_and_range_are_read(path: Path) -> None:
+    """A range begins anywhere, and its end is not included."""
+    others = [description("other"), markers(3, 30, source="other")]
+    messages = [*others, *(markers(3, number) for number in range(100))]
+    moments, _ = read(path, messages, START_UTIME + 200_000, START_UTIME + 500_000)
     assert [moment.timestamp_us for moment in moments] == list(range(200_000, 500_000, 10_000))
     assert moments[0].due_us == 0
 
@@ -63,9 +54,12 @@ def test_each_frame_has_the_parameters_that_were_valid(path: Path) -> None:
         markers(3, 3, version=2),
         parameters(SECOND, 2),  # repeated every few seconds
         markers(3, 4, version=3),  # whose parameters are missing
+        parameters(b"", 4),  # void
+        markers(3, 5, version=4),
     ]
     moments, found = read(path, messages)
-    assert [moment.parameters.xml for moment in moments] == [DEFAULT.xml, FIRST, FIRST, SECOND, SECOND]
+    expected = [DEFAULT.xml, FIRST, FIRST, SECOND, SECOND, DEFAULT.xml]
+    assert [moment.parameters.xml for moment in moments] == expected
     assert found.first_parameters is not None
     assert found.first_parameters.xml == FIRST
 
@@ -79,13 +73,6 @@ def test_a_thousand_versions_of_the_parameters_are_remembered_at_most(path: Path
     assert (min(found._versions), max(found._versions)) == (1001, 1599)
 
 
-def test_parameters_that_became_void_are_those_of_the_take_no_more(path: Path) -> None:
-    moments, _ = read(
-        path, [parameters(FIRST, 1), markers(3, 0, version=1), parameters(b"", 2), markers(3, 1, version=2)]
-    )
-    assert [moment.parameters.xml for moment in moments] == [FIRST, DEFAULT.xml]
-
-
 @pytest.mark.parametrize("encoding", ["ISO-8859-1", "latin1", "UTF-8"])
 def test_xml_keeps_the_encoding_that_it_declares(path: Path, encoding: str) -> None:
     xml = f'<?xml version="1.0" encoding="{encoding}"?><RT_Parameters><Größe/></RT_Parameters>'
@@ -97,20 +84,10 @@ def test_xml_keeps_the_encoding_that_it_declares(path: Path, encoding: str) -> N
 def test_malformed_messages_are_left_out_and_counted(path: Path) -> None:
     channel, message = markers(3, 1)
     parameters_channel, parameters_message = parameters(FIRST)
-    moments, found = read(
-        path,
-        [
-            markers(3, 0),
-            (channel, message[:-1]),
-            (channel, message + b"\0"),
-            (channel, message[:52] + b"\xff\xff\xff\xff" + message[56:]),
-            (channel, message[:20]),
-            (parameters_channel, parameters_message[:-5]),
-            markers(3, 2),
-        ],
-    )
-    assert [moment.timestamp_us for moment in moments] == [0, 20_000]
-    assert found.num_malformed == 5
+    malformed = (message[:-1], message + b"\0", message[:52] + b"\xff" * 4 + message[56:], message[:20])
+    others = [(channel, each) for each in malformed] + [(parameters_channel, parameters_message[:-5])]
+    moments, found = read(path, [markers(3, 0), *others, markers(3, 2)])
+    assert ([moment.timestamp_us for moment in moments], found.num_malformed) == ([0, 20_000], 5)
 
 
 def test_a_capture_time_that_cannot_be_true_is_not_used(path: Path) -> None:

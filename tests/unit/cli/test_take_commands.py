@@ -1,0 +1,115 @@
+"""What ``take list`` and ``take info`` print, and the replies of several sources to a command for takes."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from gateway.cli.main import app
+from gateway.cli.take_gateway import GatewayAddress, TakeReplies
+from gateway.cli.take_list import ListedTake, size_text, write_list
+from gateway.errors import QueryError, TakeError
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from tests.takes import description, markers, parameters, write_take
+
+TAKE = {"name": "walk-1", "bytes": 3_456_789, "begin_utime": 1_700_000_000_000_000, "seconds": 83.25}
+
+
+def written(**content: Any) -> str:
+    out = io.StringIO()
+    write_list({"lab": content}, Console(file=out, width=120))
+    return out.getvalue()
+
+
+def test_a_row_has_what_matters() -> None:
+    text = written(takes=[TAKE | {"is_running": True, "lost": 3}], num_takes=1, kept_s=59.7)
+    for part in ("lab", "walk-1", "1 min 23.2 s", "3.5 MB", "running, 3 messages lost"):
+        assert part in text
+    assert "lab: the last 60 s are kept, to be saved with: take save" in text
+
+
+def test_no_takes_are_no_table_and_a_list_with_a_limit_says_so() -> None:
+    assert written(takes=[], num_takes=0, kept_s=0.0) == "lab: no takes\n"
+    assert "lab: the newest 1 of 1500 takes" in written(takes=[TAKE], num_takes=1500)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {},
+        {"takes": 5, "num_takes": "x", "kept_s": None},
+        {"takes": [5, None, {}, {"name": "\x1b[2J", "bytes": "x", "begin_utime": 1e300, "seconds": 1e299}]},
+        {"takes": [{"name": "x" * 10_000, "begin_utime": -5, "seconds": float("nan")}]},
+    ],
+)
+def test_what_another_gateway_sends_is_shown_as_far_as_possible(content: Any) -> None:
+    assert "\x1b[2J" not in written(**content)
+
+
+def test_durations_and_sizes() -> None:
+    durations = [ListedTake({"seconds": seconds}).duration_text for seconds in (0, 59.96, 3600.04, 7384.5)]
+    assert durations == ["0.0 s", "1 min 0.0 s", "1 h 0 min 0.0 s", "2 h 3 min 4.5 s"]
+    assert [size_text(each) for each in (0, 999, 1000, 2.5e9)] == ["0 bytes", "999 bytes", "1.0 kB", "2.5 GB"]
+
+
+CODES = ("disabled", "nothing-yet", "refused")
+
+
+@pytest.mark.parametrize(
+    ("source", "received", "action", "codes"),
+    [
+        (None, {"lab": {}}, "stop", CODES[2:]),
+        (None, {"lab": {}}, "start", CODES[1:]),
+        (None, {}, "stop", CODES),
+        ("lab", {"lab": {}}, "stop", CODES),
+    ],
+)
+def test_sources_that_are_not_concerned_are_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+    source: str | None,
+    received: dict[str, Any],
+    action: str,
+    codes: tuple[str, ...],
+) -> None:
+    """Replies of several sources to one command for takes."""
+    problems = [QueryError(code, code=code) for code in CODES]
+    monkeypatch.setattr(GatewayAddress, "_ask_zenoh", lambda *_: TakeReplies(received, problems))
+    replies = GatewayAddress(source, False, None, None, None, None, None, 1.0).ask({"set": action})
+    assert replies.received == received
+    assert tuple(problem.code for problem in replies.problems) == codes
+
+
+PARAMETERS = Parameters(markers=Parameters3D(100.0, "mm", (Marker("1", "head[red]"), Marker("2", "foot"))))
+
+
+def take(folder: Path) -> Path:
+    messages = [description(), parameters(PARAMETERS)]
+    messages += [markers(2, number) for number in range(100) if number not in (50, 51)]
+    path = write_take(folder / "lab.lcmlog", messages)
+    path.write_bytes(path.read_bytes()[:-10] + b"garbage")
+    return path
+
+
+def test_the_report_and_json_have_what_is_there_and_what_is_missing(tmp_path: Path) -> None:
+    path = str(take(tmp_path))
+    words = " ".join(CliRunner().invoke(app, ["take", "info", path]).stdout.split())
+    assert "Source lab: 192.0.2.20:3020, gateway 1.0" in words
+    assert "3d 97 2 100 of 100 0.98 2 1, 2 at 0.52 s" in words
+    assert "head[red] 100.0 %" in words
+    assert "lab.lcmlog: 125 bytes from" in words
+    found = json.loads(CliRunner().invoke(app, ["take", "info", path, "--json"]).stdout)
+    part = found["sources"]["lab"]["components"]["3d"]
+    assert (part["messages"], part["missing"], part["largest_gap"]) == (97, 2, {"at_s": 0.52, "missing": 2})
+    assert part["visible"] == {"head[red]": 1.0, "foot": 1.0}
+    assert (found["damage"]["places"], found["is_complete"]) == (1, False)
+
+
+def test_a_file_that_is_no_recording_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n" * 100)
+    result = CliRunner().invoke(app, ["take", "info", str(tmp_path / "picture.png")])
+    assert isinstance(result.exception, TakeError)
+    assert "choose a recording" in str(result.exception)
