@@ -83,8 +83,9 @@ class SessionHolder:
         self._opener.start()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the thread has opened the session and declared everything."""
-        self._opener.join(timeout_s)
+        """Wait until the thread has opened the session and declared everything, or was never started."""
+        if self._opener.is_alive():
+            self._opener.join(timeout_s)
 
     def _run(self) -> None:
         prepare_threads()

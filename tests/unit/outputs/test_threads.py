@@ -37,7 +37,7 @@ async def test_zenoh_opens_and_replies_in_threads(threads: Callable[[], dict[str
         output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=endpoint)))
         output.serve_queries(SourceQueryService(dict, dict, "zenoh"))
         output.start()
-        assert threads() == {"zenoh-open": True, "zenoh-send": True, "zenoh-send-long": True}
+        assert threads() == {"zenoh-open": True}  # the others start when there is something to send
         await output.stop_queries()
         await wait_until_async(lambda: set(threads()) == {"zenoh-open"})
     await asyncio.to_thread(output.close)

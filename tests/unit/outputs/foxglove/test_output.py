@@ -361,7 +361,7 @@ async def test_numbers_are_also_in_cdr_as_messages_of_ros_2() -> None:
         async with viewing(port, "/lab-2/analog/cdr") as viewer:
             channel = viewer.channel("/lab-2/analog/cdr")
             assert channel["schemaName"] == "rtc3d_lab_2/msg/Analog"
-            names = ("EMG_1", "n_1", "n_1_2", "channel_4", "channel_5")
+            names = ("emg_1", "n1", "n_1", "channel_4", "channel_5")
             assert channel["schema"].splitlines() == [f"float32 {name}" for name in names]
             await lab.wait_until_wanted()
             lab.publish_items(ANALOG, [1, -2.5, math.nan, 4, 5])

@@ -201,9 +201,9 @@ def test_what_is_not_multicast_has_no_multicast_problem(url: str) -> None:
 
 
 def test_a_closed_publisher_says_so_and_frees_its_channel_once() -> None:
-    sent: list[tuple[str, bytes]] = []
+    sent: list[tuple[str, bytes, str]] = []
     forgotten: list[LcmPublisher] = []
-    publisher = LcmPublisher("MOCAP_LAB_3D", lambda *each: sent.append(each), forgotten.append)
+    publisher = LcmPublisher("MOCAP_LAB_3D", "lab", lambda *each: sent.append(each), forgotten.append)
     assert publisher.wanted
     publisher.publish(b"message")
     publisher.close()
@@ -212,7 +212,7 @@ def test_a_closed_publisher_says_so_and_frees_its_channel_once() -> None:
         "LCM channel MOCAP_LAB_3D is closed; ask for a new publisher",
         "closed",
     )
-    assert sent == [("MOCAP_LAB_3D", b"message")]
+    assert sent == [("MOCAP_LAB_3D", b"message", "lab")]
     assert forgotten == [publisher]
 
 

@@ -3,6 +3,7 @@
 import logging
 import struct
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 import pytest
@@ -76,7 +77,7 @@ class _Declared:
 
 
 class Router:
-    """A RouterSession without a session."""
+    """A SessionHolder without a session."""
 
     def __init__(self, *_: Any) -> None:
         self.is_cut_off = False
@@ -107,6 +108,7 @@ class Sender:
         self.calls: list[Callable[[], None]] = []
         self.offered_bytes: list[int] = []
         self.is_full = self.is_closed = False
+        self.call_age_s = 0.0
 
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
         if not self.is_full:
@@ -114,8 +116,11 @@ class Sender:
             self.offered_bytes.append(num_bytes)
         return not self.is_full
 
-    def submit(self, call: Callable[[], None]) -> None:
+    def submit(self, call: Callable[[], None]) -> Future[None]:
         self.calls.insert(0, call)
+        done: Future[None] = Future()
+        done.set_result(None)
+        return done
 
     def run(self) -> None:
         while self.calls:

@@ -31,7 +31,7 @@ class Output:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_open: bool = True, **settings: Any) -> None:
         self.node, self.sender = Node(), Sender()
-        monkeypatch.setattr(output_module, "RouterSession", Router)
+        monkeypatch.setattr(output_module, "router_session", Router)
         monkeypatch.setattr(output_module, "SendThread", lambda _: self.sender)
         monkeypatch.setattr(output_module, "RosNode", lambda *_: self.node)
         self.output = Ros2Output(Ros2Settings(enabled=True, **settings))
@@ -41,7 +41,7 @@ class Output:
             self.open()
 
     def open(self) -> None:
-        self.output._on_open(None)  # type: ignore[arg-type]
+        self.output._declare_in_thread(None)  # type: ignore[arg-type]
         self.sender.run()
 
     def source(self, name: str, *labels: str) -> RosSource:

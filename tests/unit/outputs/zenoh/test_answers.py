@@ -68,7 +68,7 @@ async def open_lab(**settings: Any) -> AsyncIterator[Lab]:
     output.announce("lab")
     output.start()
     await wait_until_async(lambda: output.health().connected)
-    await asyncio.to_thread(output._opener.join)  # it declares the queryables last
+    await asyncio.to_thread(output.wait_until_open, 30)  # it declares the queryables last
     peer = open_zenoh("client", connect=endpoint)
     try:
         yield Lab(output, service, peer)

@@ -169,7 +169,7 @@ def test_a_message_is_refused_as_not_open_while_the_session_opens() -> None:
 def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: Lab) -> None:
     publisher = lab.output.publisher(MARKERS)
     lab.open()
-    lab.output._opener.join()  # it still declares on the session
+    lab.output.wait_until_open(30)  # it still declares on the session
     assert lab.output.session is not None
     lab.output.session.close()
     with pytest.raises(OutputError) as caught:

@@ -79,7 +79,7 @@ class Lab:
         self.output.announce("lab")
         self.output.start()
         await wait_until_async(lambda: self.output.health().connected)
-        await asyncio.to_thread(self.output._opener.join)  # it declares the queryables last
+        await asyncio.to_thread(self.output.wait_until_open, 30)  # it declares the queryables last
         self.peer = open_zenoh("client", connect=self.endpoint)
 
     def subscribe(self, keys: str) -> None:

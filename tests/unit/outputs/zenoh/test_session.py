@@ -1,0 +1,152 @@
+"""The session of an output: opening, everything declared on it, its router, and closing, without Zenoh."""
+
+import logging
+from collections.abc import Callable
+from unittest.mock import Mock
+
+import pytest
+import zenoh
+
+from gateway.outputs.zenoh import session as session_module
+from gateway.outputs.zenoh.config import zenoh_config
+from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
+from tests.networks import zenoh_keys
+
+TEXTS = SessionTexts("zenoh", "not open yet", "cannot open: {reason}", "no router there", "it is open")
+
+
+def event(*, is_open: bool) -> Mock:
+    """Return what SessionHolder uses of a zenoh.TransportEvent."""
+    return Mock(kind=zenoh.SampleKind.PUT if is_open else zenoh.SampleKind.DELETE)
+
+
+class Lab:
+    """A SessionHolder whose zenoh.open fails as often as there are ``errors``."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, num_errors: int = 0, mode: str = "client") -> None:
+        self.session = Mock()
+        self.listen = self.session.info.declare_transport_events_listener
+        self.errors: list[Exception] = [zenoh.ZError("refused") for _ in range(num_errors)]
+        self.declared: list[object] = []
+        self.defects: list[Exception] = []  # of declaring
+        self.closed: list[object] = []
+        self.waits_s: list[object] = []
+        self.before_open: Callable[[], None] = lambda: None
+        monkeypatch.setattr(zenoh, "open", self._open)
+        monkeypatch.setattr(session_module, "close_session", lambda session, _: self.closed.append(session))
+        config = zenoh_config(zenoh_keys(mode, connect="tcp/192.0.2.9:7447"))
+        self.holder = SessionHolder(TEXTS, config, self._declare)
+        monkeypatch.setattr(self.holder._closing, "wait", self.waits_s.append)
+
+    def _open(self, _config: zenoh.Config) -> Mock:
+        self.before_open()
+        if self.errors:
+            raise self.errors.pop()
+        return self.session
+
+    def _declare(self, session: object) -> None:
+        if self.defects:
+            raise self.defects.pop()
+        self.declared.append(session)
+
+    def open(self) -> None:
+        """Do what the opening thread does."""
+        self.holder._run()
+
+    def transport(self, *, is_open: bool) -> None:
+        """Tell the gateway that the router has come or gone."""
+        self.listen.call_args.args[0].callback(event(is_open=is_open))
+
+
+def test_the_session_is_opened_as_soon_as_there_is_a_router(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A second after each failure; until then, the health says why it is not open."""
+    caplog.set_level(logging.INFO)
+    lab = Lab(monkeypatch, num_errors=3)
+    problems: list[str] = []
+    lab.before_open = lambda: problems.append(lab.holder.health.problem)
+    lab.open()
+    assert lab.waits_s == [1.0] * 3
+    assert problems == ["not open yet", *["cannot open: refused"] * 3]
+    assert lab.declared == [lab.session]
+    assert (lab.listen.call_args.args[0].indirect, lab.listen.call_args.kwargs) == (False, {"history": True})
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+
+
+def test_without_a_transport_nothing_can_be_sent(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Zenoh keeps a session without its router; several links of one router are one connection."""
+    lab = Lab(monkeypatch)
+    holder = lab.holder
+    assert (holder.is_cut_off, holder.refusal.cause) == (True, "not open")
+    lab.open()
+    assert (holder.is_cut_off, holder.refusal.cause) == (True, "no router")
+    for is_open, is_cut_off in ((True, False), (True, False), (False, False), (False, True), (True, False)):
+        lab.transport(is_open=is_open)
+        assert (holder.is_cut_off, holder.health.connected) == (is_cut_off, not is_cut_off)
+    caplog.set_level(logging.INFO)
+    caplog.clear()
+    for is_open in (True, False, False, True):
+        lab.transport(is_open=is_open)
+        holder.maintain()
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+
+
+def test_a_router_that_connects_while_the_session_opens_is_not_missed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its event comes before the session is known."""
+    lab = Lab(monkeypatch)
+    lab.listen.side_effect = lambda events, *, history: events.callback(event(is_open=history))
+    lab.open()
+    assert not lab.holder.is_cut_off
+
+
+def test_closing_ends_the_session_and_the_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A session that opens too late is closed again, and nothing is declared on it."""
+    lab = Lab(monkeypatch)
+    lab.open()
+    lab.transport(is_open=True)
+    lab.holder.close()
+    lab.holder.close()
+    assert (lab.closed, lab.holder.is_cut_off) == ([lab.session], True)
+    assert "closed" in lab.holder.health.problem
+    lab.holder.maintain()
+
+    late = Lab(monkeypatch, num_errors=2)
+
+    def close_at_last() -> None:
+        if not late.errors:
+            late.holder.close()
+
+    late.before_open = close_at_last
+    late.open()
+    assert (late.declared, late.session.close.call_count, late.closed) == ([], 1, [])
+    late.open()
+    assert len(late.waits_s) == 2
+
+
+def test_what_cannot_be_declared_is_declared_on_the_next_session(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without a retry, nothing would ever be published, and the health would say "not open yet"."""
+    lab = Lab(monkeypatch)
+    lab.defects = [RuntimeError("can't start new thread"), zenoh.ZError("no key")]
+    problems: list[str] = []
+    lab.before_open = lambda: problems.append(lab.holder.health.problem)
+    lab.open()
+    assert problems[1] == "cannot open: no key"
+    assert "can't start new thread" in problems[2]
+    assert (lab.closed, lab.declared) == ([lab.session] * 2, [lab.session])
+    assert (lab.holder.session, lab.waits_s) == (lab.session, [1.0] * 2)
+    assert [record.levelname for record in caplog.records] == ["WARNING", "ERROR"]
+
+
+def test_a_peer_needs_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = Lab(monkeypatch, mode="peer")
+    lab.open()
+    assert not lab.holder.is_cut_off
+    lab.holder.maintain()
+    assert lab.holder.health.connected
