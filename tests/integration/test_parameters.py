@@ -188,9 +188,9 @@ async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(
 ) -> None:
     url = lcm_url()
     scene = SyntheticScene(markers=2, tools=1, analog=0, plates=0, rate_hz=500)
-    source: dict[str, Any] = {"router": router, "lcm_url": url, "tool_poses": True, "parameters_interval_s": 0.2}
+    source: dict[str, Any] = {"lcm_url": url, "tool_poses": True, "parameters_interval_s": 0.2}
     with listeners(router, url) as (on_zenoh, on_lcm):
-        async with Simulator(scene) as simulator, run_gateway(simulator.port, **source):
+        async with Simulator(scene) as simulator, run_gateway(simulator.port, router=router, **source):
             await on_zenoh.wait_for_frame(1)
             await on_lcm.wait_for_frame(1)
             await wait_until_async(lambda: "6d/Tool%201" in on_zenoh.poses)

@@ -241,7 +241,7 @@ def output_with_schemas(schemas: dict[str, bytes], folder: Path, frame: bytes) -
         file = folder / name / "schema.lcm"
         file.write_bytes(schema)
         subprocess.run([lcm_gen, "--python", "--ppath", file.parent, file], check=True)
-    command = [sys.executable, "-c", USE_SCHEMAS, folder]
+    command = [sys.executable, "-c", USE_SCHEMAS, str(folder)]
     process = subprocess.run(command, env={}, input=frame, capture_output=True, check=True)
     return process.stdout.decode().splitlines()
 
