@@ -102,17 +102,23 @@ def simulator(*options: str, log: Path = Path(os.devnull)) -> Iterator[tuple[int
 
 @contextlib.contextmanager
 def gateway_process(
-    folder: Path, port: int, environ: Mapping[str, str] | None = None, hub: str = "peer", **source: Any
+    folder: Path,
+    port: int,
+    environ: Mapping[str, str] | None = None,
+    hub: str = "peer",
+    lcm_url: str | None = None,
+    **source: Any,
 ) -> Iterator[GatewayProcess]:
     """Run a gateway on Zenoh, with default settings except for those of the ``source``.
 
-    Its subscriber is a peer; with "router" as the ``hub``, other programs can connect to it, too.
+    Its subscriber is a peer; with "router" as the ``hub``, other programs can connect to it, too. With an
+    ``lcm_url``, it also publishes on LCM.
     """
     endpoint = free_endpoint()
     configuration = {
         "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, **source}],
         "zenoh": {"config": zenoh_keys("peer", connect=endpoint)},
-        "lcm": {"enabled": False},
+        "lcm": {"enabled": lcm_url is not None, "url": lcm_url},
         "metrics": {"enabled": False},
     }
     (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))

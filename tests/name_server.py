@@ -2,7 +2,8 @@
 
 import contextlib
 import socket
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -14,13 +15,20 @@ _USE_FILE: Final = 'mount --bind "$1" /etc/resolv.conf && shift && exec "$@"'
 
 
 @contextlib.contextmanager
-def dead_name_server(folder: Path) -> Iterator[tuple[str, ...]]:
+def dead_name_server(
+    folder: Path,
+    options: str = f"timeout:{_TIMEOUT_S}",
+    serve: Callable[[socket.socket], None] | None = None,
+) -> Iterator[tuple[str, ...]]:
     """Run the server; yield what to put before a command whose names it should resolve.
 
-    The command gets a file /etc/resolv.conf of its own, in a mount namespace.
+    The command gets a file /etc/resolv.conf of its own, in a mount namespace. ``serve`` may answer after all,
+    in a thread.
     """
     file = folder / "resolv.conf"
-    file.write_text(f"nameserver {_ADDRESS[0]}\noptions timeout:{_TIMEOUT_S}\n")
+    file.write_text(f"nameserver {_ADDRESS[0]}\noptions {options}\n")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(_ADDRESS)
+        if serve is not None:
+            threading.Thread(target=serve, args=(server,), daemon=True).start()
         yield ("unshare", "--mount", "sh", "-c", _USE_FILE, "with-resolv-conf", str(file))

@@ -22,8 +22,6 @@ class Direction:
         self._open = asyncio.Event()
         self._open.set()
         self.passed_bytes = 0
-        self.delay_s = 0.0
-        """The minimum delay of bytes."""
         self.segment_bytes: int | None = None
         """The maximum number of bytes in one write; None for no limit."""
         self.bytes_per_s: float | None = None
@@ -40,7 +38,7 @@ class Direction:
 
     def clear(self) -> None:
         """Pass everything at once and unchanged."""
-        self.delay_s = self.corrupt_share = 0.0
+        self.corrupt_share = 0.0
         self.segment_bytes = self.bytes_per_s = None
         self.resume()
 
@@ -52,8 +50,6 @@ class Direction:
         return max(1, min(_READ_BYTES, int(self.bytes_per_s / 50)))
 
     async def send(self, data: bytes, writer: asyncio.StreamWriter) -> None:
-        if self.delay_s:
-            await asyncio.sleep(self.delay_s)
         if self.bytes_per_s is not None:
             await asyncio.sleep(len(data) / self.bytes_per_s)
         await self._open.wait()
@@ -67,9 +63,7 @@ class Direction:
             writer.write(segment)
             await writer.drain()
             if self.segment_bytes is not None:
-                await asyncio.sleep(
-                    0
-                )  # let other tasks run, so that the receiver reads each segment by itself
+                await asyncio.sleep(0)  # so that the receiver reads each segment by itself
 
     def _corrupted(self, data: bytes) -> bytes:
         if not self.corrupt_share:
@@ -83,42 +77,31 @@ class Direction:
 class FuzzingProxy:
     """Forwards connections from ``port`` to ``server_port`` of this host."""
 
-    def __init__(self, server_port: int, *, port: int = 0, seed: int = 1) -> None:
+    port: int
+
+    def __init__(self, server_port: int) -> None:
         self._server_port = server_port
-        self.port = port
-        self.to_client = Direction(seed)
-        self.to_server = Direction(seed + 1)
-        self.num_accepted = 0
+        self.to_client = Direction(seed=1)
+        self.to_server = Direction(seed=2)
         self._connections: set[_Connection] = set()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._server: asyncio.Server | None = None
 
     async def __aenter__(self) -> Self:
-        await self.listen()
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        self.port = self._server.sockets[0].getsockname()[1]
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.vanish()
+        self._server.close()
+        self.cut(reset=True)
         if self._tasks:
             await asyncio.wait(self._tasks)
 
     @property
     def num_connections(self) -> int:
         return len(self._connections)
-
-    async def listen(self) -> None:
-        """Accept connections; after ``vanish``, on the same port again."""
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
-        self.port = self._server.sockets[0].getsockname()[1]
-
-    def vanish(self) -> None:
-        """Reset all connections and refuse new ones."""
-        if self._server is not None:
-            self._server.close()
-            self._server = None
-        self.cut(reset=True)
 
     def cut(self, *, reset: bool = False) -> None:
         """Close all connections between two bytes: with FIN after all sent bytes, or with RST."""
@@ -140,7 +123,6 @@ class FuzzingProxy:
         assert task is not None
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        self.num_accepted += 1
         try:
             server = await asyncio.open_connection("127.0.0.1", self._server_port, limit=_READ_BYTES)
         except OSError:

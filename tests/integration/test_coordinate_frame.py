@@ -58,29 +58,6 @@ def y_up(tool: Any) -> list[float]:
     return [tool.x * 0.002 + 10, -tool.z * 0.002, tool.y * 0.002 + 1]
 
 
-async def test_poses_are_transformed_and_component_messages_are_not() -> None:
-    endpoint = free_endpoint()
-    poses: dict[int, rtc3d.tool_pose_t] = {}
-    tools: dict[int, rtc3d.tools_t] = {}
-    async with (
-        Simulator(scene()) as simulator,
-        run_gateway(
-            simulator.port, listen=endpoint, tool_poses=True, frame_id="world", transform=Y_UP
-        ) as gateway,
-    ):
-        await wait_until_cached(gateway)
-        with zenoh_peer(endpoint) as peer:
-            collect(peer, "6d/Tool%201", poses)
-            collect(peer, "6d", tools)
-            await wait_until_async(lambda: poses.keys() & tools.keys())
-    number = min(poses.keys() & tools.keys())
-    tool, pose = tools[number].tools[0], poses[number]
-    np.testing.assert_allclose(pose.position_m, y_up(tool), rtol=1e-5)
-    assert pose.error_m == pytest.approx(tool.error * 0.002)
-    w = HALF * tool.q0 - HALF * tool.qx
-    assert pose.orientation_xyzw[3] == pytest.approx(w, abs=1e-5)
-
-
 async def test_a_reload_changes_the_frame_of_a_stream_that_goes_on() -> None:
     endpoint = free_endpoint()
     poses: dict[int, rtc3d.tool_pose_t] = {}
@@ -114,13 +91,20 @@ async def test_a_reload_changes_the_frame_of_a_stream_that_goes_on() -> None:
     for number in poses.keys() & tools.keys():
         expected = plain if poses[number].parameters_version == 1 else y_up
         np.testing.assert_allclose(poses[number].position_m, expected(tools[number].tools[0]), rtol=1e-5)
+    newest = max(poses.keys() & tools.keys())
+    tool, pose = tools[newest].tools[0], poses[newest]
+    assert pose.error_m == pytest.approx(tool.error * 0.002)
+    assert pose.orientation_xyzw[3] == pytest.approx(HALF * tool.q0 - HALF * tool.qx, abs=1e-5)
 
 
-async def test_receivers_on_zenoh_learn_the_frame() -> None:
-    endpoint = free_endpoint()
+@pytest.mark.netns
+async def test_receivers_on_zenoh_and_lcm_learn_the_frame() -> None:
+    endpoint, url = free_endpoint(), lcm_url()
+    lcm: dict[str, Any] = {"lcm_url": url, "queries_url": url}
+    replies: list[rtc3d.command_reply_t] = []
     async with (
         Simulator(scene()) as simulator,
-        run_gateway(simulator.port, listen=endpoint, frame_id="world", transform=Y_UP) as gateway,
+        run_gateway(simulator.port, listen=endpoint, frame_id="world", transform=Y_UP, **lcm) as gateway,
     ):
         await wait_until_cached(gateway)
         with zenoh_peer(endpoint) as peer:
@@ -128,25 +112,6 @@ async def test_receivers_on_zenoh_learn_the_frame() -> None:
             parameters = await query(peer, "mocap/lab/parameters")
             refused = await query(peer, "mocap/lab/frame?format=json")
             status = decode((await query(peer, "mocap/lab/status")).payload)
-    assert (reply.json, reply.encoding) == ({**FRAME, "names": {}}, "application/json")
-    assert parameters.attachment["frame"] == FRAME
-    assert (refused.error, refused.code) == ("frame takes no options", "bad-request")
-    assert {name: getattr(status, name) for name in FRAME} == {
-        name: tuple(value) if isinstance(value, list) else value for name, value in FRAME.items()
-    }
-
-
-@pytest.mark.netns
-async def test_receivers_on_lcm_can_ask_for_the_frame() -> None:
-    url = lcm_url()
-    replies: list[rtc3d.command_reply_t] = []
-    async with (
-        Simulator(scene()) as simulator,
-        run_gateway(
-            simulator.port, lcm_url=url, queries_url=url, frame_id="world", transform=Y_UP
-        ) as gateway,
-    ):
-        await wait_until_cached(gateway)
         connection = open_lcm(url)
         subscriber = LcmSubscriber(
             connection, "MOCAP_LAB_COMMAND_REPLY", lambda _, message: replies.append(decode(message))
@@ -156,4 +121,10 @@ async def test_receivers_on_lcm_can_ask_for_the_frame() -> None:
         connection.publish("MOCAP_LAB_COMMAND_REQUEST", request.encode())
         await wait_until_async(lambda: replies)
         subscriber.close()
-    assert json.loads(replies[0].content) == {**FRAME, "names": {}}
+    expected = {**FRAME, "names": {}}
+    assert (reply.json, reply.encoding) == (expected, "application/json")
+    assert json.loads(replies[0].content) == expected
+    assert parameters.attachment["frame"] == FRAME
+    assert (refused.error, refused.code) == ("frame takes no options", "bad-request")
+    in_status = {name: getattr(status, name) for name in FRAME}
+    assert in_status == {key: tuple(each) if isinstance(each, list) else each for key, each in FRAME.items()}

@@ -1,13 +1,10 @@
 """The gateway process and its signals; tests/systemd runs it under a real systemd."""
 
-import asyncio
-import json
 import os
 import pty
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,20 +14,12 @@ from typing import Any
 import pytest
 import yaml
 
-from gateway.simulator.simulator import Simulator
-from gateway.simulator.synthetic import SyntheticScene
+from tests.gateway_process import program
 from tests.networks import free_endpoint, free_port, zenoh_keys
-from tests.waiting import wait_until, wait_until_async
+from tests.waiting import wait_until
 
-GATEWAY = (sys.executable, "-m", "gateway", "run", "--config")
-SUBSCRIBER = """
-import sys, zenoh
-session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
-session.declare_subscriber("mocap/lab/3d", lambda sample: print("heard", flush=True))
-sys.stdin.read()
-"""
 STOP_S = 9
-"""Much more than the gateway needs; closing Zenoh could wait 10 s for a peer that does not read."""
+"""Much more than the gateway needs."""
 
 
 class Notifications:
@@ -61,43 +50,27 @@ class Site:
 
     def __init__(self, folder: Path) -> None:
         self.file = folder / "gateway.yaml"
-        self.endpoint = free_endpoint()
         self.notifications = Notifications(folder / "notify")
 
-    def configure(self, port: int, **sections: Any) -> None:
+    def configure(self, port: int) -> None:
         configuration = {
             "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
-            "zenoh": {"config": zenoh_keys("peer", listen=self.endpoint)},
+            "zenoh": {"config": zenoh_keys("peer", listen=free_endpoint())},
             "lcm": {"enabled": False},
             "metrics": {"enabled": False},
         }
-        self.file.write_text(yaml.safe_dump(configuration | sections))
+        self.file.write_text(yaml.safe_dump(configuration))
 
     @contextmanager
-    def running(self, **options: Any) -> Iterator[subprocess.Popen[str]]:
-        environment = {**os.environ, "NOTIFY_SOCKET": str(self.notifications.path), "WATCHDOG_USEC": "200000"}
-        command = [*GATEWAY, str(self.file)]
+    def running(self, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
+        environment = {"NOTIFY_SOCKET": str(self.notifications.path), "WATCHDOG_USEC": "200000"}
         options = {"stdin": subprocess.DEVNULL} | options
-        with subprocess.Popen(command, env=environment, text=True, **options) as process:
-            try:
-                wait_until(lambda: "READY=1" in self.notifications.texts)
-                yield process
-            finally:
-                process.kill()
+        with program("run", "--config", str(self.file), environ=environment, **options) as process:
+            wait_until(lambda: "READY=1" in self.notifications.texts)
+            yield process
 
     def until(self, condition: Callable[[Notifications], bool]) -> None:
         wait_until(lambda: condition(self.notifications))
-
-
-@contextmanager
-def subscriber(endpoint: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a process that subscribes and prints one line per message."""
-    command = [sys.executable, "-c", SUBSCRIBER, json.dumps(zenoh_keys("client", connect=endpoint))]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 @pytest.fixture
@@ -139,47 +112,13 @@ def test_sighup_reloads_the_configuration(site: Site) -> None:
         assert process.wait(STOP_S) == 0
 
 
-def test_the_gateway_stops_when_its_terminal_closes(site: Site) -> None:
+def test_sighup_reloads_while_the_terminal_exists_and_stops_the_gateway_when_it_closes(site: Site) -> None:
     site.configure(free_port())
     terminal, end = pty.openpty()
     with site.running(stdin=end, stdout=end, stderr=end, start_new_session=True) as process:
+        process.send_signal(signal.SIGHUP)
+        site.until(lambda sent: sent.stages == ["READY=1", "RELOADING=1", "READY=1"])
         os.close(end)
         os.close(terminal)
         process.send_signal(signal.SIGHUP)  # the kernel sends it to the processes that the terminal controls
         assert process.wait(STOP_S) == 0
-
-
-def test_sighup_reloads_while_the_terminal_exists(site: Site) -> None:
-    site.configure(free_port())
-    terminal, end = pty.openpty()
-    with site.running(stdin=end, start_new_session=True) as process:
-        process.send_signal(signal.SIGHUP)
-        site.until(lambda sent: sent.stages == ["READY=1", "RELOADING=1", "READY=1"])
-        process.terminate()
-        assert process.wait(STOP_S) == 0
-    os.close(end)
-    os.close(terminal)
-
-
-def test_a_zenoh_session_that_never_opens_does_not_delay_stopping(site: Site) -> None:
-    away = zenoh_keys("client", connect=site.endpoint)
-    away["connect"]["timeout_ms"] = -1  # opening never returns
-    site.configure(free_port(), zenoh={"config": away})
-    with site.running() as process:
-        site.until(lambda sent: "zenoh: the Zenoh session is not open yet" in "".join(sent.texts))
-        process.terminate()
-        assert process.wait(STOP_S) == 0
-
-
-async def test_a_subscriber_that_does_not_read_does_not_delay_stopping(site: Site) -> None:
-    scene = SyntheticScene(markers=3000, tools=0, analog=0, plates=0, rate_hz=200)  # 48 kB a frame
-    async with Simulator(scene) as server:
-        site.configure(server.port)
-        with site.running() as process, subscriber(site.endpoint) as frozen:
-            assert frozen.stdout is not None
-            assert await asyncio.to_thread(frozen.stdout.readline) == "heard\n"
-            frozen.send_signal(signal.SIGSTOP)
-            full = server.frames_sent + 300  # more than any socket's buffers hold
-            await wait_until_async(lambda: server.frames_sent > full)
-            process.terminate()
-            assert await asyncio.to_thread(process.wait, STOP_S) == 0

@@ -1,10 +1,8 @@
 """Real recordings, from the file through simulator, TCP and gateway to subscribers on Zenoh and LCM."""
 
-import asyncio
 import os
-import socket
 from collections import defaultdict
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -14,14 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
 from gateway.messages.encode import ITEMS_OFFSET
-from gateway.outputs.contract import Output
-from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern
-from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
@@ -30,11 +25,12 @@ from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.configurations import make_settings
+from tests.networks import free_endpoint, lcm_url, zenoh_keys
+from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-LCM_URL = "udpm://239.255.76.67:7711?ttl=0&recv_buf_size=2000000"
 ANALOG = StreamSettings(components=(ComponentType.ANALOG,))
 OTHERS = StreamSettings(
     components=(ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.FORCE, ComponentType.EVENT)
@@ -52,50 +48,39 @@ class Lab:
         self.zenoh: Received = defaultdict(list)
         self.lcm: Received = defaultdict(list)
 
-    async def until(self, condition: Callable[[], bool], timeout_s: float = 30) -> None:
-        await wait_until_async(condition, timeout_s)
-
 
 @asynccontextmanager
 async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
     """Run simulator, gateway and subscribers; start the measurement once both subscribers receive."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint, url = free_endpoint(), f"{lcm_url()}&recv_buf_size=2000000"
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
         settings = make_settings(
             sources=(SourceSettings(name="lab", host="127.0.0.1", port=simulator.port, streams=streams),),
-            zenoh=ZenohSettings(
-                config={"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
-            ),
-            lcm=LcmSettings(url=LCM_URL),
+            zenoh=ZenohSettings(config=zenoh_keys("peer", listen=endpoint)),
+            lcm=LcmSettings(url=url),
+            metrics=MetricsSettings(enabled=False),
         )
-        stop = asyncio.Event()
-        zenoh_output = ZenohOutput(settings.zenoh)
-        outputs: list[Output] = [zenoh_output, LcmOutput(settings.lcm)]
-        gateway = asyncio.create_task(Gateway(settings, outputs).run(stop))
-        running = Lab(simulator)
-        await running.until(lambda: zenoh_output.session is not None)
-        session = open_zenoh(endpoint)
-        listener = LcmSubscriber(
-            lcm.LCM(LCM_URL),
-            channel_pattern("MOCAP", "lab", None),
-            lambda channel, message: running.lcm[channel.rsplit("_", 1)[-1].lower()].append(message),
-        )
-        try:
-            ZenohSubscriber(
-                session,
-                key_patterns("mocap", "lab", None),
-                lambda key, message: running.zenoh[key.rsplit("/", 1)[-1]].append(message),
+        async with running_gateway(Gateway(settings)) as gateway:
+            await gateway.opened.wait()
+            running, session = Lab(simulator), open_zenoh(endpoint)
+            listener = LcmSubscriber(
+                lcm.LCM(url),
+                channel_pattern("MOCAP", "lab", None),
+                lambda channel, message: running.lcm[channel.rsplit("_", 1)[-1].lower()].append(message),
             )
-            await running.until(lambda: bool(running.zenoh["status"] and running.lcm["status"]))
-            simulator.start_measurement()
-            yield running
-        finally:
-            stop.set()
-            await gateway
-            session.close()
-            listener.close()
+            try:
+                ZenohSubscriber(
+                    session,
+                    key_patterns("mocap", "lab", None),
+                    lambda key, message: running.zenoh[key.rsplit("/", 1)[-1]].append(message),
+                )
+                await wait_until_async(lambda: running.zenoh["status"] and running.lcm["status"])
+                simulator.start_measurement()
+                yield running
+            finally:
+                session.close()
+                listener.close()
 
 
 def take_path(name: str) -> Path:
@@ -141,7 +126,7 @@ async def test_every_value_that_arrives_is_the_one_in_the_file(
     path = take_path(name)
     expected = expected_bits(path)
     async with lab(C3dScene(path), OTHERS, ANALOG) as running:
-        await running.until(lambda: min(len(side["3d"]) for side in (running.zenoh, running.lcm)) > frames)
+        await wait_until_async(lambda: min(len(side["3d"]) for side in (running.zenoh, running.lcm)) > frames)
         running.simulator.stop_measurement()
     for side in (running.zenoh, running.lcm):
         assert set(side) - {"status", "clock", "parameters"} == set(components)
@@ -154,7 +139,7 @@ async def test_every_value_that_arrives_is_the_one_in_the_file(
 async def test_nothing_is_lost_in_five_seconds_with_analog_at_2000_hz() -> None:
     scene = SyntheticScene(markers=55, tools=6, analog=69, plates=2, rate_hz=200, analog_rate_hz=2000)
     async with lab(scene, OTHERS, ANALOG) as running:
-        await running.until(lambda: running.simulator.components_sent["analog"] >= 10_000)
+        await wait_until_async(lambda: running.simulator.components_sent["analog"] >= 10_000)
         running.simulator.stop_measurement()
         sent = running.simulator.components_sent
         assert sent["3d"] >= 990
@@ -166,7 +151,7 @@ async def test_nothing_is_lost_in_five_seconds_with_analog_at_2000_hz() -> None:
                 for key, count in sent.items()
             )
 
-        await running.until(all_received)
+        await wait_until_async(all_received)
     for side in (running.zenoh, running.lcm):
         for component, count in sent.items():
             sequences = [int.from_bytes(message[24:32], "big") for message in side[component]]

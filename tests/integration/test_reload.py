@@ -16,7 +16,6 @@ from gateway.config.settings import (
     ReconnectSettings,
     Settings,
     SourceSettings,
-    SpoolSettings,
 )
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
@@ -33,14 +32,14 @@ from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
 from tests.running_gateway import running_gateway
-from tests.servers import Client, ScriptedServer, c3d_file, ok, packet
+from tests.servers import ScriptedServer
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
 
-def simulator() -> Simulator:
-    return Simulator(SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200))
+def simulator(tools: int = 0) -> Simulator:
+    return Simulator(SyntheticScene(markers=1, tools=tools, analog=0, plates=0, rate_hz=200))
 
 
 class SettingsBuilder:
@@ -114,19 +113,6 @@ def subscribed(builder: SettingsBuilder) -> Iterator[ReceivedMarkers]:
         session.close()
 
 
-async def test_equal_settings_change_nothing() -> None:
-    builder = SettingsBuilder()
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            await received.wait_for_more("mocap/lab/3d")
-            [source], outputs = gateway.sources, gateway.outputs
-            assert await gateway.reload(builder.settings({"lab": server.port})) == []
-            assert (list(gateway.sources), gateway.outputs) == ([source], outputs)
-            await received.wait_for_more("mocap/lab/3d")
-            received.assert_gapless("mocap/lab/3d")
-            assert len(server.connections) == 1
-
-
 async def test_a_changed_source_keeps_its_numbering_and_other_sources_are_not_affected() -> None:
     builder = SettingsBuilder()
     async with (
@@ -171,71 +157,6 @@ async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> No
             assert keys == {"mocap/lab/alive", "mocap/new/alive"}
 
 
-async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing() -> None:
-    builder = SettingsBuilder()
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            await received.wait_for_more("mocap/lab/3d")
-            await received.wait_for_more("MOCAP_LAB_3D")
-            changed = builder.settings({"lab": server.port}, lcm=builder.lcm(prefix="OTHER"))
-            assert await gateway.reload(changed) == ["output lcm changed"]
-            await received.wait_for_more("OTHER_LAB_3D")
-            await received.wait_for_more("mocap/lab/3d")
-            received.assert_gapless("mocap/lab/3d")
-            before, after = received.numbers["MOCAP_LAB_3D"], received.numbers["OTHER_LAB_3D"]
-            assert after[0][1] > before[-1][1]
-            assert len(server.connections) == 1
-
-
-@pytest.mark.parametrize("output", ["lcm", "zenoh"])
-async def test_switching_tool_poses_does_not_reopen_the_output(
-    output: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    builder = SettingsBuilder()
-    scene = SyntheticScene(markers=1, tools=2, analog=0, plates=0, rate_hz=200)
-    async with Simulator(scene) as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            await received.wait_for_more("mocap/lab/3d")
-            await received.wait_for_more("MOCAP_LAB_3D")
-            outputs = list(gateway.outputs)
-            poses: list[bytes] = []
-            session = open_zenoh(builder.endpoint)
-            session.declare_subscriber(
-                "mocap/lab/6d/*", lambda sample: poses.append(sample.payload.to_bytes())
-            )
-            for is_on in (True, False, True):
-                changed = {output: getattr(builder, output)(tool_poses=is_on)}
-                settings = builder.settings({"lab": server.port}, **changed)
-                assert await gateway.reload(settings) == [f"output {output} changed"]
-                assert await gateway.reload(settings) == []
-                await received.wait_for_more("mocap/lab/3d")
-                await received.wait_for_more("MOCAP_LAB_3D")
-            assert list(gateway.outputs) == outputs
-            if output == "zenoh":
-                await wait_until_async(lambda: poses)
-            received.assert_gapless("mocap/lab/3d")
-            received.assert_gapless("MOCAP_LAB_3D")
-            session.close()
-    assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
-
-
-@pytest.mark.parametrize("output", ["lcm", "zenoh"])
-async def test_replacing_an_output_is_no_reason_for_a_warning(
-    output: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-    builder = SettingsBuilder()
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            await received.wait_for_more("mocap/lab/3d")
-            changed = {output: getattr(builder, output)(prefix={"lcm": "OTHER", "zenoh": "other"}[output])}
-            assert await gateway.reload(builder.settings({"lab": server.port}, **changed)) == [
-                f"output {output} changed"
-            ]
-            await received.wait_for_more({"lcm": "OTHER_LAB_3D", "zenoh": "other/lab/3d"}[output])
-    assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
-
-
 async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters() -> None:
     builder, server = SettingsBuilder(), ParameterServer("known")
     async with (
@@ -258,69 +179,6 @@ async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters
             subscriber.undeclare()
 
 
-async def test_an_output_can_be_disabled_and_enabled() -> None:
-    builder = SettingsBuilder()
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            await received.wait_for_more("MOCAP_LAB_3D")
-            off = builder.settings({"lab": server.port}, lcm=builder.lcm(enabled=False))
-            assert await gateway.reload(off) == ["output lcm removed"]
-            assert [output.name for output in gateway.outputs] == ["zenoh"]
-            num_before = len(received.numbers["MOCAP_LAB_3D"])
-            assert await gateway.reload(builder.settings({"lab": server.port})) == ["output lcm added"]
-            await received.wait_for_more("MOCAP_LAB_3D")
-            (_, last), (_, next_) = received.numbers["MOCAP_LAB_3D"][num_before - 1 : num_before + 1]
-            assert next_ > last  # frames that arrive meanwhile are a gap
-
-
-async def test_a_changed_zenoh_configuration_file_reopens_the_output(tmp_path: Path) -> None:
-    builder, file = SettingsBuilder(), tmp_path / "zenoh.json5"
-    other = free_endpoint()
-    file.write_text(json.dumps(zenoh_keys("peer", listen=builder.endpoint)))
-    settings = builder.settings({"lab": free_port()}, zenoh=builder.zenoh(config=file))
-    async with running(settings) as gateway:
-        assert await gateway.reload(settings) == []
-        file.write_text(json.dumps(zenoh_keys("peer", listen=other)))
-        assert await gateway.reload(settings) == ["output zenoh changed"]
-        await wait_until_async(lambda: gateway.outputs[0].health().connected)
-        with zenoh_peer(other) as peer:
-            await query(peer, "mocap/lab/status")
-
-
-async def test_a_configuration_that_zenoh_refuses_changes_nothing(tmp_path: Path) -> None:
-    builder, file = SettingsBuilder(), tmp_path / "zenoh.json5"
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            await received.wait_for_more("mocap/lab/3d")
-            file.write_text("{no_such_key: 1}")
-            refused = builder.settings({"other": server.port}, zenoh=builder.zenoh(config=file))
-            with pytest.raises(ConfigError, match="no_such_key"):
-                await gateway.reload(refused)
-            await received.wait_for_more("mocap/lab/3d")
-            received.assert_gapless("mocap/lab/3d")
-            assert [source.name for source in gateway.sources] == ["lab"]
-
-
-async def test_files_are_stored_in_the_new_folder(tmp_path: Path) -> None:
-    clients: list[Client] = []
-
-    async def script(client: Client) -> None:
-        clients.append(client)
-        await client.commands(lambda command: ok(f"OK-{command}"))
-
-    builder, before, after = SettingsBuilder(), tmp_path / "before", tmp_path / "after"
-    async with ScriptedServer(script) as server:
-        settings = builder.settings({"lab": server.port}, spool=SpoolSettings(directory=str(before)))
-        async with running(settings) as gateway:
-            changed = builder.settings({"lab": server.port}, spool=SpoolSettings(directory=str(after)))
-            await wait_until_async(lambda: clients)
-            assert await gateway.reload(changed) == ["spool changed"]
-            clients[0].send(packet(5, c3d_file(b"a file")))
-            await wait_until_async(lambda: after.exists() and list(after.glob("lab-*.c3d")))
-            assert not before.exists()
-            assert len(clients) == 1
-
-
 async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     builder, before, after = SettingsBuilder(), free_port(), free_port()
@@ -339,12 +197,65 @@ async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) ->
     await task
 
 
-async def test_stopping_during_a_reload_closes_everything() -> None:
+@pytest.mark.parametrize(
+    ("output", "other", "before", "kept", "after"),
+    [
+        ("lcm", "OTHER", "MOCAP_LAB_3D", "mocap/lab/3d", "OTHER_LAB_3D"),
+        ("zenoh", "other", "mocap/lab/3d", "MOCAP_LAB_3D", "other/lab/3d"),
+    ],
+)
+async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
+    output: str, other: str, before: str, kept: str, after: str, caplog: pytest.LogCaptureFixture
+) -> None:
     builder = SettingsBuilder()
-    async with simulator() as first, simulator() as second:
-        async with running(builder.settings({"lab": first.port})) as gateway:
-            await wait_until_async(lambda: first.connections)
-            reloading = asyncio.create_task(gateway.reload(builder.settings({"lab": second.port})))
-            await wait_until_async(lambda: not first.connections)
-        assert await reloading == ["source lab changed"]
-        await wait_until_async(lambda: not second.connections)
+    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more(before)
+            await received.wait_for_more(kept)
+            changed = {output: getattr(builder, output)(prefix=other)}
+            changes = await gateway.reload(builder.settings({"lab": server.port}, **changed))
+            assert changes == [f"output {output} changed"]
+            await received.wait_for_more(after)
+            await received.wait_for_more(kept)
+            received.assert_gapless(kept)
+            assert received.numbers[after][0][1] > received.numbers[before][-1][1]
+            assert len(server.connections) == 1
+    assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+@pytest.mark.parametrize("output", ["lcm", "zenoh"])
+async def test_switching_tool_poses_does_not_reopen_the_output(output: str) -> None:
+    builder = SettingsBuilder()
+    async with simulator(tools=2) as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            outputs = list(gateway.outputs)
+            for is_on in (True, False, True):
+                changed = {output: getattr(builder, output)(tool_poses=is_on)}
+                settings = builder.settings({"lab": server.port}, **changed)
+                assert await gateway.reload(settings) == [f"output {output} changed"]
+                assert await gateway.reload(settings) == []
+                for name in ("mocap/lab/3d", "MOCAP_LAB_3D"):
+                    await received.wait_for_more(name)
+                    received.assert_gapless(name)
+            assert list(gateway.outputs) == outputs
+
+
+async def test_a_changed_zenoh_configuration_file_reopens_the_output_unless_zenoh_refuses_it(
+    tmp_path: Path,
+) -> None:
+    builder, file = SettingsBuilder(), tmp_path / "zenoh.json5"
+    other = free_endpoint()
+    file.write_text(json.dumps(zenoh_keys("peer", listen=builder.endpoint)))
+    settings = builder.settings({"lab": free_port()}, zenoh=builder.zenoh(config=file))
+    async with running(settings) as gateway:
+        assert await gateway.reload(settings) == []
+        file.write_text(json.dumps(zenoh_keys("peer", listen=other)))
+        assert await gateway.reload(settings) == ["output zenoh changed"]
+        await wait_until_async(lambda: gateway.outputs[0].health().connected)
+        file.write_text("{no_such_key: 1}")
+        refused = builder.settings({"other": free_port()}, zenoh=builder.zenoh(config=file))
+        with pytest.raises(ConfigError, match="no_such_key"):
+            await gateway.reload(refused)
+        assert [source.name for source in gateway.sources] == ["lab"]
+        with zenoh_peer(other) as peer:
+            await query(peer, "mocap/lab/status")

@@ -1,0 +1,272 @@
+"""Parameters and names as present and late subscribers on Zenoh and LCM get them, without a query."""
+
+import asyncio
+import json
+import logging
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from functools import partial
+from typing import Any
+
+import pytest
+import rtc3d
+import zenoh
+import zenoh.ext
+
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode, prefix_of
+from gateway.outputs.lcm import parameters as lcm_parameters
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.simulator.faults.server_faults import Rename
+from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from tests.networks import free_port, lcm_url, open_zenoh
+from tests.queried_gateway import (
+    ParameterServer,
+    parameters_xml,
+    query,
+    query_all,
+    run_gateway,
+    wait_until_cached,
+    zenoh_peer,
+)
+from tests.servers import ScriptedServer
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+KEY = "mocap/lab/parameters"
+
+
+class Listener:
+    """Everything that one transport carries, in the order in which it arrives: names, versions, tool keys."""
+
+    def __init__(self) -> None:
+        self.xml: list[bytes] = []
+        self.versions: list[int] = []
+        """The version of each of ``xml``."""
+        self.frame_version = 0
+        """The version of the newest frame."""
+        self.early_versions: set[int] = set()
+        """The versions of frames that arrived before the parameters."""
+        self.poses: set[str] = set()
+        """The keys or channels of poses per tool."""
+        self.newest: Any = None
+        """The newest message with parameters on LCM."""
+
+    def on_parameters(self, xml: bytes, version: int) -> None:
+        self.versions.append(version)
+        self.xml.append(xml)
+
+    def on_frame(self, version: int) -> None:
+        self.frame_version = version
+        if version not in self.versions:
+            self.early_versions.add(version)
+
+    def on_zenoh(self, sample: zenoh.Sample) -> None:
+        key, data = str(sample.key_expr).removeprefix("mocap/lab/"), sample.payload.to_bytes()
+        if key == "parameters":
+            assert sample.attachment is not None
+            self.on_parameters(data, json.loads(sample.attachment.to_bytes())["parameters_version"])
+        elif key == "3d":
+            self.on_frame(prefix_of(data).parameters_version)
+        elif key.startswith("6d/"):
+            self.poses.add(key)
+
+    def on_lcm(self, channel: str, data: bytes) -> None:
+        match decode(data):
+            case rtc3d.parameters_t() as message:
+                self.newest = message
+                self.on_parameters(message.xml.encode(), message.parameters_version)
+            case rtc3d.markers_t() as message:
+                self.on_frame(message.parameters_version)
+            case rtc3d.tool_pose_t():
+                self.poses.add(channel)
+
+    async def wait_for(self, xml: bytes) -> None:
+        await wait_until_async(lambda: self.xml and self.xml[-1] == xml)
+
+    async def wait_for_frame(self, version: int) -> None:
+        await wait_until_async(lambda: self.frame_version == version)
+
+
+@contextmanager
+def listeners(router: str, url: str) -> Iterator[tuple[Listener, Listener]]:
+    """Listen on Zenoh and on LCM."""
+    on_zenoh, on_lcm = Listener(), Listener()
+    session = open_zenoh("client", connect=router)
+    session.declare_subscriber("mocap/lab/**", on_zenoh.on_zenoh)
+    subscriber = LcmSubscriber(open_lcm(url), "MOCAP_LAB_.*", on_lcm.on_lcm)
+    try:
+        yield on_zenoh, on_lcm
+    finally:
+        subscriber.close()
+        session.close()
+
+
+async def late_parameters(router: str) -> bytes:
+    """Return what a late AdvancedSubscriber gets first."""
+    received: list[bytes] = []
+    with zenoh_peer(router) as peer:
+        zenoh.ext.declare_advanced_subscriber(
+            peer,
+            KEY,
+            lambda sample: received.append(sample.payload.to_bytes()),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+        )
+        await wait_until_async(lambda: received)
+    return received[0]
+
+
+@asynccontextmanager
+async def gateway_with_cache(server: ParameterServer, router: str, url: str) -> AsyncIterator[Gateway]:
+    """Run ``server`` and a gateway on Zenoh and LCM that has cached its parameters."""
+    async with (
+        ScriptedServer(server.script) as listening,
+        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
+    ):
+        await wait_until_cached(gateway)
+        yield gateway
+
+
+async def test_parameters_are_published_for_every_connection(router: str) -> None:
+    port, url = free_port(), lcm_url()
+    first, second = ParameterServer("Marker before"), ParameterServer("Marker after")
+    with listeners(router, url) as (on_zenoh, on_lcm):
+        async with run_gateway(port, router=router, lcm_url=url) as gateway:
+            async with ScriptedServer(first.script, port):
+                await on_zenoh.wait_for(first.xml)
+                await on_lcm.wait_for(first.xml)
+                message = on_lcm.newest
+                assert (message.sequence, message.session, message.parameters_version) == (0, 1, 1)
+                assert message.capture_utime <= message.utime
+            async with ScriptedServer(second.script, port):
+                await on_zenoh.wait_for(second.xml)
+                await on_lcm.wait_for(second.xml)
+                assert on_lcm.newest.session > message.session
+                assert (on_zenoh.versions[0], on_zenoh.versions[-1], on_lcm.versions[-1]) == (1, 2, 2)
+                await wait_until_cached(gateway)
+                with zenoh_peer(router) as peer:
+                    reply = await query(peer, KEY)
+                    assert (reply.payload, reply.attachment["parameters_version"]) == (second.xml, 2)
+                    assert (await query(peer, "mocap/lab/3d")).attachment["parameters_version"] == 2
+
+
+async def test_late_subscribers_get_the_parameters_without_asking_the_server_and_others_not_again(
+    router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lcm_parameters, "REPEAT_S", 0.05)
+    server, url = ParameterServer(), lcm_url()
+    async with gateway_with_cache(server, router, url):
+        commands = list(server.commands)
+        with listeners(router, url) as (on_zenoh, on_lcm):
+            await on_zenoh.wait_for(server.xml)
+            await on_lcm.wait_for(server.xml)  # LCM repeats them for everyone
+            with zenoh_peer(router) as peer:
+                await query(peer, KEY)  # its reply arrives after everything published before
+                num_before = len(on_zenoh.xml)
+                assert await late_parameters(router) == server.xml
+                await query(peer, KEY)
+            assert len(on_zenoh.xml) == num_before
+        assert server.commands == commands
+
+
+async def test_a_change_found_by_a_fresh_query_is_published(router: str) -> None:
+    server, url = ParameterServer(), lcm_url()
+    with listeners(router, url) as (on_zenoh, on_lcm):
+        async with gateway_with_cache(server, router, url):
+            with zenoh_peer(router) as peer:
+                for marker, key in (("One more", KEY), ("Another", f"{KEY}/3d")):
+                    server.xml = parameters_xml(marker)
+                    assert marker.encode() in (await query(peer, f"{key}?fresh=true")).payload
+                    await on_zenoh.wait_for(server.xml)  # all parameters, also for one section
+                    await on_lcm.wait_for(server.xml)
+
+
+async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(
+    router: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = lcm_url()
+    scene = SyntheticScene(markers=2, tools=1, analog=0, plates=0, rate_hz=500)
+    source: dict[str, Any] = {"lcm_url": url, "tool_poses": True, "parameters_interval_s": 0.2}
+    with listeners(router, url) as (on_zenoh, on_lcm):
+        async with Simulator(scene) as simulator, run_gateway(simulator.port, router=router, **source):
+            await on_zenoh.wait_for_frame(1)
+            await on_lcm.wait_for_frame(1)
+            await wait_until_async(lambda: "6d/Tool%201" in on_zenoh.poses)
+            simulator.faults.begin(Rename(prefix="Left "))
+            for listener, pose in (
+                (on_zenoh, "6d/Left%20Tool%201"),
+                (on_lcm, "MOCAP_LAB_6D_LEFT_TOOL_1"),
+            ):
+                await listener.wait_for_frame(2)
+                assert b"<Label>Left Marker 2</Label>" in listener.xml[-1]
+                await wait_until_async(partial(listener.poses.__contains__, pose))
+            with zenoh_peer(router) as peer:
+                reply = await query(peer, f"{KEY}/3d?format=json")
+                assert reply.attachment["parameters_version"] == 2
+                labels = [marker["label"] for marker in reply.json["markers"]]
+                assert labels == ["Left Marker 1", "Left Marker 2"]
+            assert b"Left Marker 2" in await late_parameters(router)
+    for listener in (on_zenoh, on_lcm):
+        assert (listener.early_versions, set(listener.versions)) == (set(), {1, 2})
+    [warning] = [
+        record.message
+        for record in caplog.records
+        if record.levelno == logging.WARNING and "were renamed" in record.message
+    ]
+    assert "3d 'Marker 1' to 'Left Marker 1', 'Marker 2' to 'Left Marker 2'; 6d 'Tool 1' to" in warning
+
+
+async def test_a_server_that_gives_no_parameters_any_more_makes_them_void_for_everyone(
+    router: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lcm_parameters, "REPEAT_S", 0.05)
+    server, url = ParameterServer(), lcm_url()
+    with listeners(router, url) as (on_zenoh, on_lcm):
+        async with gateway_with_cache(server, router, url):
+            await on_zenoh.wait_for_frame(1)
+            await on_lcm.wait_for_frame(1)
+            server.refused_commands = ("SendParameters",)  # another program on the same port
+            assert server.client is not None
+            server.client.cut()
+            for listener in (on_zenoh, on_lcm):
+                await listener.wait_for_frame(2)
+                assert (listener.xml[-1], listener.early_versions) == (b"", set())
+            repeats = len(on_lcm.xml)
+            await wait_until_async(lambda: len(on_lcm.xml) > repeats + 1)
+            assert set(on_lcm.xml[repeats:]) == {b""}
+            assert await late_parameters(router) == b""
+            with zenoh_peer(router) as peer:
+                reply = await query(peer, KEY)
+            assert reply.code == "refused"
+            assert "the parameters of its earlier connections are void" in reply.error
+            server.refused_commands = ()
+            server.client.cut()
+            await on_zenoh.wait_for_frame(3)
+            assert on_zenoh.xml[-1] == server.xml
+
+
+async def test_no_frame_is_lost_while_two_hundred_queries_are_answered(router: str) -> None:
+    scene = SyntheticScene(markers=10, tools=2, analog=4, plates=1, rate_hz=200, analog_rate_hz=200)
+    sequences: list[int] = []
+    async with Simulator(scene) as simulator:
+        simulator.stop_measurement()
+        async with run_gateway(simulator.port, router=router) as gateway:
+            [source] = gateway.sources
+            await wait_until_async(lambda: source.statuses[0].state.value == "no measurement")
+            with zenoh_peer(router) as peer:
+                peer.declare_subscriber(
+                    "mocap/lab/3d",
+                    lambda sample: sequences.append(decode(sample.payload.to_bytes()).sequence),
+                )
+                await wait_until_async(lambda: source.fan_out.has_subscribers(source.queries.components))
+                simulator.start_measurement()
+                keys = ("parameters?fresh=true", "parameters/3d", "6d", "*?format=json")
+                for _ in range(10):
+                    answers = await asyncio.gather(*(query_all(peer, f"mocap/lab/{key}") for key in keys * 5))
+                    assert all(replies and not any(each.error for each in replies) for replies in answers)
+                await wait_until_async(lambda: len(sequences) > 50)
+                simulator.stop_measurement()
+                await wait_until_async(lambda: len(sequences) >= simulator.components_sent["3d"])
+    assert sequences == list(range(simulator.components_sent["3d"]))
