@@ -148,7 +148,7 @@ class JsonPublisher:
         publisher = session.declare_publisher(
             self._key, encoding=JSON, congestion_control=zenoh.CongestionControl.DROP
         )
-        publisher.declare_matching_listener(in_zenoh_thread(lambda status: self._set_wanted(status.matching)))
+        publisher.declare_matching_listener(in_zenoh_thread(self._on_matching))
         self._publisher = publisher
 
     def check_subscribers(self) -> None:
@@ -156,6 +156,9 @@ class JsonPublisher:
         publisher: Any = self._publisher  # its type stub is wrong: see ZenohPublisher
         if publisher is not None:
             self._set_wanted(publisher.matching_status.matching)
+
+    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
+        self._set_wanted(status.matching)
 
     def _set_wanted(self, wanted: bool) -> None:
         self.wanted = wanted

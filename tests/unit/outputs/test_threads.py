@@ -4,13 +4,20 @@ import asyncio
 import socket
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import lcm
 import pytest
 
+from gateway.messages.topics import Topic
+from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.outputs.lsl.output import LslOutput
+from gateway.outputs.lsl.settings import LslSettings
+from gateway.outputs.ros2.output import Ros2Output
+from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.queries.service import SourceQueryService
@@ -70,3 +77,32 @@ def test_a_subscriber_of_lcm_receives_in_a_thread_until_it_is_closed(
     shared.publish("A", b"late")
     shared.handle_timeout(0)
     assert received == []
+
+
+def test_zenoh_has_no_thread_for_each_key() -> None:
+    """With three sources of 256 tools, no further thread could start, and the gateway stopped working."""
+    output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
+    output.start()
+    output.wait_until_open(30)
+    threads = Path("/proc/self/task")
+    num_before = len([*threads.iterdir()])
+    publishers = [output.publisher(Topic("lab", ("6d", str(at)), "rtc3d.tool_pose_t")) for at in range(90)]
+    assert len([*threads.iterdir()]) < num_before + len(publishers) / 2  # Zenoh's own may grow
+    output.close()
+
+
+UNUSED = [
+    lambda: LcmOutput(LcmSettings()),
+    lambda: LslOutput(LslSettings()),
+    lambda: Ros2Output(Ros2Settings()),
+    lambda: ZenohOutput(ZenohSettings()),
+]
+
+
+@pytest.mark.parametrize("build", UNUSED)
+def test_an_output_that_is_never_started_has_no_thread(
+    threads: Callable[[], dict[str, bool]], build: Callable[[], Output]
+) -> None:
+    """A reload builds every output to compare it with the running one, and drops it if they are alike."""
+    output = build()
+    assert threads() == {}, output.name

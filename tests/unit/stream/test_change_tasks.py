@@ -1,6 +1,7 @@
 """Changes to a stream by demand and by lateness, with a scripted server."""
 
 import asyncio
+import gc
 import logging
 import re
 from typing import Any
@@ -244,3 +245,11 @@ async def test_a_defect_ends_the_session() -> None:
     with pytest.raises(DefectError, match="defect in the gateway: ZeroDivisionError: "):
         await lab.session.monitor(lab.check_silence)
     lab.changes.cancel()
+
+
+async def test_tasks_that_are_cancelled_before_they_start_leave_nothing_behind() -> None:
+    """A server may send OK, a frame and a bad packet at once. Python would print a warning on stderr."""
+    lab = await started(on_demand=True)
+    lab.changes.cancel()
+    await settle()
+    gc.collect()

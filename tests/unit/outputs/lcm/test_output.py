@@ -1,10 +1,15 @@
 """The channels of an output on LCM."""
 
+import logging
+from collections import Counter
+
 import pytest
 
+from gateway.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
+from tests.losses import amounts
 
 
 @pytest.fixture
@@ -49,3 +54,14 @@ def test_labels_that_look_alike_or_are_too_long_for_lcm_get_channels_of_their_ow
     ]
     long = [output.publisher(probe(100 * "x" + end)).channel for end in "abcdefghijkl"]
     assert (len(set(long)), {len(channel) for channel in long}) == (12, {63})
+
+
+def test_what_a_peer_has_not_taken_at_the_end_is_counted(
+    output: LcmOutput, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """160 of 300 messages were lost over tcpq, and all counted as sent."""
+    losses = Losses(logging.getLogger(__name__), "lab to lcm")
+    output.count_losses("lab", losses)
+    monkeypatch.setattr(output._sender, "close", lambda: Counter(lab=160))
+    output.close()
+    assert amounts(losses.report()) == {"closed": (160, 0)}

@@ -60,8 +60,9 @@ def parameters(label: str, version: int = 1) -> ServerParameters:
 class Line(asyncio.Transport):
     """The transport of a client: ``written`` is what was sent, of which ``num_unread`` bytes are not read."""
 
-    def __init__(self) -> None:
+    def __init__(self, address: tuple[str, int] | None = _CLIENT) -> None:
         super().__init__()
+        self.address = address
         self.written = bytearray()
         self.num_unread = 0
         self.high_water = 0
@@ -70,7 +71,7 @@ class Line(asyncio.Transport):
         self.protocol: ClientConnection
 
     def get_extra_info(self, name: str, default: object = None) -> Any:
-        return {"peername": _CLIENT, "sockname": _SERVER, "socket": self}.get(name, default)
+        return {"peername": self.address, "sockname": _SERVER, "socket": self}.get(name, default)
 
     def setsockopt(self, _level: int, option: int, value: int) -> None:
         self.options[option] = value

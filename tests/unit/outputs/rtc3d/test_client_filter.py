@@ -17,10 +17,12 @@ from gateway.outputs.rtc3d.client_filter import (
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
 from gateway.rtc3d.commands import ControlRecording
 from gateway.rtc3d.packets import Packet
+from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.losses import amounts
 from tests.unit.outputs.rtc3d.scripted_server import (
     Client,
+    Line,
     ScriptedServer,
     in_virtual_time,
     settle,
@@ -272,3 +274,13 @@ def test_requests_for_parameters_are_recognised() -> None:
         Packet(DATA, b"SendParameters"),
     ):
         assert not asks_for_parameters(other)
+
+
+@in_virtual_time
+async def test_a_client_that_resets_its_connection_at_once_is_no_defect(server: ScriptedServer) -> None:
+    """The system no longer knows its address; a port scan must not look like a problem of the source."""
+    line = Line(None)
+    connection = line.protocol = ClientConnection(server)
+    connection.connection_made(line)
+    connection.connection_lost(ConnectionResetError())
+    assert not server.connections
