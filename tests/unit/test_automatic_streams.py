@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from gateway.c3d_files.spool import Spool
+from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.state import StreamState
+from gateway.stream.streams import AutomaticStreams
 from tests.servers import error, ok, packet
 from tests.spec_parameters import in_root
 from tests.unit.scripted_sources import Servers
@@ -203,6 +205,21 @@ async def test_a_second_connection_that_breaks_twice_in_a_row_is_given_up(
         assert lab.limitations[0].startswith(f"{ONE_CONNECTION}the server accepts one connection only (")
         await asyncio.sleep(3600)
         assert len(lab.scripted.connections) == 3
+
+
+async def test_a_server_that_accepts_one_connection_gets_no_second_one_for_another_rate(lab: AutoLab) -> None:
+    """Its operator has set another rate; two connections would fail again."""
+    async with running(lab):
+        for _ in range(2):
+            await lab.uses_two()
+            await end(lab.scripted.connections[-1])
+        await until(lambda: lab.limitations)
+        num_connections = len(lab.scripted.connections)
+        streams = lab.source._streams
+        assert isinstance(streams, AutomaticStreams)
+        streams.parameters_changed(parse_parameters(parameters(1000)[8:]).parameters)
+        await asyncio.sleep(60)
+        assert len(lab.scripted.connections) == num_connections
 
 
 async def test_the_further_connection_ends_with_the_first(lab: AutoLab) -> None:

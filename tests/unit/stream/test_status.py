@@ -15,9 +15,10 @@ from gateway.messages.host_time import now_utime
 from gateway.monitoring.status_line import source_line
 from gateway.publish.status_messages import status_message
 from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.stream.running_clock import running_clock
 from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
-from gateway.stream.status_text import message_texts, source_text
+from gateway.stream.status_text import message_texts, source_text, unusable_frames
 from tests.losses import amounts
 
 SERVER = "192.0.2.20:3020"
@@ -266,6 +267,19 @@ def test_frames_that_are_all_rejected_are_no_streaming() -> None:
     rejected.frame_rejected("component 7 is too short", 1)
     [(components, text)] = message_texts(message_of([(rejected, 200.0)]))
     assert (components, text) == ("3d", "frames come, and all are rejected: component 7 is too short")
+
+
+async def test_frames_without_the_streams_components_are_a_problem_if_they_last() -> None:
+    status = StreamStatus("3d")
+    clock_s = running_clock().time()
+    status.frames_read(clock_s - 4)
+    status.components_received("6d")
+    status.frames_read(clock_s)
+    status.components_received("6d")
+    assert "none has a component of this stream (3d); the newest has 6d" in unusable_frames(status, 3.0)
+    assert unusable_frames(status, 100.0) == ""
+    status.components_received("")
+    assert unusable_frames(status, 3.0) == ""
 
 
 def test_texts_of_a_hostile_message_are_escaped_and_cut() -> None:

@@ -1,5 +1,7 @@
 """Parameters on LCM in memory: what subscribers receive."""
 
+import asyncio
+import threading
 from types import SimpleNamespace
 
 import lcm
@@ -69,16 +71,24 @@ async def test_an_output_without_queries_has_no_results() -> None:
 
 
 async def test_long_parameters_are_sent_by_a_thread(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short ones must not overtake them: late subscribers would keep the old names."""
     monkeypatch.setattr(parameters_module, "LONG_REPLY_BYTES", 10)
+    queries = lab.output._queries
+    assert queries is not None
+    may_send = threading.Event()
+    queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
     sent = lab.output.publish_parameters("lab", ServerParameters(b"<long enough/>", 3, 4))
+    short = lab.output.publish_parameters("lab", ServerParameters(b"<a/>", 3, 5))
+    may_send.set()
     assert sent is not None
-    await sent
-    again = lab.output.publish_parameters("lab", ServerParameters(b"<longer than that/>", 3, 5))
+    assert short is not None
+    await asyncio.gather(sent, short)
+    again = lab.output.publish_parameters("lab", ServerParameters(b"<longer than that/>", 3, 6))
     assert again is not None
     await again
     lab.deliver()
-    assert [message.xml for message in lab.parameters] == ["<long enough/>", "<longer than that/>"]
-    assert [message.sequence for message in lab.parameters] == [0, 1]
+    assert [message.xml for message in lab.parameters] == ["<a/>", "<a/>", "<longer than that/>"]
+    assert [message.sequence for message in lab.parameters] == [0, 1, 2]
     lab.send(request(1))
     [reply] = await lab.receive()
     assert reply.xml == XML.decode()

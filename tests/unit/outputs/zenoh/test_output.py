@@ -379,6 +379,16 @@ def test_a_json5_file_passes_whole_and_as_it_stands(tmp_path: Path) -> None:
     assert value_of(config, "connect/retry") == value_of(zenoh.Config.from_file(str(path)), "connect/retry")
 
 
+def test_a_changed_json5_file_is_another_configuration(tmp_path: Path) -> None:
+    """A reload must open another session for it, although its path is the same."""
+    path = tmp_path / "zenoh.json5"
+    outputs = []
+    for lease in (2000, 2000, 3000):
+        path.write_text(f"{{ transport: {{ link: {{ tx: {{ lease: {lease} }} }} }} }}")
+        outputs.append(ZenohOutput(ZenohSettings(config=path)))
+    assert [outputs[0].is_configured_like(other) for other in outputs] == [True, True, False]
+
+
 @pytest.mark.parametrize("shared_memory", [{}, {"shared_memory": {"enabled": True}}])
 def test_inline_keys_pass_whole_over_what_the_gateway_prefers(shared_memory: dict[str, Any]) -> None:
     retry = {"period_max_ms": 9000}

@@ -28,6 +28,15 @@ XML = b"<RT_Parameters/>"
 STATUS, C3D = ("status",), ("c3d",)
 
 
+class Unmakeable:
+    """A payload that cannot be made."""
+
+    num_bytes, is_made = 1, False
+
+    def make(self) -> bytes:
+        raise QueryError("no JSON of this frame")
+
+
 class Service:
     """Answers every key with itself, or raises ``error``."""
 
@@ -61,7 +70,8 @@ class Service:
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
     ) -> dict[KeyPath, Answer]:
         self.received.append((source, list(paths), dict(options)))
-        return {path: Answer("/".join(path).encode(), "text/plain") for path in paths}
+        answers = {path: Answer("/".join(path).encode(), "text/plain") for path in paths}
+        return answers if "fail" not in options else answers | {STATUS: Answer(Unmakeable(), "text/plain")}
 
 
 class Lab:
@@ -121,6 +131,8 @@ async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -
         ("mocap/lab/status", b"status", {}),
     ]
     assert lab.service.received == [("lab", [STATUS, ("parameters", "3d")], {"format": "json"})]
+    replies = await query_all(lab.peer, "mocap/lab/**?fail=yes")
+    assert [(reply.key, reply.code) for reply in replies] == [("mocap/lab/parameters/3d", "")]
     replies = await query_all(lab.peer, "mocap/lab/parameters/*")
     assert [reply.key for reply in replies] == ["mocap/lab/parameters/3d"]
     replies = await query_all(lab.peer, "mocap/*/c3d")
