@@ -21,10 +21,9 @@ from gateway.takes.event_log import Event
 from gateway.takes.reader import TakeReader
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 from gateway.worker_thread import WorkerThread, make_call
-from tests import settable_clock
+from tests.settable_clock import Clock
 from tests.waiting import wait_until_async
 
-Clock = settable_clock.Clock
 _Result = TypeVar("_Result")
 
 

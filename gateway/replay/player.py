@@ -59,7 +59,7 @@ class Player:
     other waiting. The system reads the file ahead.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - most are options of the command
         self,
         reader: TakeReader,
         selection: Selection,
@@ -70,9 +70,9 @@ class Player:
         is_watched: bool = False,
         max_gap_s: float = MAX_GAP_S,
         on_jump: Callable[[Jump], None] = lambda _jump: None,
+        clock: PlayerClock | None = None,
     ) -> None:
-        self.clock = PlayerClock()
-        """The time; it may be replaced before ``start``."""
+        self._clock = PlayerClock() if clock is None else clock
         self.lateness = Lateness()
         self.position_us = selection.start_us
         """Where in the take the newest message is."""
@@ -87,8 +87,7 @@ class Player:
         self._reader = reader
         self._selection = selection
         self._publication = publication
-        now_s = lambda: self.clock.now_s()  # noqa: E731, PLW0108 - the clock may be replaced later
-        self._pace = None if rate is None else Pace(rate, now_s)
+        self._pace = None if rate is None else Pace(rate, self._clock.now_s)
         self.is_repeated = is_repeated
         """Whether it begins again at the end. It may be changed at any time."""
         self.is_at_end = False
@@ -169,7 +168,7 @@ class Player:
     # In the thread.
 
     def _run(self) -> None:
-        self._started_s = self.clock.now_s()
+        self._started_s = self._clock.now_s()
         try:
             start_us: int | None = self._selection.start_us
             while start_us is not None:
@@ -177,7 +176,7 @@ class Player:
         except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
             self.error = error
         finally:
-            self._ended_s = self.clock.now_s()
+            self._ended_s = self._clock.now_s()
 
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""
@@ -201,7 +200,7 @@ class Player:
             )
         if not self.is_repeated:
             return self._wait_at_end() if self._is_watched else None
-        self.clock.sleep(_PASS_S)
+        self._clock.sleep(_PASS_S)
         return self._selection.start_us
 
     def _wait_at_end(self) -> int | None:
@@ -209,7 +208,7 @@ class Player:
         with self._changed:
             self.is_at_end = True
             while not (self._is_stopping or self._seek_us is not None):
-                self.clock.wait(self._changed, None)
+                self._clock.wait(self._changed, None)
             self.is_at_end = False
             seek_us, self._seek_us = self._seek_us, None
             self._notify()
@@ -232,7 +231,7 @@ class Player:
                 if not is_begun and key != "parameters":
                     is_begun = True
                     pace.start(max(start_us, preview_end_us))
-                    self._begun_s = self.clock.now_s()
+                    self._begun_s = self._clock.now_s()
                 if is_begun and not self._wait(pace, position_us):
                     return False
             publish(source, key, message)
@@ -245,21 +244,21 @@ class Player:
         now_s = self._now_s(pace)
         while (wait_s := pace.due_s(position_us) - now_s) > 0:
             if wait_s <= _FINE_S:
-                self.clock.sleep(wait_s)
+                self._clock.sleep(wait_s)
             else:
                 with self._changed:
                     if not self._must_attend:
-                        self.clock.wait(self._changed, wait_s - _FINE_S / 2)
+                        self._clock.wait(self._changed, wait_s - _FINE_S / 2)
                 if self._must_attend and not self._attend():
                     return False
-            self._begun_s = max(self._begun_s, min(pace.due_s(position_us), self.clock.now_s()))
+            self._begun_s = max(self._begun_s, min(pace.due_s(position_us), self._clock.now_s()))
             now_s = self._now_s(pace)
         self.lateness.add(-wait_s)
         return True
 
     def _now_s(self, pace: Pace) -> float:
         """Return the time; if the process stood still since ``_begun_s``, let all the rest be due later."""
-        now_s = self.clock.now_s()
+        now_s = self._clock.now_s()
         stalled_s = now_s - self._begun_s
         if stalled_s > STALL_S:
             pace.shift(stalled_s)
@@ -269,14 +268,14 @@ class Player:
 
     def _attend(self) -> bool:
         """Pause until the replay is to continue; return False if it is to stop or to go elsewhere."""
-        began_s = self.clock.now_s()
+        began_s = self._clock.now_s()
         with self._changed:
             while self._is_paused and not self._is_stopping and self._seek_us is None:
-                self.clock.wait(self._changed, None)
+                self._clock.wait(self._changed, None)
             is_continued = not self._is_stopping and self._seek_us is None
             rate, self._rate = self._rate, None
             self._notify()
-        paused_s = self.clock.now_s() - began_s
+        paused_s = self._clock.now_s() - began_s
         if self._pace is not None:
             self._pace.shift(paused_s)
             if rate is not None:

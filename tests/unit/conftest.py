@@ -6,8 +6,8 @@ from typing import Final
 
 import pytest
 
+from tests.settable_clock import Clock
 from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
-from tests.unit.settable_clock import SettableClock
 from tests.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {
@@ -41,5 +41,5 @@ async def threads(servers: Servers) -> SlowThreads:
 
 
 @pytest.fixture
-def clock() -> SettableClock:
-    return SettableClock()
+def clock() -> Clock:
+    return Clock()

@@ -8,14 +8,14 @@ import pytest
 
 from gateway.log import FIELDS, HOLD_S, MAX_HOLD_S, MAX_REPEATS, DefectLog, EventLog, FailureLog, log_fields
 from gateway.service.log_format import ContextFilter
-from tests.unit.settable_clock import SettableClock
+from tests.settable_clock import Clock
 
 LOGGER = logging.getLogger("tests.failures")
 
 
 @pytest.fixture(autouse=True)
 def _clock_and_every_level(
-    clock: SettableClock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("gateway.log.monotonic", clock)
     caplog.set_level(logging.DEBUG, LOGGER.name)
@@ -29,9 +29,7 @@ def levels(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.levelname for record in caplog.records]
 
 
-def test_a_failure_is_loud_once_and_its_recovery_too(
-    clock: SettableClock, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failure_is_loud_once_and_its_recovery_too(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     """What fails for hours must not fill the log, but its begin and its end must be there."""
     failures = FailureLog(LOGGER, "lab")
     failures.recovered("streaming")
@@ -52,9 +50,7 @@ def test_a_failure_is_loud_once_and_its_recovery_too(
     ]
 
 
-def test_success_is_always_logged_and_ends_a_failure(
-    clock: SettableClock, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_success_is_always_logged_and_ends_a_failure(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     """Each connection is logged, and a new failure after it is loud again."""
     failures = FailureLog(LOGGER, "lab")
     failures.succeeded("streaming")
@@ -67,7 +63,7 @@ def test_success_is_always_logged_and_ends_a_failure(
 
 
 def test_intermittent_failures_are_over_after_the_hold_time_without_one(
-    clock: SettableClock, caplog: pytest.LogCaptureFixture
+    clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A link that loses every other packet is one failure, not a thousand."""
     failures = FailureLog(LOGGER, "lab", hold_s=5.0)
@@ -89,7 +85,7 @@ def test_intermittent_failures_are_over_after_the_hold_time_without_one(
     ("pause_s", "holds_s"), [(MAX_HOLD_S - 1, [5, 10, 20, 40, 60, 60]), (MAX_HOLD_S, [5, 5, 5])]
 )
 def test_the_hold_time_doubles_while_failures_come_back_soon(
-    clock: SettableClock, pause_s: float, holds_s: list[float]
+    clock: Clock, pause_s: float, holds_s: list[float]
 ) -> None:
     """The wait ends at a minute, and starts again after a minute without a failure."""
     failures = FailureLog(LOGGER, "lab", HOLD_S)
@@ -113,9 +109,7 @@ def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptu
     assert levels(caplog) == ["WARNING", "INFO"] * MAX_REPEATS + ["DEBUG"] * 2 * (100 - MAX_REPEATS)
 
 
-def test_an_event_is_loud_some_times_in_five_minutes(
-    clock: SettableClock, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_event_is_loud_some_times_in_five_minutes(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     """The window slides: after it, as many are loud again as are older, and the next says what was hidden."""
     events = EventLog(LOGGER, "lab")
     begin_s = clock.now_s

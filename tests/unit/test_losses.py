@@ -6,13 +6,13 @@ import pytest
 
 from gateway.losses import MAX_HOLD_S, MIN_HOLD_S, Losses, last_minute_text
 from tests.losses import amounts
-from tests.unit.settable_clock import SettableClock
+from tests.settable_clock import Clock
 
 LOGGER = logging.getLogger("tests.losses")
 
 
 @pytest.fixture
-def losses(clock: SettableClock, caplog: pytest.LogCaptureFixture) -> Losses:
+def losses(clock: Clock, caplog: pytest.LogCaptureFixture) -> Losses:
     caplog.set_level(logging.DEBUG, LOGGER.name)
     return Losses(LOGGER, "lab", clock)
 
@@ -40,9 +40,7 @@ def test_a_frame_counts_once_for_each_cause_however_many_messages_it_loses(losse
     assert amounts(losses.report()) == {"no router": (4, 2), "put failed": (1, 1)}
 
 
-def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(
-    losses: Losses, clock: SettableClock
-) -> None:
+def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(losses: Losses, clock: Clock) -> None:
     losses.lost("skipped", "late", messages=2)
     clock.now_s += 30
     losses.lost("skipped", "later", messages=3)
@@ -54,9 +52,7 @@ def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(
     assert (loss.messages, loss.frames, loss.text) == (5, 2, "later")
 
 
-def test_the_last_minute_is_complete_if_something_is_lost_all_the_time(
-    losses: Losses, clock: SettableClock
-) -> None:
+def test_the_last_minute_is_complete_if_something_is_lost_all_the_time(losses: Losses, clock: Clock) -> None:
     for _ in range(200 * 10):
         losses.lost("skipped", "late")
         clock.now_s += 0.1
@@ -66,7 +62,7 @@ def test_the_last_minute_is_complete_if_something_is_lost_all_the_time(
 
 
 def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
-    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
+    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(250):
         losses.lost("no router", "start zenohd", messages=5)
@@ -85,7 +81,7 @@ def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
 
 
 def test_the_next_period_has_a_total_of_its_own(
-    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
+    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Also one that begins while nobody has checked for the end of the former one."""
     for number in (1, 2):
@@ -102,7 +98,7 @@ def test_the_next_period_has_a_total_of_its_own(
 
 
 def test_causes_that_alternate_are_logged_once_each(
-    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
+    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
     for _ in range(1000):
         losses.lost("no router", "start zenohd")
@@ -129,7 +125,7 @@ def test_a_loss_that_is_expected_at_first_is_logged_again_as_warning(
 
 @pytest.mark.parametrize("period_s", [6.0, 20.0, 59.0])
 def test_loss_that_comes_and_goes_does_not_fill_the_log(
-    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture, period_s: float
+    losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture, period_s: float
 ) -> None:
     for _ in range(1000):
         losses.lost("no router", "start zenohd")
@@ -148,7 +144,7 @@ def test_loss_that_comes_and_goes_does_not_fill_the_log(
     assert len(logged(caplog)) == 2  # after a long pause, the wait is short again
 
 
-def test_texts_say_how_much_and_why(losses: Losses, clock: SettableClock) -> None:
+def test_texts_say_how_much_and_why(losses: Losses, clock: Clock) -> None:
     assert last_minute_text(losses.report()) == ""
     losses.lost("skipped while behind", "late", messages=872, frames=436)
     losses.lost("C3D file", "disk full", frames=0)

@@ -9,11 +9,11 @@ from gateway.cli import echo_rates
 from gateway.cli.echo_messages import Limits
 from gateway.cli.echo_rates import MAX_KEYS, MIN_WINDOW, Rate, Rates, print_rates
 from gateway.cli.silence import Silence
+from tests.settable_clock import Clock
 from tests.unit.cli.test_echo import REQUEST, Published
-from tests.unit.settable_clock import SettableClock
 
 
-def receive(rates: Rates, clock: SettableClock, intervals_s: list[float], key: str = "mocap/lab/3d") -> Rate:
+def receive(rates: Rates, clock: Clock, intervals_s: list[float], key: str = "mocap/lab/3d") -> Rate:
     """Receive a message after each interval; return the rate of their key."""
     for interval_s in intervals_s:
         clock.now_s += interval_s
@@ -22,21 +22,21 @@ def receive(rates: Rates, clock: SettableClock, intervals_s: list[float], key: s
     return row
 
 
-def test_figures_are_those_of_the_intervals(clock: SettableClock) -> None:
+def test_figures_are_those_of_the_intervals(clock: Clock) -> None:
     row = receive(Rates(monotonic=clock), clock, [5.0, *([0.01, 0.03] * 100)])
     assert row.rate_hz == pytest.approx(50)
     assert (row.min_s, row.max_s, row.std_dev_s) == pytest.approx((0.01, 0.03, 0.01))
     assert (row.window, row.age_s, row.has_stopped) == (201, 0, False)
 
 
-def test_the_window_is_ten_seconds_and_at_least_ten_messages(clock: SettableClock) -> None:
+def test_the_window_is_ten_seconds_and_at_least_ten_messages(clock: Clock) -> None:
     rates = Rates(monotonic=clock)
     assert receive(rates, clock, [0.01] * 5000).window == pytest.approx(1001, abs=1)
     assert receive(rates, clock, [7.0] * 50, "slow").window == MIN_WINDOW
     assert [row.rate_hz for row in rates.rows() if row.key == "slow"] == [pytest.approx(1 / 7)]
 
 
-def test_a_key_that_stops_has_the_rate_0(clock: SettableClock) -> None:
+def test_a_key_that_stops_has_the_rate_0(clock: Clock) -> None:
     rates = Rates(monotonic=clock)
     receive(rates, clock, [0.01] * 100)
     receive(rates, clock, [1.0] * 3, "status")
@@ -47,7 +47,7 @@ def test_a_key_that_stops_has_the_rate_0(clock: SettableClock) -> None:
     assert not running.has_stopped
 
 
-def test_a_few_messages_at_once_are_no_high_rate(clock: SettableClock) -> None:
+def test_a_few_messages_at_once_are_no_high_rate(clock: Clock) -> None:
     rates = Rates(monotonic=clock)
     receive(rates, clock, [0, 0.00001])
     clock.now_s += 1
@@ -56,7 +56,7 @@ def test_a_few_messages_at_once_are_no_high_rate(clock: SettableClock) -> None:
     assert receive(rates, clock, [0], "once")[1:6] == (0, None, None, None, 1)
 
 
-def test_messages_after_the_last_one_wanted_do_not_count(clock: SettableClock) -> None:
+def test_messages_after_the_last_one_wanted_do_not_count(clock: Clock) -> None:
     rates = Rates(3, monotonic=clock)
     assert receive(rates, clock, [1] * 10).window == 3
     assert rates.num_messages == 3

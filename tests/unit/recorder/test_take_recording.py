@@ -23,7 +23,7 @@ from gateway.subscriber.reception import MAX_SOURCES
 from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
-from tests.recording_output import Clock
+from tests.settable_clock import Clock
 from tests.waiting import wait_until
 
 UTIME = 1_700_000_000_000_000

@@ -63,10 +63,8 @@ class Replay:
 
     def prepare(self, selection: Selection | None = None, **options: Any) -> Player:
         """Make the player."""
-        self.player = Player(
-            TakeReader(self.path), selection or Selection(), self, on_jump=self.jumps.append, **options
-        )
-        self.player.clock = self.clock
+        options |= {"on_jump": self.jumps.append, "clock": self.clock}
+        self.player = Player(TakeReader(self.path), selection or Selection(), self, **options)
         return self.player
 
     def run(self) -> list[tuple[int, float]]:

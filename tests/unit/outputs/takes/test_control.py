@@ -9,7 +9,7 @@ import pytest
 from gateway.errors import QueryError
 from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, TakeCommand
 from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
-from tests.recording_output import Clock
+from tests.settable_clock import Clock
 
 WALK = StoredTake("walk-1", 4096, 1_700_000_000_000_000, 12.34567, is_running=True, num_lost=2)
 WALK_FIELDS = {

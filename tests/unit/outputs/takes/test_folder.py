@@ -15,7 +15,8 @@ from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
 from gateway.takes.event_log import encode_event
-from tests.recording_output import Clock, NoThread, settings_in
+from tests.recording_output import NoThread, settings_in
+from tests.settable_clock import Clock
 
 NOW_S = 1_700_000_000.0
 DAY_S = 86_400.0

@@ -13,7 +13,8 @@ import rtc3d
 
 from gateway.outputs.takes.follow import END_S, LOST_S, event_ids
 from gateway.takes.reader import TakeReader
-from tests.recording_output import Clock, RecordingLab, still_lab
+from tests.recording_output import RecordingLab, still_lab
+from tests.settable_clock import Clock
 from tests.unit.messages.samples import component_message
 from tests.vectors import LONG_EVENTS
 from tests.waiting import wait_until_async

@@ -15,7 +15,7 @@ from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
-from tests.recording_output import Clock
+from tests.settable_clock import Clock
 
 CHANNEL = b"MOCAP_LAB_3D"
 

@@ -19,7 +19,8 @@ from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.stored import StoredTake
-from tests.recording_output import Clock, events, frames, still_lab
+from tests.recording_output import events, frames, still_lab
+from tests.settable_clock import Clock
 from tests.virtual_time import run_in_virtual_time
 
 

@@ -10,7 +10,8 @@ import pytest
 from gateway.outputs.takes.disk_calls import Host
 from gateway.outputs.takes.folder import ROLLING
 from gateway.takes.reader import log_paths
-from tests.recording_output import Clock, NoThread, RecordingLab, settings_in, still_host, still_lab
+from tests.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
+from tests.settable_clock import Clock
 
 MIB = 1024 * 1024
 
