@@ -39,6 +39,13 @@ def test_calls_are_made_in_order_in_a_thread_of_its_own() -> None:
     sender.close()
 
 
+def test_the_age_of_a_call_is_known_while_it_is_made(blocked: tuple[SendThread, threading.Event]) -> None:
+    sender, go = blocked
+    assert sender.call_age_s > 0
+    go.set()
+    wait_until(lambda: sender.call_age_s == 0)
+
+
 def test_what_a_call_raises_goes_to_who_waits_for_it_and_the_next_is_made() -> None:
     def fail() -> None:
         raise OSError("of the test")
@@ -66,16 +73,18 @@ def test_a_call_that_is_cancelled_before_its_turn_is_not_made(
 
 
 def test_after_close_no_call_is_begun(blocked: tuple[SendThread, threading.Event]) -> None:
+    """Nobody waits for ever for one that was still queued, or came later."""
     sender, go = blocked
     made: list[str] = []
-    sender.submit(lambda: made.append("late"))
+    queued = sender.submit(lambda: made.append("late"))
     # The thread of an earlier test may still be ending; the newest is the last.
     *_, thread = (each for each in threading.enumerate() if each.name == "blocked")
     sender.close()
     go.set()
     thread.join(10)
     assert not thread.is_alive()
-    assert made == []
+    later = sender.submit(lambda: made.append("later"))
+    assert (made, queued.cancelled(), later.cancelled()) == ([], True, True)
 
 
 def test_the_end_of_the_program_does_not_wait_for_a_call() -> None:

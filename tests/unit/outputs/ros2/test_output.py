@@ -137,6 +137,17 @@ def test_only_equal_settings_are_taken_over(monkeypatch: pytest.MonkeyPatch) -> 
     assert [one.is_configured_like(each) for each in (same, other)] == [True, False]
 
 
+def test_a_router_that_does_not_read_is_a_problem_although_it_is_connected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """rmw_zenohd may hang for 60 s before Zenoh gives the connection up."""
+    lab = Output(monkeypatch)
+    for lab.sender.call_age_s in (0.0, 1.9):
+        assert lab.output.health().connected
+    lab.sender.call_age_s = 3.0
+    assert "has read nothing for 3 s" in lab.output.health().problem
+
+
 def test_closing_ends_the_thread_and_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is queued afterwards."""
     lab = Output(monkeypatch, is_open=False)
