@@ -282,6 +282,21 @@ async def test_another_version_of_the_server_is_tried_again(lab: AutoLab) -> Non
         assert lab.limitations == []
 
 
+async def test_a_server_stays_known_when_its_rates_change_on_an_open_connection(lab: AutoLab) -> None:
+    """It is the same server: several connections would end the first one again."""
+    async with running(lab):
+        for _ in range(3):
+            await lab.uses_two()
+            await end_all(lab)
+        await until(lambda: lab.limitations == [ONE_ONLY] and lab.states == [StreamState.NO_MEASUREMENT])
+        lab.scripted.answer_on = answering(parameters(1000))
+        lab.scripted.connections[-1].send_frames(1)  # a new measurement
+        lab.scripted.connections[-1].send(NO_DATA)
+        await until(lambda: lab.limitations == [ONE_ONLY.replace("2000", "1000")])
+        await asyncio.sleep(60)
+        assert (lab.components, lab.scripted.num_open) == ([EVERYTHING], 1)
+
+
 async def test_a_server_that_refused_is_tried_again_after_ten_minutes(lab: AutoLab) -> None:
     answer = lab.scripted.answer_on
     lab.scripted.answer_on = lambda each, command: (

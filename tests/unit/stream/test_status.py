@@ -15,9 +15,10 @@ from gateway.messages.host_time import now_utime
 from gateway.monitoring.status_line import source_line
 from gateway.publish.status_messages import status_message
 from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.stream.running_clock import running_clock
 from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
-from gateway.stream.status_text import message_texts, source_text
+from gateway.stream.status_text import message_texts, source_text, unusable_frames
 from tests.losses import amounts
 
 SERVER = "192.0.2.20:3020"
@@ -266,6 +267,20 @@ def test_frames_that_are_all_rejected_are_no_streaming() -> None:
     rejected.frame_rejected("component 7 is too short", 1)
     [(components, text)] = message_texts(message_of([(rejected, 200.0)]))
     assert (components, text) == ("3d", "frames come, and all are rejected: component 7 is too short")
+
+
+@pytest.mark.parametrize(("since_s", "is_problem"), [(1.0, False), (3.0, True)])
+async def test_frames_without_a_wanted_component_are_named_after_a_while(
+    since_s: float, is_problem: bool
+) -> None:
+    """The time counts from the first of them, not from the newest."""
+    status, now_s = StreamStatus("3d"), running_clock().time()
+    for time_s in (now_s - since_s, now_s):
+        status.frames_read(time_s)
+        status.components_received("6d")
+    assert bool(unusable_frames(status, 2.0)) is is_problem
+    status.components_received("")
+    assert not unusable_frames(status, 2.0)
 
 
 def test_texts_of_a_hostile_message_are_escaped_and_cut() -> None:
