@@ -8,9 +8,7 @@ from pathlib import Path
 import pytest
 
 from gateway.c3d_files.spool import Spool
-from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.state import StreamState
-from gateway.stream.streams import AutomaticStreams
 from tests.servers import error, ok, packet
 from tests.spec_parameters import in_root
 from tests.unit.scripted_sources import Servers
@@ -207,21 +205,6 @@ async def test_a_second_connection_that_breaks_twice_in_a_row_is_given_up(
         assert len(lab.scripted.connections) == 3
 
 
-async def test_a_server_that_accepts_one_connection_gets_no_second_one_for_another_rate(lab: AutoLab) -> None:
-    """Its operator has set another rate; two connections would fail again."""
-    async with running(lab):
-        for _ in range(2):
-            await lab.uses_two()
-            await end(lab.scripted.connections[-1])
-        await until(lambda: lab.limitations)
-        num_connections = len(lab.scripted.connections)
-        streams = lab.source._streams
-        assert isinstance(streams, AutomaticStreams)
-        streams.parameters_changed(parse_parameters(parameters(1000)[8:]).parameters)
-        await asyncio.sleep(60)
-        assert len(lab.scripted.connections) == num_connections
-
-
 async def test_the_further_connection_ends_with_the_first(lab: AutoLab) -> None:
     async with running(lab):
         await lab.uses_two()
@@ -274,6 +257,21 @@ async def test_a_server_that_ends_with_every_second_connection_is_remembered(lab
         await end_all(lab)
         await lab.uses_two()
         assert lab.limitations == []
+
+
+async def test_a_server_stays_known_when_its_rates_change_on_an_open_connection(lab: AutoLab) -> None:
+    """It is the same server: several connections would end the first one again."""
+    async with running(lab):
+        for _ in range(3):
+            await lab.uses_two()
+            await end_all(lab)
+        await until(lambda: lab.limitations == [ONE_ONLY] and lab.states == [StreamState.NO_MEASUREMENT])
+        lab.scripted.answer_on = answering(parameters(1000))
+        lab.scripted.connections[-1].send_frames(1)  # a new measurement
+        lab.scripted.connections[-1].send(NO_DATA)
+        await until(lambda: lab.limitations == [ONE_ONLY.replace("2000", "1000")])
+        await asyncio.sleep(60)
+        assert (lab.components, lab.scripted.num_open) == ([EVERYTHING], 1)
 
 
 async def test_a_server_that_refused_is_tried_again_after_ten_minutes(lab: AutoLab) -> None:

@@ -181,6 +181,7 @@ async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
 ) -> None:
     await lab.streaming()
     contradictory = bytearray(markers_frame(1, (0.0, 0.0, 0.0)))
+    contradictory[8:12] = (2).to_bytes(4, "big")  # announces 2 components, of which the stream has 1
     contradictory[32:36] = (9).to_bytes(4, "big")  # announces 9 markers
     lab.connection.send(bytes(contradictory) + markers_frame(2, (0.0, 0.0, 0.0)))
     assert lab.numbers == [2]
@@ -199,6 +200,7 @@ async def test_a_c3d_file_is_passed_on_in_pieces_until_the_session_ends(lab: Lab
     lab.connection.send(file[11:])
     assert (lab.files.pieces, lab.files.interruptions) == ([b"con", b"tent"], [])
     lab.connection.send(file[:-1])
+    lab.server.closes_at_bye = False
     closing = asyncio.create_task(lab.session.close())
     await settle()
     assert lab.files.interruptions == ["the connection to 192.0.2.20:3020 was closed by the gateway"]

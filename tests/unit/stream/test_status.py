@@ -101,8 +101,12 @@ def test_a_frame_may_arrive_before_the_handshake_is_done() -> None:
 
 def test_a_new_connection_counts_and_forgets_what_was_agreed() -> None:
     status = StreamStatus("3d", session=4, byte_order="little", rate="AllFrames", limitations=["no names"])
+    status.connecting(SERVER)
     status.connected(SERVER)
     assert (status.session, status.byte_order, status.rate, status.limitations) == (5, "", "", [])
+    assert status.tries == 1
+    status.handshake_done(ProtocolState.IDLE, SERVER, "StreamFrames")
+    assert status.tries == 0
 
 
 def test_a_limitation_is_a_warning_once_over_all_connections(caplog: pytest.LogCaptureFixture) -> None:

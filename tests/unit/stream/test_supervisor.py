@@ -231,6 +231,16 @@ async def test_a_server_that_sends_some_frames_and_breaks_is_tried_as_rarely_as_
     assert_delays(lab.delays_s[:9], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10], connected_s=2 * STEP_S)
 
 
+async def test_the_time_that_an_attempt_takes_counts_as_waiting() -> None:
+    """A server that hangs and recovers is not kept waiting for its client even longer."""
+    lab = Lab()
+    lab.server.answer = silent_to("")
+    async with running(lab):
+        await asyncio.sleep(300)
+    assert len(lab.delays_s) > 5
+    assert max(lab.delays_s) - min(lab.delays_s) < 0.2
+
+
 async def test_a_steady_connection_starts_the_delays_again() -> None:
     lab = Lab()
     async with running(lab):

@@ -12,6 +12,8 @@ import uvloop
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
+from gateway.stream import tcp
+from gateway.stream.running_time import running_timeout
 from gateway.stream.tcp import open_connection, set_socket_options
 from tests.networks import free_port
 from tests.unit.stream.conftest import Resolver
@@ -128,10 +130,20 @@ def test_the_addresses_of_a_name_are_tried_in_turn(resolver: Resolver) -> None:
     assert resolver.names == ["lab-pc"]
 
 
-def test_an_address_that_does_not_answer_leaves_time_for_the_next(resolver: Resolver) -> None:
+def test_an_address_that_does_not_answer_leaves_time_for_the_next(
+    resolver: Resolver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits_s: list[float] = []
+
+    def noted(seconds: float) -> Any:
+        limits_s.append(seconds)
+        return running_timeout(seconds)
+
+    monkeypatch.setattr(tcp, "running_timeout", noted)
     resolver.addresses = ["127.0.0.1", "127.0.0.3"]
     with full_server() as port, socket.create_server(("127.0.0.3", port)):
         assert uvloop.run(connected_address(port, 0.4)) == "127.0.0.3"
+    assert limits_s[1] <= 0.2  # half of the time
 
 
 def test_the_kernel_holds_seconds_of_frames_while_the_process_stands_still() -> None:
