@@ -1,6 +1,7 @@
 """Takes that the gateway records: through reloads, the end of the process, and a kill."""
 
 import contextlib
+import re
 import signal
 import subprocess
 import time
@@ -76,7 +77,7 @@ async def growth(take: Path) -> None:
 
 
 def num_frames(take: Path) -> int:
-    return take.read_bytes().count(b"_3D") if take.exists() else 0
+    return len(re.findall(b"(LAB|HALL)_3D", take.read_bytes())) if take.exists() else 0
 
 
 def scene() -> SyntheticScene:
