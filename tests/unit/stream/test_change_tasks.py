@@ -120,6 +120,10 @@ async def test_a_reduced_rate_is_requested_again_with_other_components() -> None
     lab.changes.request_components((ComponentType.MARKERS,))
     await settle()
     assert requests(lab) == [HALF, "StreamFrames AllFrames 3D", f"{HALF} 3D"]
+    lab.changes.lateness_changed(0)
+    assert not lab.changes.is_full_rate  # the server does not know yet
+    await settle()
+    assert lab.changes.is_full_rate
     lab.changes.cancel()
 
 

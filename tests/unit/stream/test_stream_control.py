@@ -119,6 +119,11 @@ async def test_a_changed_rate_is_a_fraction_of_the_agreed_one_unless_it_is_refus
     refused = "StreamFrames Frequency:100 3D"
     assert lab.status.rate == "Frequency:200"
     assert lab.status.limitations == [f"the server refused {refused}: Error-{refused}"]
+    lab.connection.send_frames(1)
+    lab.server.answer = silent_to("StreamFrames")
+    asyncio.get_running_loop().call_later(1, lambda: lab.connection.send_frames(2))  # at the former rate
+    assert not await lab.control.request(1)
+    assert lab.status.rate == "Frequency:200"
 
 
 async def test_a_request_without_an_answer_is_not_accepted_unless_data_comes() -> None:

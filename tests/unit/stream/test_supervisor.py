@@ -16,7 +16,7 @@ from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.stream.backoff import Backoff
+from gateway.stream.backoff import STEADY_S, Backoff
 from gateway.stream.parameters import Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -229,6 +229,12 @@ async def test_a_server_that_sends_some_frames_and_breaks_is_tried_as_rarely_as_
         await lab.tried(10)
     # Between two attempts, there is always a delay of the shortest kind, however long the connection lasted.
     assert_delays(lab.delays_s[:9], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10], connected_s=2 * STEP_S)
+
+
+def test_a_steady_connection_forgets_the_breaks_before_it() -> None:
+    backoff = Backoff(ReconnectSettings(first_delay_s=FIRST_DELAY_S, max_delay_s=MAX_DELAY_S))
+    delays_s = [backoff.delay_after(lasted_s, had_data=True) for lasted_s in (1, 1, 1, STEADY_S)]
+    assert delays_s[2] > FIRST_DELAY_S >= delays_s[3]
 
 
 async def test_the_time_that_an_attempt_takes_counts_as_waiting() -> None:
