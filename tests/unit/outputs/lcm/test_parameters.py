@@ -1,5 +1,6 @@
 """Parameters on LCM in memory: what subscribers receive."""
 
+import threading
 from types import SimpleNamespace
 
 import lcm
@@ -82,6 +83,23 @@ async def test_long_parameters_are_sent_by_a_thread(lab: Lab, monkeypatch: pytes
     lab.send(request(1))
     [reply] = await lab.receive()
     assert reply.xml == XML.decode()
+
+
+async def test_short_parameters_do_not_overtake_long_ones(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise late subscribers would keep the former names."""
+    monkeypatch.setattr(parameters_module, "LONG_REPLY_BYTES", 10)
+    may_send = threading.Event()
+    assert lab.output._queries is not None
+    lab.output._queries._long_sender.submit(lambda: may_send.wait(20))
+    for xml in (b"<long enough/>", b"<short/>"):
+        sent = lab.output.publish_parameters("lab", ServerParameters(xml, 3, 4))
+    lab.deliver()
+    assert lab.parameters == []
+    may_send.set()
+    assert sent is not None
+    await sent
+    lab.deliver()
+    assert lab.parameters[-1].xml == "<short/>"
 
 
 @pytest.mark.parametrize(

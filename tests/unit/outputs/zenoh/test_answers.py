@@ -4,6 +4,7 @@ import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from gateway.outputs.contract import Answer, KeyPath
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.queries.payloads import FilePayload
 from tests.losses import amounts
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.queried_gateway import query, query_all, to_reply
@@ -132,6 +134,23 @@ async def test_a_query_with_wildcards_counts_once_for_each_of_its_keys(
         monkeypatch.setattr(queries._admission, "count", counted.append)
         assert len(await query_all(lab.peer, "mocap/lab/*")) == 3
         assert counted == [2]  # besides the query itself
+
+
+async def test_answers_arrive_although_another_key_has_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """An error besides them would have a peer give up what it got."""
+    path = tmp_path / "walk.c3d"
+    path.write_bytes(b"C3D")
+    deleted = Answer(FilePayload(path), "application/octet-stream")
+    path.unlink()
+    async with open_lab() as lab:
+
+        async def answer_all(*_: object) -> dict[KeyPath, Answer]:
+            return {("status",): Answer(b"1", "text/plain"), ("c3d",): deleted}
+
+        monkeypatch.setattr(lab.service, "answer_all", answer_all, raising=False)
+        assert [reply.payload for reply in await query_all(lab.peer, "mocap/lab/*")] == [b"1"]
 
 
 async def test_queries_beyond_the_rate_get_an_error_and_are_counted(

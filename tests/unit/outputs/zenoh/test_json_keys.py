@@ -323,6 +323,16 @@ def test_events_that_come_faster_than_they_can_be_converted_are_counted(lab: Lab
     assert lab.lost["json queue full"] > 100
 
 
+def test_after_a_full_queue_the_next_frame_is_sent(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.subscribe()
+    publisher = lab.publisher()
+    with monkeypatch.context() as full:
+        full.setattr(lab.output._json, "offer", lambda *_: False)
+        publisher.publish(markers(1)[1])
+    assert lab.lost == {"json queue full": 1}
+    assert lab.received_of(publisher, markers(1, 100)[1])["sequence"] == 100
+
+
 def test_a_frame_that_is_too_long_is_counted_and_published_without_json(lab: Lab) -> None:
     lab.subscribe("mocap/**")
     publisher = lab.publisher()

@@ -379,6 +379,16 @@ def test_a_json5_file_passes_whole_and_as_it_stands(tmp_path: Path) -> None:
     assert value_of(config, "connect/retry") == value_of(zenoh.Config.from_file(str(path)), "connect/retry")
 
 
+def test_a_file_that_has_changed_is_another_configuration(tmp_path: Path) -> None:
+    """Otherwise a reload would keep the session of the former file."""
+    path = tmp_path / "zenoh.json5"
+    path.write_text("{ mode: 'peer' }")
+    output = ZenohOutput(ZenohSettings(config=path))
+    assert output.is_configured_like(ZenohOutput(ZenohSettings(config=path, tool_poses=True)))
+    path.write_text("{ mode: 'client' }")
+    assert not output.is_configured_like(ZenohOutput(output.settings))
+
+
 @pytest.mark.parametrize("shared_memory", [{}, {"shared_memory": {"enabled": True}}])
 def test_inline_keys_pass_whole_over_what_the_gateway_prefers(shared_memory: dict[str, Any]) -> None:
     retry = {"period_max_ms": 9000}
