@@ -216,6 +216,17 @@ async def test_a_change_of_the_statistics_is_not_announced_but_answered() -> Non
     general = answer.parsed.parameters.general
     assert general is not None
     assert general.frames_sent == 2
+    source.server.replies["SendParameters"] = b"\n" + parameters_xml("mm", frames_sent=3)
+    await source.queries.parameters.refresh()
+    assert source.announced == [(MM, 1)]
+
+
+async def test_another_frame_of_poses_is_another_version_of_the_parameters() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    await source.queries.parameters.begin_version()
+    assert source.announced == [(MM, 1), (MM, 2)]
+    assert (await source.parameters()).version == 2
 
 
 async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_them() -> None:

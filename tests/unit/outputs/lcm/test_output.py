@@ -5,6 +5,7 @@ import pytest
 from gateway.messages.topics import Topic
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
+from tests.unit.outputs.lcm.peer import Lab
 
 
 @pytest.fixture
@@ -39,6 +40,14 @@ def test_a_channel_given_up_is_free_and_one_in_use_is_not(output: LcmOutput) -> 
     first.close()
     another = output.publisher(probe("a"))
     assert (again.channel, another.channel) == ("MOCAP_LAB_6D_A", "MOCAP_LAB_6D_A_3")
+
+
+async def test_without_queries_nothing_is_received() -> None:
+    lab = Lab(queries=False)
+    lab.open()
+    assert lab.output._queries is not None
+    assert not lab.output._queries._receiver._thread.is_alive()
+    await lab.output.stop_queries()
 
 
 def test_labels_that_look_alike_or_are_too_long_for_lcm_get_channels_of_their_own(output: LcmOutput) -> None:
