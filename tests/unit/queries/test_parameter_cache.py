@@ -370,6 +370,17 @@ async def test_a_section_that_is_missing_is_requested_once() -> None:
     await source.parameters(fresh=True)
     assert (await source.parameters("6d")).xml == tools
     assert source.server.commands[1:] == ["SendParameters", "SendParameters 6D"]  # asked again after a change
+    tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D><Tools/></The_6D>")
+    assert (await source.parameters("6d", fresh=True)).xml == tools
+
+
+async def test_a_section_that_a_lost_connection_prevents_is_an_error_and_asked_for_again() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters 6D"] = ClosedError("closed")
+    assert (await source.parameters_error("6d")).code == "no-connection"
+    tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
+    assert (await source.parameters("6d")).xml == tools
 
 
 async def test_a_section_of_malformed_xml_is_requested() -> None:
@@ -434,6 +445,10 @@ async def test_a_refusal_is_cached_for_the_connection_unless_the_query_is_fresh(
     assert source.server.commands == ["SendParameters"]
     assert (await source.parameters_error(fresh=True)).code == "refused"
     assert source.server.commands == ["SendParameters", *requests]
+    with pytest.raises(ReplyTimeoutError):
+        await source.connect(SILENCE)
+    source.server.replies["SendParameters"] = MM
+    assert (await source.parameters()).xml == MM
 
 
 async def test_xml_is_parsed_in_a_thread_and_only_its_statistics_if_nothing_else_has_changed(

@@ -58,3 +58,21 @@ def test_labels_that_look_alike_or_are_too_long_for_lcm_get_channels_of_their_ow
     ]
     long = [output.publisher(probe(100 * "x" + end)).channel for end in "abcdefghijkl"]
     assert (len(set(long)), {len(channel) for channel in long}) == (12, {63})
+
+
+@pytest.mark.parametrize(
+    ("url", "queries_url"),
+    [
+        ("udpm://239.255.76.68:7000?ttl=1", "udpm://239.255.76.68:7001?ttl=1"),
+        ("udpm://", "udpm://239.255.76.67:7668"),
+        ("udpm://239.255.76.68:65535", "udpm://239.255.76.68:65534"),
+        ("mpudpm://239.255.76.68:7000", "mpudpm://239.255.76.68:7000"),
+        ("tcpq://127.0.0.1:7700", "tcpq://127.0.0.1:7700"),
+    ],
+)
+def test_requests_have_a_multicast_port_of_their_own(
+    url: str, queries_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert LcmSettings(url=url).effective_queries_url == queries_url
+    monkeypatch.setenv("LCM_DEFAULT_URL", url)
+    assert LcmSettings().effective_queries_url == queries_url
