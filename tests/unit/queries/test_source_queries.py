@@ -116,10 +116,11 @@ async def test_a_server_that_does_not_know_a_component_is_asked_for_the_whole_fr
 async def test_the_json_of_a_message_has_the_number_on_the_output_of_the_query() -> None:
     source = FakeSource()
     source.status.state = StreamState.STREAMING
+    answers = {}
     for output in ("lcm", "zenoh"):
         source.newest_messages[ComponentType.MARKERS] = with_sequence(markers_message(1), len(output))
-        answer = await source.queries.answer(Question("component", "3d", as_json=True), output)
-        assert json.loads(answer.payload)["sequence"] == len(output)
+        answers[output] = await source.queries.answer(Question("component", "3d", as_json=True), output)
+    assert [json.loads(answers[output].payload)["sequence"] for output in answers] == [3, 5]
 
 
 @pytest.mark.parametrize(
