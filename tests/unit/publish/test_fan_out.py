@@ -344,6 +344,18 @@ def test_every_output_shows_whether_frames_arrive_until_the_fan_out_is_closed() 
         assert (output.declared, output.announced, output.streaming) == ([], [], [True, False] * 2)
 
 
+def test_every_output_shows_once_whether_a_measurement_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple[str, bool | None]] = []
+    monkeypatch.setattr(ToyOutput, "show_measurement", lambda self, _, runs: shown.append((self.name, runs)))
+    one, new = ToyOutput("one"), ToyOutput("new")
+    fan_out = FanOut("lab", [one])
+    for is_running in (True, True):
+        fan_out.show_measurement(is_running)
+    fan_out.set_outputs([one, new])
+    fan_out.show_measurement(None)
+    assert shown == [("one", True), ("new", True), ("one", None), ("new", None)]
+
+
 def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
     outputs = [ToyOutput(name, "Probe", has_tool_poses=True) for name in ("stays", "side", "side")]
     stays, before, after = outputs

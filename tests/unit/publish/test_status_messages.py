@@ -52,7 +52,7 @@ def test_the_status_message_has_every_field_and_counts_sorted_by_name() -> None:
     stream.losses.lost("frame rejected", "too short")
     lost = Losses(logging.getLogger("tests"), "lab to zenoh")
     lost.lost("no router", "start it", messages=7, frames=2)
-    quiet = StreamStatus("analog", session=1, parameters_version=5, tries=2)
+    quiet = StreamStatus("analog", session=4, parameters_version=5, tries=2)
     zenoh = OutputStatus("zenoh", Counter({"6d": 8, "event": 1, "3d": 9}), lost.report())
     lcm = OutputStatus("lcm")
     before = now_utime()
@@ -75,7 +75,7 @@ def test_the_status_message_has_every_field_and_counts_sorted_by_name() -> None:
         "utime": message["utime"],
         "capture_utime": message["utime"],
         "sequence": 17,
-        "session": 3,
+        "session": 4,
         "parameters_version": 5,
         "source": "lab",
         "server": "192.0.2.20:3020",
@@ -113,7 +113,7 @@ def test_the_status_message_has_every_field_and_counts_sorted_by_name() -> None:
                 "last_error_utime": 1_700_000_000_000_000,
             },
             fields_of(rtc3d.stream_status_t())
-            | {"components": "analog", "state": "waiting to reconnect", "tries": 2, "session": 1},
+            | {"components": "analog", "state": "waiting to reconnect", "tries": 2, "session": 4},
         ],
         "num_outputs": 2,
         "outputs": [

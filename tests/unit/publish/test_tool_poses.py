@@ -212,6 +212,23 @@ def test_with_an_unknown_unit_no_pose_is_published_which_is_logged_and_counted(
     ]
 
 
+def test_poses_that_are_lost_leave_a_gap_and_too_many_tools_do_not() -> None:
+    output, fan_out = lab("Probe", wanted=("Probe",))
+    for unit in ("mm", "furlong", "m"):
+        fan_out.set_parameters(in_metres(parameters("Probe", unit=unit)))
+        publish_tools(fan_out, 1)
+    fan_out.skip(tools_frame(*[IN_VIEW] * 257), STAMP, ALL)
+    publish_tools(fan_out, 1)
+    assert [pose.sequence for pose in output.poses("Probe")] == [0, 2, 3]
+
+
+def test_poses_of_a_server_without_parameters_are_in_the_configured_frame() -> None:
+    output, fan_out = lab(wanted=("tool 1",))
+    fan_out.begin(in_metres(Parameters(markers=Parameters3D(unit="m"))))
+    publish_tools(fan_out, 1)
+    assert output.poses("tool 1")[0].position_m == (100.0, 200.0, 300.0)
+
+
 def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCaptureFixture) -> None:
     lab("Probe", unit="furlong", has_tool_poses=False)
     assert not caplog.records

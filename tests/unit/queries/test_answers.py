@@ -4,10 +4,13 @@ import math
 import pytest
 import rtc3d
 
+from gateway.errors import QueryError
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import TEXT
 from gateway.queries.answers import message_answer, parameters_json, schema_answer
+from gateway.queries.frame_answer import frame_answer
 from gateway.queries.payloads import NewestJson
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
@@ -66,6 +69,15 @@ def test_parameters_as_json_have_the_sections_of_the_server() -> None:
     )
     assert parameters_json(parameters, "force") == b'{"plates":[]}'
     assert parameters_json(parameters, "3d") is None
+
+
+def test_the_frame_is_answered_with_the_names_that_outputs_have_given() -> None:
+    frame = CoordinateFrame("lab")
+    names = {"ros2": {"6d": {"Probe 1": "probe_1"}}}
+    answer = frame_answer(frame, names | {"lsl": {}}, {})
+    assert json.loads(answer.payload) == json.loads(json.dumps({**frame.facts, "names": names}))
+    with pytest.raises(QueryError, match="frame takes no options"):
+        frame_answer(frame, names, {"format": "json"})
 
 
 def test_missing_numbers_of_a_plate_are_null_in_json() -> None:

@@ -216,6 +216,17 @@ async def test_a_change_of_the_statistics_is_not_announced_but_answered() -> Non
     general = answer.parsed.parameters.general
     assert general is not None
     assert general.frames_sent == 2
+    source.server.replies["SendParameters"] = b"\n" + parameters_xml("mm", frames_sent=3)
+    await source.queries.parameters.refresh()
+    assert source.announced == [(MM, 1)]
+
+
+async def test_another_frame_of_poses_is_another_version_of_the_parameters() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    await source.queries.parameters.begin_version()
+    assert source.announced == [(MM, 1), (MM, 2)]
+    assert (await source.parameters()).version == 2
 
 
 async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_them() -> None:
@@ -359,6 +370,17 @@ async def test_a_section_that_is_missing_is_requested_once() -> None:
     await source.parameters(fresh=True)
     assert (await source.parameters("6d")).xml == tools
     assert source.server.commands[1:] == ["SendParameters", "SendParameters 6D"]  # asked again after a change
+    tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D><Tools/></The_6D>")
+    assert (await source.parameters("6d", fresh=True)).xml == tools
+
+
+async def test_a_section_that_a_lost_connection_prevents_is_an_error_and_asked_for_again() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters 6D"] = ClosedError("closed")
+    assert (await source.parameters_error("6d")).code == "no-connection"
+    tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
+    assert (await source.parameters("6d")).xml == tools
 
 
 async def test_a_section_of_malformed_xml_is_requested() -> None:
@@ -423,6 +445,10 @@ async def test_a_refusal_is_cached_for_the_connection_unless_the_query_is_fresh(
     assert source.server.commands == ["SendParameters"]
     assert (await source.parameters_error(fresh=True)).code == "refused"
     assert source.server.commands == ["SendParameters", *requests]
+    with pytest.raises(ReplyTimeoutError):
+        await source.connect(SILENCE)
+    source.server.replies["SendParameters"] = MM
+    assert (await source.parameters()).xml == MM
 
 
 async def test_xml_is_parsed_in_a_thread_and_only_its_statistics_if_nothing_else_has_changed(

@@ -104,6 +104,7 @@ async def test_start_and_stop_are_carried_out_in_their_order() -> None:
     source.server.unanswered.popleft().set_result(OK)
     source.server.replies = {STOP: OK}
     await asyncio.gather(start, stop)
+    assert (source.server.commands, source.recorded) == ([START, STOP], [])
     assert source.followed == [(True, "walk-1"), (False, "")]
 
 

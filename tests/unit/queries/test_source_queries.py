@@ -3,10 +3,12 @@ import json
 
 import pytest
 
-from gateway.errors import QueryError
-from gateway.messages.encode import encode_message
+from gateway.errors import QueryError, ServerError
+from gateway.messages.encode import encode_message, with_sequence
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import JSON, XML
+from gateway.queries.questions import Question
+from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet, PacketType
@@ -102,6 +104,23 @@ async def test_simultaneous_queries_for_the_current_frame_share_one_request() ->
     answers = await asyncio.gather(*(source.answer("component", "3d", as_json=True) for _ in range(5)))
     assert {json.loads(answer.payload)["frame_number"] for answer in answers} == {7}
     assert source.server.commands == ["SendCurrentFrame 3D"]
+
+
+async def test_a_server_that_does_not_know_a_component_is_asked_for_the_whole_frame() -> None:
+    source = FakeSource()
+    source.server.replies["SendCurrentFrame 3D"] = ServerError("err-what?")
+    source.server.replies[str(SendCurrentFrame())] = Packet(PacketType.DATA, FRAME)
+    assert (await source.answer("component", "3d")).encoding == "application/x-lcm;rtc3d.markers_t"
+
+
+async def test_the_json_of_a_message_has_the_number_on_the_output_of_the_query() -> None:
+    source = FakeSource()
+    source.status.state = StreamState.STREAMING
+    answers = {}
+    for output in ("lcm", "zenoh"):
+        source.newest_messages[ComponentType.MARKERS] = with_sequence(markers_message(1), len(output))
+        answers[output] = await source.queries.answer(Question("component", "3d", as_json=True), output)
+    assert [json.loads(answers[output].payload)["sequence"] for output in answers] == [3, 5]
 
 
 @pytest.mark.parametrize(

@@ -106,8 +106,10 @@ async def test_only_the_newest_commands_are_remembered(lab: Lab) -> None:
     for number in range(MAX_REMEMBERED + 1):
         lab.send(command_request(number, *START), kind="COMMAND")
         await lab.receive(number + 1)
-    for number in (MAX_REMEMBERED, 0):
-        lab.send(command_request(number, *START), kind="COMMAND")
+    lab.send(command_request(MAX_REMEMBERED, *START), kind="COMMAND")
+    await lab.receive(MAX_REMEMBERED + 2)
+    assert len(lab.service.commands_received) == MAX_REMEMBERED + 1
+    lab.send(command_request(0, *START), kind="COMMAND")
     await lab.receive(MAX_REMEMBERED + 3)
     assert len(lab.service.commands_received) == MAX_REMEMBERED + 2
 

@@ -80,6 +80,12 @@ def test_a_pipe_of_another_thread_is_not_kept_open() -> None:
         os.close(reading)
 
 
+def test_a_tcp_socket_of_another_thread_still_waits() -> None:
+    with socket.socket() as tcp:
+        connection._set_up_to_send(tcp.fileno())
+        assert os.get_blocking(tcp.fileno())
+
+
 # Datagrams --------------------------------------------------------------------------------
 
 
@@ -135,6 +141,7 @@ def test_what_is_no_message_counts_as_an_empty_one(
         for datagram in (b"", b"nothing of LCM", b"LC02\0\0\0\0NAME"):
             sender.sendto(datagram, GROUP)
             datagrams.handle_timeout(5000)
+        sender.sendto(b"LC02\0\0\0\0NAME\0", ("127.0.0.1", GROUP[1]))  # not to the group
     datagrams.handle_timeout(1)  # nothing arrives
     assert received == 3 * [(NO_CHANNEL, b"")]
 

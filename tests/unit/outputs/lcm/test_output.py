@@ -2,6 +2,7 @@
 
 import logging
 from collections import Counter
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,6 +11,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.losses import amounts
+from tests.unit.outputs.lcm.peer import Lab
 
 
 @pytest.fixture
@@ -46,6 +48,14 @@ def test_a_channel_given_up_is_free_and_one_in_use_is_not(output: LcmOutput) -> 
     assert (again.channel, another.channel) == ("MOCAP_LAB_6D_A", "MOCAP_LAB_6D_A_3")
 
 
+async def test_without_queries_nothing_is_received() -> None:
+    lab = Lab(queries=False)
+    lab.open()
+    assert lab.output._queries is not None
+    assert not lab.output._queries._receiver._thread.is_alive()
+    await lab.output.stop_queries()
+
+
 def test_labels_that_look_alike_or_are_too_long_for_lcm_get_channels_of_their_own(output: LcmOutput) -> None:
     labels = ["Left foot", "left-foot", "LEFT FOOT", "膝", "足"]
     channels = [output.publisher(probe(label)).channel for label in labels]
@@ -62,6 +72,24 @@ def test_what_a_peer_has_not_taken_at_the_end_is_counted(
     """160 of 300 messages were lost over tcpq, and all counted as sent."""
     losses = Losses(logging.getLogger(__name__), "lab to lcm")
     output.count_losses("lab", losses)
-    monkeypatch.setattr(output._sender, "close", lambda: Counter(lab=160))
+    monkeypatch.setattr(output, "_sender", Mock(close=lambda: Counter(lab=160)))
     output.close()
     assert amounts(losses.report()) == {"closed": (160, 0)}
+
+
+@pytest.mark.parametrize(
+    ("url", "queries_url"),
+    [
+        ("udpm://239.255.76.68:7000?ttl=1", "udpm://239.255.76.68:7001?ttl=1"),
+        ("udpm://", "udpm://239.255.76.67:7668"),
+        ("udpm://239.255.76.68:65535", "udpm://239.255.76.68:65534"),
+        ("mpudpm://239.255.76.68:7000", "mpudpm://239.255.76.68:7000"),
+        ("tcpq://127.0.0.1:7700", "tcpq://127.0.0.1:7700"),
+    ],
+)
+def test_requests_have_a_multicast_port_of_their_own(
+    url: str, queries_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert LcmSettings(url=url).effective_queries_url == queries_url
+    monkeypatch.setenv("LCM_DEFAULT_URL", url)
+    assert LcmSettings().effective_queries_url == queries_url

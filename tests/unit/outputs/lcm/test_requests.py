@@ -1,6 +1,7 @@
 """Requests on LCM in memory: what peers receive, and what the output counts."""
 
 import asyncio
+import threading
 
 import pytest
 
@@ -11,6 +12,8 @@ from gateway.outputs.lcm.queries import LcmQueries
 from gateway.outputs.lcm.requests import MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.token_bucket import TokenBucket
+from tests.settable_clock import Clock
 from tests.unit.outputs.lcm.peer import XML, Lab, request, with_settings
 from tests.waiting import wait_until_async
 
@@ -85,6 +88,33 @@ async def test_requests_beyond_the_rate_get_an_error_and_are_counted(lab: Lab) -
     assert lab.output.query_results == {"lab": {"ok": 8 - len(refused), "rate": len(refused)}}
 
 
+@with_settings(max_queries_per_source_per_s=1.0)
+async def test_a_flood_of_requests_is_not_a_flood_of_errors(lab: Lab) -> None:
+    assert lab.output._queries is not None
+    queries, is_sent = lab.output._queries, threading.Event()
+    queries._requests._admission._refusals = TokenBucket(2.0, monotonic=Clock())
+    for number in range(8):
+        lab.send(request(number))
+    queries._long_sender.offer(is_sent.set)
+    await wait_until_async(is_sent.is_set)
+    lab.deliver()
+    assert [reply.error_code for reply in lab.replies].count("rate") == 2
+
+
+async def test_a_long_reply_is_sent_by_a_thread(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would keep the frames of all sources waiting."""
+    monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
+    assert lab.output._queries is not None
+    may_send = threading.Event()
+    lab.output._queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
+    lab.send(request(1))
+    await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
+    lab.deliver()
+    assert lab.replies == []
+    may_send.set()
+    await lab.receive()
+
+
 @with_settings(max_reply_bytes_per_s=1024)
 async def test_replies_beyond_the_bytes_of_a_second_are_errors(lab: Lab) -> None:
     lab.service.reply = ServerParameters(b"x" * 4000, 3, 4)
@@ -104,6 +134,8 @@ async def test_malformed_requests_and_those_beyond_the_limits_are_counted_by_sou
     for data in (b"", request(5)[:-1], bytes(8) + request(6)[8:]):
         lab.send(data)
     assert (lab.lost("lab"), lab.lost("hall")) == ({"malformed request": (5, 0)}, {})
+    assert lab.output._queries is not None
+    assert lab.output._queries._requests._admission.num_pending == 0
 
 
 async def test_after_the_end_of_queries_no_request_is_answered() -> None:

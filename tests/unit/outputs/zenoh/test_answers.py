@@ -14,9 +14,11 @@ from gateway.outputs.contract import Answer, KeyPath
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.token_bucket import TokenBucket
 from tests.losses import amounts
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.queried_gateway import query, query_all, to_reply
+from tests.settable_clock import Clock
 from tests.waiting import wait_until_async
 
 
@@ -149,6 +151,15 @@ async def test_queries_beyond_the_rate_get_an_error_and_are_counted(
         [warning] = [record.message for record in caplog.records if "refused" in record.message]
         assert "10 queries a second like this one" in warning
         assert "raise zenoh.max_queries_per_key_per_s" in warning
+
+
+async def test_a_flood_of_queries_is_not_a_flood_of_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with open_lab(max_queries_per_key_per_s=10.0) as lab:
+        queries = lab.output._queries
+        assert queries is not None
+        monkeypatch.setattr(queries._admission, "_monotonic", lambda: 1000.0)  # all within a moment
+        monkeypatch.setattr(queries._admission, "_refusals", TokenBucket(2.0, monotonic=Clock()))
+        assert await lab.codes("mocap/lab/status", 30) == {"ok": 10, "rate": 2}
 
 
 async def test_replies_beyond_the_bytes_of_a_second_are_errors() -> None:

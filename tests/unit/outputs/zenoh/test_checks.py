@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from gateway.findings import Finding, Result
-from gateway.outputs.zenoh.checks import check_zenoh
+from gateway.outputs.zenoh.checks import check_zenoh, leaves_host
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 
@@ -154,3 +154,23 @@ def test_an_address_where_nobody_listens_passes() -> None:
             link_passing("0 routers and 0 peers"),
             no_gateway("lab"),
         )
+
+
+LOCAL, REMOTE = "tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447"
+
+
+@pytest.mark.parametrize(
+    ("changes", "leaves"),
+    [
+        ({}, False),
+        ({"scouting": {"multicast": {"enabled": True}}}, True),
+        ({"connect": {"endpoints": [LOCAL, REMOTE]}}, True),
+        ({"listen": {"endpoints": [REMOTE]}}, True),
+        ({"listen": {"endpoints": [REMOTE]}, "mode": "client"}, False),
+    ],
+)
+def test_messages_leave_this_computer_by_any_remote_endpoint_or_by_scouting(
+    changes: dict[str, Any], leaves: bool
+) -> None:
+    config = with_endpoints(connect=[LOCAL], listen=[LOCAL]) | changes
+    assert leaves_host(ZenohSettings(config=config)) is leaves

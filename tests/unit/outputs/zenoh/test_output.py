@@ -401,6 +401,11 @@ def test_inline_keys_pass_whole_over_what_the_gateway_prefers(shared_memory: dic
     assert value_of(config, "transport/shared_memory/enabled") is bool(shared_memory)
 
 
+def test_a_command_runs_although_the_gateway_cannot_be_reached() -> None:
+    config = command_config({"mode": "peer", "connect": {"exit_on_failure": True}})
+    assert value_of(config, "connect/exit_on_failure") is False
+
+
 def test_a_configured_id_is_replaced_by_another_valid_one_for_commands() -> None:
     given = {"mode": "peer", "id": "abc1"}
     ids = {json.loads(command_config(given).get_json("id")) for _ in range(100)}  # raises if one is invalid
