@@ -61,7 +61,7 @@ def test_a_complete_take(tmp_path: Path) -> None:
     assert source.take_name == "take"
     assert (source.sessions, source.server_restarts, source.gateway_restarts) == (1, 0, 0)
     assert (found.num_messages, found.min_items, found.max_items, found.rate_hz) == (201, 2, 2, 100.0)
-    assert source.announced_hz("3d") == 100.0
+    assert (source.announced_hz("3d"), source.announced_hz("6d")) == (100.0, None)
     assert found.visibility == {"a": 1.0, "b": 51 / 201}
     assert [change.text for change in source.parameters_changes] == ["first: 3d"]
 
@@ -118,12 +118,22 @@ def test_versions_that_start_again_with_the_gateway_keep_their_own_labels(tmp_pa
     assert source.components["3d"].visibility == {"a": 1, "b": 1}
 
 
+def test_each_of_many_versions_keeps_its_labels(tmp_path: Path) -> None:
+    """The memory is bounded; a day of changes is no reason to forget what came before."""
+    messages = [
+        each for v in range(40) for each in (parameters(labelled(f"{v}"), v), markers(1, v, version=v))
+    ]
+    assert markers_of(tmp_path, messages).visibility == {f"{v}": 1 for v in range(40)}
+
+
 def test_events_are_counted_by_id_with_their_labels(tmp_path: Path) -> None:
     events = [(7, 0, -1, -1, -1), (16, 0, -1, -1, -1), (7, 0, -1, -1, -1)]
     definition = Parameters(events=ParametersEvents((EventDefinition("0x10", "jump"),)))
     source = lab(tmp_path, [parameters(definition), frame(ComponentType.EVENT, events)])
     assert source.components["event"].event_counts == {7: 2, 16: 1}
     assert source.event_labels == {16: "jump"}
+    many = lab(tmp_path, [frame(ComponentType.EVENT, [(number, 0, -1, -1, -1) for number in range(1005)])])
+    assert (len(many.components["event"].event_counts), many.components["event"].other_events) == (1000, 5)
 
 
 def test_what_the_gateway_lost_during_the_take_is_counted_from_its_beginning(tmp_path: Path) -> None:
