@@ -178,16 +178,6 @@ def test_limits_of_time_sources_and_components(tmp_path: Path) -> None:
         open_take(path, components=["3D"])
 
 
-def test_frames_without_items_can_be_left_out(tmp_path: Path) -> None:
-    """A measurement that begins with empty frames has its values and labels all the same."""
-    found = markers_in(lab(tmp_path, [markers(0, 0), markers(2, 1), markers(0, 2), markers(2, 3)]))
-    filled = found.without_empty_frames()
-    assert filled.sequence.tolist() == [1, 3]
-    assert filled.items["y"].tolist() == [[1, 1], [3, 3]]
-    empty = markers_in(lab(tmp_path, [markers(0, 0)]))
-    assert len(empty.without_empty_frames()) == 1
-
-
 def test_messages_whose_size_contradicts_their_count_are_counted(tmp_path: Path) -> None:
     channel, message = markers(2, 1)
     malformed = [(channel, data) for data in (message[:-1], message + b"x", message[:20])]

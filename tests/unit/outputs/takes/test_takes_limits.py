@@ -13,6 +13,7 @@ from gateway.outputs.takes.output import TakesOutput
 from gateway.takes.reader import log_paths
 from tests.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
 from tests.settable_clock import Clock
+from tests.takes import markers, write_take
 
 MIB = 1024 * 1024
 
@@ -124,6 +125,15 @@ async def test_a_reload_is_applied_if_anything_has_changed(tmp_path: Path) -> No
             other = TakesOutput(settings_in(tmp_path, tool_poses=has_tool_poses))
             assert lab.output.take_over(other) is is_change
             assert lab.output.has_tool_poses is has_tool_poses
+
+
+async def test_the_segments_of_a_killed_gateway_are_listed_after_the_start(tmp_path: Path) -> None:
+    """Nobody would find them in a hidden folder, and the next segments would be mixed with them."""
+    (tmp_path / ROLLING / "lab").mkdir(parents=True)
+    segment = write_take(tmp_path / ROLLING / "lab" / "x-000001.lcmlog", [markers(1)])
+    async with still_lab(tmp_path, keep_last_s=60) as lab:
+        assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [False]
+        assert not segment.exists()
 
 
 async def test_a_take_can_start_before_the_folder_was_checked(tmp_path: Path) -> None:
