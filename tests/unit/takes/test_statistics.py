@@ -51,7 +51,7 @@ def test_a_complete_take(tmp_path: Path) -> None:
     messages = [description(), parameters(labelled("a", "b"))]
     for number in range(201):
         second = (1, NAN, 3, 999) if number % 4 else (1, 2, 3, 0)
-        messages.append(frame(ComponentType.MARKERS, [(1, 2, 3, 0.5), second], number))
+        messages.append(frame(ComponentType.MARKERS, [(1, 2, 3, NAN), second], number))
     statistics = take_statistics(write_take(tmp_path / "take.lcmlog", messages))
     source = statistics.sources["lab"]
     found = source.components["3d"]
@@ -61,9 +61,17 @@ def test_a_complete_take(tmp_path: Path) -> None:
     assert source.take_name == "take"
     assert (source.sessions, source.server_restarts, source.gateway_restarts) == (1, 0, 0)
     assert (found.num_messages, found.min_items, found.max_items, found.rate_hz) == (201, 2, 2, 100.0)
-    assert source.announced_hz("3d") == 100.0
+    assert (source.announced_hz("3d"), source.announced_hz("6d")) == (100.0, None)
     assert found.visibility == {"a": 1.0, "b": 51 / 201}
     assert [change.text for change in source.parameters_changes] == ["first: 3d"]
+
+
+def test_the_rate_is_that_of_frames_that_follow_each_other(tmp_path: Path) -> None:
+    """With a pause, a loss or a lost connection in it, a server would seem to be slower than it is."""
+    messages = [markers(1, 0), markers(1, 1), markers(1, 2, timestamp_us=1_010_001)]
+    messages += [markers(1, 4, timestamp_us=1_510_001), markers(1, 5, timestamp_us=2_010_001, session=2)]
+    assert markers_of(tmp_path, messages).rate_hz == 100.0
+    assert markers_of(tmp_path, [markers(1, number, timestamp_us=0) for number in range(3)]).rate_hz == 100.0
 
 
 def test_damaged_numbers_are_neither_gaps_nor_restarts(tmp_path: Path) -> None:
@@ -110,12 +118,22 @@ def test_versions_that_start_again_with_the_gateway_keep_their_own_labels(tmp_pa
     assert source.components["3d"].visibility == {"a": 1, "b": 1}
 
 
+def test_each_of_many_versions_keeps_its_labels(tmp_path: Path) -> None:
+    """The memory is bounded; a day of changes is no reason to forget what came before."""
+    messages = [
+        each for v in range(40) for each in (parameters(labelled(f"{v}"), v), markers(1, v, version=v))
+    ]
+    assert markers_of(tmp_path, messages).visibility == {f"{v}": 1 for v in range(40)}
+
+
 def test_events_are_counted_by_id_with_their_labels(tmp_path: Path) -> None:
     events = [(7, 0, -1, -1, -1), (16, 0, -1, -1, -1), (7, 0, -1, -1, -1)]
     definition = Parameters(events=ParametersEvents((EventDefinition("0x10", "jump"),)))
     source = lab(tmp_path, [parameters(definition), frame(ComponentType.EVENT, events)])
     assert source.components["event"].event_counts == {7: 2, 16: 1}
     assert source.event_labels == {16: "jump"}
+    many = lab(tmp_path, [frame(ComponentType.EVENT, [(number, 0, -1, -1, -1) for number in range(1005)])])
+    assert (len(many.components["event"].event_counts), many.components["event"].other_events) == (1000, 5)
 
 
 def test_what_the_gateway_lost_during_the_take_is_counted_from_its_beginning(tmp_path: Path) -> None:
@@ -132,7 +150,11 @@ def test_steps_of_the_clock_are_found_and_pauses_of_the_network_are_not(tmp_path
             return START_UTIME + 13_000_000 + number
         return time_us - 3_600_000_000 if number >= 2500 else time_us
 
-    messages = [markers(1, number, utime=utime(number)) for number in range(4000)]
+    messages = [
+        frame(component, [], number, utime=utime(number))
+        for number in range(4000)
+        for component in (ComponentType.MARKERS, ComponentType.TOOLS)
+    ]
     steps = lab(tmp_path, messages).clock_steps
     assert [(step.step_us, step.utime) for step in steps.steps] == [(-3_600_000_000, utime(2500))]
 
@@ -155,6 +177,24 @@ def test_a_status_of_an_earlier_version_is_counted_and_leaves_the_rest(tmp_path:
     statistics = take_statistics(write_take(tmp_path / "earlier.lcmlog", messages))
     assert statistics.unknown == {"MOCAP_LAB_STATUS": 1}
     assert statistics.sources["lab"].components["3d"].num_messages == 2
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        [],
+        [("MOCAP_LAB_3D", markers(1, 1)[1][:-1]), markers(1, 1)],
+        [("MOCAP_LAB_STATUS", status(0, 0)[1][:-1]), markers(1, 1)],
+    ],
+)
+def test_a_gap_or_a_message_that_cannot_be_read_makes_a_take_incomplete(
+    tmp_path: Path, lost: list[Message]
+) -> None:
+    """Whoever analyses a take must be able to rely on this answer."""
+    path = write_take(tmp_path / "take.lcmlog", [markers(1, 0), *lost, markers(1, 2)])
+    statistics = take_statistics(path)
+    assert not statistics.is_complete
+    assert statistics.seconds == 0.02
 
 
 # Gaps in sequence numbers, and steps of the clock, in arrays of any division --------------------

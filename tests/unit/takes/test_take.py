@@ -92,6 +92,10 @@ def test_each_component_has_its_values_labels_unit_and_rate(tmp_path: Path) -> N
     assert found.sequence.tolist() == found.frame_number.tolist() == [0, 1, 2]
     assert found.timestamp_us.tolist() == [0, 10_000, 20_000]
     assert found.measured_rate_hz == 100.0
+    paused = [markers(1, number, timestamp_us=(0, 10_000, 20_000, 900_000)[number]) for number in range(4)]
+    without_times = [markers(1, number, timestamp_us=0) for number in range(3)]
+    rates = [markers_in(lab(tmp_path, each)).measured_rate_hz for each in (paused, without_times)]
+    assert rates == [100.0, 100.0]
     assert (tools.labels, tools.unit) == (("hand",), "m")
     assert tools.positions[0].tolist() == [[4, 5, 6]]
     assert tools.quaternions[0].tolist() == [[1, 0, 0, 0]]
@@ -102,6 +106,7 @@ def test_each_component_has_its_values_labels_unit_and_rate(tmp_path: Path) -> N
     assert events.items["id"].tolist() == [16, 9]
     assert events.event_labels == ("jump", "")
     assert events.sequence.tolist() == [3, 3]
+    assert [run.items["id"].tolist() for run in source.runs("event")] == [[16, 9]]
 
 
 def test_columns_are_the_union_of_labels_and_absent_values_are_nan(tmp_path: Path) -> None:
@@ -140,6 +145,8 @@ def test_runs_end_where_the_server_or_the_gateway_starts_again(tmp_path: Path) -
     runs = [run.sequence.tolist() for run in source.runs("3d")]
     assert runs == [[0, 1], [2, 3], [4, 6, 5, 7, 8, 9, 10], [11], [2]]
     assert source.runs("6d") == []
+    wrapped = [markers(1, number, frame_number=(2**31 - 1, -(2**31))[number]) for number in range(2)]
+    assert len(lab(tmp_path, wrapped).runs("3d")) == 1
 
 
 def test_versions_that_start_again_with_the_gateway_keep_their_own_labels(tmp_path: Path) -> None:
@@ -147,6 +154,15 @@ def test_versions_that_start_again_with_the_gateway_keep_their_own_labels(tmp_pa
     messages = [parameters(labelled("a"), 1), markers(1, 0), again, markers(1, 2)]
     found = markers_in(lab(tmp_path, messages))
     assert [run.labels for run in found.runs()] == [("a",), ("b",)]
+    assert [found.parameters_of(row) for row in range(2)] == [labelled("a"), labelled("b")]
+
+
+def test_parameters_that_cannot_be_read_are_counted_and_describe_nothing(tmp_path: Path) -> None:
+    """The labels of other parameters would be wrong; the same ones may come with a new version."""
+    again = [parameters(labelled("a"), 1), parameters(labelled("a"), 2), markers(1, 0, version=2)]
+    source = lab(tmp_path, [*again, parameters(b"<broken", 3), markers(1, 1, version=3)])
+    assert [run.labels for run in source.runs("3d")] == [("a",), ("marker 1",)]
+    assert source.malformed == {"parameters": 1}
 
 
 def test_limits_of_time_sources_and_components(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from gateway.losses import Losses
 from gateway.messages.decode import decode
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters
+from gateway.outputs.takes import disk as disk_module
 from gateway.outputs.takes import disk_calls
 from gateway.outputs.takes.disk import RETRY_S, Disk
 from gateway.outputs.takes.folder import ROLLING
@@ -364,6 +365,19 @@ def test_many_messages_are_written_in_pieces(number: int, sizes: list[int]) -> N
     sink.write(sent)
     assert sink.log.sizes == sizes
     assert sink.log.content == sent
+
+
+def test_a_problem_of_the_disk_and_its_end_are_logged_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without the second line, a reader of the log takes the problem for a present one."""
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(disk_module, "HOLD_S", 0.0)
+    disk = Disk()
+    for call in (disk.succeeded, *[lambda: disk.failed(Path("/takes"), FULL)] * 3, *[disk.succeeded] * 2):
+        call()
+    assert ["cannot be written" in each for each in caplog.messages] == [True, False]
+    assert "takes are written again" in caplog.messages[1]
 
 
 def test_a_new_file_begins_with_the_parameters_that_were_written_last() -> None:

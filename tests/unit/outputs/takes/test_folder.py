@@ -17,6 +17,7 @@ from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
 from gateway.takes.event_log import encode_event
 from tests.recording_output import NoThread, settings_in
 from tests.settable_clock import Clock
+from tests.unit.outputs.takes.test_segments import no_links
 
 NOW_S = 1_700_000_000.0
 DAY_S = 86_400.0
@@ -178,13 +179,15 @@ def test_the_files_of_a_saved_take_are_read_as_one(takes: TakesFolder, offset: i
     assert piece == ("fall", len(content), offset, content[offset : offset + MAX_PIECE_BYTES])
 
 
-def test_a_c3d_file_gets_the_next_free_number(takes: TakesFolder) -> None:
-    """No recording of the server replaces another one."""
+def test_a_c3d_file_gets_the_next_free_number(takes: TakesFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No recording of the server replaces another one; without links, it is copied."""
     take = stored(takes.directory / "lab/walk.lcmlog", 1).with_suffix("")
     file = stored(takes.directory / "spool.c3d", b"c3d")
     names = [add_c3d(take, file).name for _ in range(3)]
     assert names == ["walk.c3d", "walk (2).c3d", "walk (3).c3d"]
     assert (takes.directory / "lab/walk (3).c3d").samefile(file)
+    monkeypatch.setattr(os, "link", no_links)
+    assert add_c3d(take, file).read_bytes() == b"c3d"
 
 
 def test_a_further_c3d_file_is_not_that_of_another_take(takes: TakesFolder) -> None:
@@ -313,7 +316,11 @@ def test_a_lock_that_somebody_deletes_is_taken_again(tmp_path: Path) -> None:
     for path in tmp_path.iterdir():
         path.unlink()
     assert folder.open() == ""
-    assert "another gateway records" in other.open()
+    for _ in range(3):
+        assert "another gateway records" in other.open()
+    lock = str(tmp_path / ".rtc3d-gateway.lock")
+    open_files = [os.path.realpath(each) for each in Path("/proc/self/fd").iterdir()]
+    assert open_files.count(lock) == 1  # a gateway that waits for days must not run out of descriptors
     folder.close()
     assert other.open() == ""
     other.close()

@@ -114,6 +114,15 @@ async def test_a_stopped_take_is_not_started_again_before_the_next_measurement(m
     assert measured.running
 
 
+async def test_a_source_that_is_added_again_begins_anew(measured: Followed) -> None:
+    """The measurement of the former source had its take; that of the new one has none yet."""
+    measured.show(True)
+    measured.lab.output.withdraw("lab")
+    measured.lab.output.announce("lab")
+    measured.show(True)
+    assert measured.running
+
+
 async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.LogCaptureFixture) -> None:
     """What a peer has started, only a peer stops."""
     caplog.set_level(logging.INFO)

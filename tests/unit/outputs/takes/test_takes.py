@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import socket
 from collections.abc import Coroutine
 from concurrent.futures import Future
 from pathlib import Path
@@ -63,7 +64,7 @@ async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_
     assert [event.channel for event in found] == [f"MOCAP_LAB_{end}" for end in ends]
     take, new, _, changed, _ = (decode(event.message) for event in found)
     assert (take.name, take.source, take.channels) == ("walk", "lab", "MOCAP_LAB")
-    assert take.server == "lab:3020"
+    assert (take.server, take.host) == ("lab:3020", socket.gethostname())
     assert (new.xml, new.parameters_version) == ("<new/>", 5)
     assert (changed.xml, changed.sequence) == ("<changed/>", 2)
     times = [event.utime for event in found]

@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 
 from gateway.outputs.takes.disk_calls import Host
-from gateway.outputs.takes.folder import ROLLING
+from gateway.outputs.takes.folder import ROLLING, TakesFolder
+from gateway.outputs.takes.output import TakesOutput
 from gateway.takes.reader import log_paths
 from tests.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
 from tests.settable_clock import Clock
+from tests.takes import markers, write_take
 
 MIB = 1024 * 1024
 
@@ -104,6 +106,9 @@ async def test_a_reload_keeps_segments_that_fit(
         base = settings_in(tmp_path / "takes", keep_last_s=60)
         lab.takes.change(type(base).model_validate(base.model_dump() | changes))
         await lab.takes.written()
+        other = TakesFolder(tmp_path / "takes")
+        assert (other.open() == "") is ("directory" in changes)  # nobody else may use a folder that is in use
+        other.close()
         assert (await lab.takes.list("lab")).kept_s == kept_s
         assert all(not path.exists() for path in before) is (kept_s == 0.0)
         lab.publish("event")
@@ -111,6 +116,24 @@ async def test_a_reload_keeps_segments_that_fit(
         folders = [tmp_path / "takes" / ROLLING / "lab", tmp_path / "other" / ROLLING / "lab"]
         num_segments = sum(len(log_paths(folder)) for folder in folders if folder.exists())
         assert (num_segments > 0) is (changes.get("keep_last_s") != 0.0)
+
+
+async def test_a_reload_is_applied_if_anything_has_changed(tmp_path: Path) -> None:
+    """The log says whether a reload did anything; the poses are asked for by this output."""
+    async with still_lab(tmp_path) as lab:
+        for has_tool_poses, is_change in ((False, False), (True, True), (True, False), (False, True)):
+            other = TakesOutput(settings_in(tmp_path, tool_poses=has_tool_poses))
+            assert lab.output.take_over(other) is is_change
+            assert lab.output.has_tool_poses is has_tool_poses
+
+
+async def test_the_segments_of_a_killed_gateway_are_listed_after_the_start(tmp_path: Path) -> None:
+    """Nobody would find them in a hidden folder, and the next segments would be mixed with them."""
+    (tmp_path / ROLLING / "lab").mkdir(parents=True)
+    segment = write_take(tmp_path / ROLLING / "lab" / "x-000001.lcmlog", [markers(1)])
+    async with still_lab(tmp_path, keep_last_s=60) as lab:
+        assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [False]
+        assert not segment.exists()
 
 
 async def test_a_take_can_start_before_the_folder_was_checked(tmp_path: Path) -> None:
