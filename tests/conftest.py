@@ -9,11 +9,12 @@ import itertools
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 import uvloop
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling, Scheduling
 
 from gateway.log import HOLD_S
 from tests.needs import need
@@ -27,6 +28,8 @@ settings.register_profile("gateway", deadline=None, derandomize=True, database=N
 settings.load_profile("gateway")
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
+
+_INSTALLATION: Final = ("tests/systemd/", "tests/packaging/test_wheel.py")
 
 _NEEDS: Final = {
     "netns": (
@@ -55,6 +58,20 @@ _NEEDS: Final = {
 
 def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
     return {"uvloop": uvloop.new_event_loop}
+
+
+class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
+    """Runs the tests of the installation in one worker: each would boot a machine of its own.
+
+    pytest-xdist's own groups have no effect with pytest 9.2.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "installation" if nodeid.startswith(_INSTALLATION) else nodeid
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:
+    return _Scheduler(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -23,9 +23,12 @@ _WARNING_METHODS: Final = {"failed", "add_limitation", "file_lost", *_LOSS_METHO
 _LOGGED_CLASSES: Final = {
     *("LinkError", "ConnectError", "ReplyTimeoutError", "SilenceError", "ClosedError"),
     *("RequestError", "DefectError", "StreamPlan", "RateDifference"),
-    *("PacketError", "OutputError", "OutputHealth", "SpoolError"),
+    *("PacketError", "OutputError", "OutputHealth", "SpoolError", "SessionTexts"),
 }
 """Classes whose texts are logged as WARNING or ERROR."""
+
+_KEYWORDS: Final = {"limitation", "not_open", "cannot_open", "no_router"}
+"""The keywords of calls whose values are logged."""
 
 _PRINTING_PACKAGES: Final = {"cli", "demo", "doctor"}
 """Commands that print their errors instead of logging them."""
@@ -47,7 +50,7 @@ def message_patterns(package: Path) -> dict[str, str]:
             for call in _logging_calls(scope):
                 arguments = [
                     *_arguments(call),
-                    *(keyword.value for keyword in call.keywords if keyword.arg == "limitation"),
+                    *(keyword.value for keyword in call.keywords if keyword.arg in _KEYWORDS),
                 ]
                 texts = chain.from_iterable(
                     _texts(node, scope, module, list(modules.values())) for node in arguments

@@ -23,7 +23,7 @@ from tests.fresh_clones import (
 )
 
 # The compiled modules take a minute on a busy machine; one worker builds them.
-pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600), pytest.mark.xdist_group("installation")]
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
 
 _PATH = "/usr/local/bin:/usr/bin:/bin"
 

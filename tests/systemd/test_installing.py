@@ -10,13 +10,11 @@ from tests.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service
 from tests.systemd.page import commands, exposure
 
-# One worker: each would boot a machine, or build the wheels, of its own.
 pytestmark = [
     pytest.mark.systemd,
     pytest.mark.wheelhouse,
     pytest.mark.netns,
     pytest.mark.timeout(600),
-    pytest.mark.xdist_group("installation"),
 ]
 
 PROGRAM = "/usr/local/bin/rtc3d-gateway"

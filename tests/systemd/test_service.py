@@ -16,12 +16,10 @@ from tests.servers import Client, ScriptedServer, ok, packet
 from tests.systemd.machine import CONFIG, UNIT, Service
 from tests.waiting import wait_until_async
 
-# One worker: each would boot a machine, or build the wheels, of its own.
 pytestmark = [
     pytest.mark.systemd,
     pytest.mark.wheelhouse,
     pytest.mark.netns,
-    pytest.mark.xdist_group("installation"),
 ]
 
 STATE = "/var/lib/rtc3d-gateway"

@@ -41,7 +41,8 @@ def router_session(endpoint: str, declare: Callable[[zenoh.Session], None]) -> S
     texts = SessionTexts(
         "ros2",
         not_open=f"the Zenoh session to {endpoint} is not open yet; if there is no router, {REMEDY}",
-        cannot_open=f"no Zenoh router at {endpoint}: {{reason}}; {REMEDY}",
+        cannot_open=f"no Zenoh router at {endpoint}",
+        remedy=REMEDY,
         no_router=f"the Zenoh router at {endpoint} is not connected any more; {REMEDY}",
         opened=f"connected to the router at {endpoint}",
     )

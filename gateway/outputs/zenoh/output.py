@@ -21,7 +21,8 @@ _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and 
 _TEXTS: Final = SessionTexts(
     "zenoh",
     not_open=f"the Zenoh session is not open yet; {_REMEDY}",
-    cannot_open=f"the Zenoh session does not open: {{reason}}; {_REMEDY}",
+    cannot_open="the Zenoh session does not open",
+    remedy=_REMEDY,
     no_router="no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints",
     opened="the session is open",
 )

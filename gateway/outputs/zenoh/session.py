@@ -36,7 +36,8 @@ class SessionTexts(NamedTuple):
     """The name of the output."""
     not_open: str
     cannot_open: str
-    """With {reason}."""
+    """Followed by Zenoh's reason and the remedy."""
+    remedy: str
     no_router: str
     """The session is a client, and its router is gone."""
     opened: str
@@ -93,7 +94,8 @@ class SessionHolder:
             try:
                 self._open()
             except zenoh.ZError as error:
-                self._problem = self._texts.cannot_open.format(reason=zenoh_reason(error))
+                texts = self._texts
+                self._problem = f"{texts.cannot_open}: {zenoh_reason(error)}; {texts.remedy}"
                 self._failures.failed(self._problem)
             except Exception as defect:  # noqa: BLE001 - the next try may succeed
                 self._problem = defect_text(defect)

@@ -12,7 +12,7 @@ from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from tests.networks import zenoh_keys
 
-TEXTS = SessionTexts("zenoh", "not open yet", "cannot open: {reason}", "no router there", "it is open")
+TEXTS = SessionTexts("zenoh", "not open yet", "cannot open", "correct it", "no router there", "it is open")
 
 
 def event(*, is_open: bool) -> Mock:
@@ -68,7 +68,7 @@ def test_the_session_is_opened_as_soon_as_there_is_a_router(
     lab.before_open = lambda: problems.append(lab.holder.health.problem)
     lab.open()
     assert lab.waits_s == [1.0] * 3
-    assert problems == ["not open yet", *["cannot open: refused"] * 3]
+    assert problems == ["not open yet", *["cannot open: refused; correct it"] * 3]
     assert lab.declared == [lab.session]
     assert (lab.listen.call_args.args[0].indirect, lab.listen.call_args.kwargs) == (False, {"history": True})
     assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
@@ -137,7 +137,7 @@ def test_what_cannot_be_declared_is_declared_on_the_next_session(
     problems: list[str] = []
     lab.before_open = lambda: problems.append(lab.holder.health.problem)
     lab.open()
-    assert problems[1] == "cannot open: no key"
+    assert problems[1] == "cannot open: no key; correct it"
     assert "can't start new thread" in problems[2]
     assert (lab.closed, lab.declared) == ([lab.session] * 2, [lab.session])
     assert (lab.holder.session, lab.waits_s) == (lab.session, [1.0] * 2)
