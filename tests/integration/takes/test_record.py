@@ -200,7 +200,8 @@ def test_a_recording_has_what_was_published_with_parameters_first(tmp_path: Path
                 version = parameters.parameters_version
                 known[version] = "New" in parameters.xml
             case rtc3d.markers_t() as markers:
-                assert markers.parameters_version in known
+                # A frame that was on its way when the parameters at the beginning were fetched may be older.
+                assert markers.parameters_version in known or markers.parameters_version < min(known)
     assert {*known.values()} == {True, False}
 
 
