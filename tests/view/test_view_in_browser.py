@@ -148,9 +148,10 @@ def test_a_source_that_is_lost_and_comes_back(tmp_path: Path, new_page: NewPage)
     port = free_port()
     with ExitStack() as stack:
         gateway = stack.enter_context(gateway_process(tmp_path, port, hub="router"))
-        view = stack.enter_context(view_process("--connect", gateway.endpoint))
-        picture = Picture(new_page(viewport=WINDOW), view.address)
         with simulator("--port", str(port)):
+            gateway.wait_for_frames(1)
+            view = stack.enter_context(view_process("--connect", gateway.endpoint))
+            picture = Picture(new_page(viewport=WINDOW), view.address)
             picture.wait_for_banner("live lab")
             picture.wait_for_number_of_points(MARKERS, 10)
         picture.wait_for_banner("lab: no data for")
