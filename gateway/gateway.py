@@ -3,7 +3,6 @@
 import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from functools import partial
 from typing import Any, Final
 
 from gateway.c3d_files.spool import Spool
@@ -11,7 +10,7 @@ from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.log import defect_text, log_fields
 from gateway.messages.host_time import host_clock
 from gateway.outputs.contract import Answer, Command, Output, ServerFile, ServerParameters
-from gateway.outputs.guard import guarded, health, log_defect
+from gateway.outputs.guard import GuardedOutput
 from gateway.outputs.registry import build_outputs
 from gateway.publish.fan_out import FanOut
 from gateway.publish.routes import OPENING_S
@@ -38,7 +37,7 @@ class Gateway:
 
     def __init__(self, settings: Settings, outputs: Sequence[Output] | None = None) -> None:
         self.settings = settings
-        self._given_outputs = outputs
+        self._given_outputs = None if outputs is None else [GuardedOutput(output) for output in outputs]
         self._outputs = self._build_outputs(settings)
         self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
@@ -59,11 +58,11 @@ class Gateway:
         return list(self._sources.values())
 
     @property
-    def outputs(self) -> Sequence[Output]:
-        """The outputs."""
+    def outputs(self) -> Sequence[GuardedOutput]:
+        """The outputs. None of them raises anything."""
         return self._outputs
 
-    def _serve_queries(self, output: Output) -> None:
+    def _serve_queries(self, output: GuardedOutput) -> None:
         output.serve_queries(SourceQueryService(self._queries, self._commands, output.name))
 
     def _queries(self) -> Mapping[str, SourceQueries]:
@@ -74,9 +73,7 @@ class Gateway:
         return {FRAME_KEY: self._answer_frame, **of_outputs}
 
     async def _answer_frame(self, source: str, options: Mapping[str, str]) -> Answer:
-        names: dict[str, Mapping[str, Mapping[str, str]]] = {}
-        for output in self._outputs:
-            names[output.name] = guarded(output, partial(output.topic_names, source), {})
+        names = {output.name: output.topic_names(source) for output in self._outputs}
         return frame_answer(self._sources[source].queries.frame, names, options)
 
     # Running.
@@ -84,7 +81,7 @@ class Gateway:
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then send Bye to every server and close the outputs."""
         for output in self._outputs:
-            guarded(output, output.start, None)
+            output.start()
         self._spool.reader.submit(self._spool.delete_abandoned)
         try:
             await self._wait_for_outputs(stop)
@@ -106,7 +103,7 @@ class Gateway:
     async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
         deadline_s = asyncio.get_running_loop().time() + OPENING_S
         while asyncio.get_running_loop().time() < deadline_s and not stop.is_set():
-            if all(health(output).connected for output in self._outputs):
+            if all(output.health().connected for output in self._outputs):
                 return
             await asyncio.sleep(_OPENING_POLL_S)
 
@@ -144,7 +141,7 @@ class Gateway:
             await asyncio.sleep(_STATUS_PERIOD_S)
             host_clock.read()  # detects a step of the wall clock even if no frame arrives
             for output in self._outputs:
-                guarded(output, output.maintain, None)
+                output.maintain()
             for source in self._sources.values():
                 try:
                     source.publish_status()
@@ -160,7 +157,9 @@ class Gateway:
         again, unless only its frame of poses differs; an output that differs is closed and opened again,
         unless it can take over the new settings.
         Session and sequence numbers continue.
-        Raises ConfigError, and changes nothing, if an output refuses its configuration.
+        Raises ConfigError, and changes nothing, if an output refuses its configuration. A defect in one
+        source does not keep the others from changing; it is raised at the end. Each step compares what runs
+        with what is wanted, so the next reload repeats what has failed.
         """
         async with self._reload_lock:
             built = self._build_outputs(settings)
@@ -169,25 +168,23 @@ class Gateway:
                 for output in built
             ]
             kept = [pair for pair in zip(outputs, built, strict=True) if pair[0] is not pair[1]]
-            before, self.settings = self.settings, settings
-            changes = [
-                *(f"output {output.name} changed" for output, like in kept if output.take_over(like)),
-                *await self._change_outputs(outputs),
-                *await self._change_sources(settings.sources),
-            ]
-            if settings.spool != before.spool:
+            changes = [f"output {output.name} changed" for output, like in kept if output.take_over(like)]
+            changes += await self._change_outputs(outputs)
+            if settings.spool != self.settings.spool:
                 self._spool = _new_spool(settings.spool)
                 for source in self._sources.values():
                     source.spool = self._spool
                 changes.append("spool changed")
+            changes += await self._change_sources(settings.sources)
+            self.settings = settings
             return changes
 
-    def _build_outputs(self, settings: Settings) -> list[Output]:
+    def _build_outputs(self, settings: Settings) -> list[GuardedOutput]:
         if self._given_outputs is not None:
             return list(self._given_outputs)
-        return build_outputs(settings)
+        return [GuardedOutput(output) for output in build_outputs(settings)]
 
-    async def _change_outputs(self, outputs: list[Output]) -> list[str]:
+    async def _change_outputs(self, outputs: list[GuardedOutput]) -> list[str]:
         removed = [output for output in self._outputs if output not in outputs]
         new = [output for output in outputs if output not in self._outputs]
         self._outputs = outputs
@@ -197,11 +194,11 @@ class Gateway:
             source.fan_out.set_outputs(outputs)
         await _close_all(removed)  # first, because a new output may use the same address
         for output in new:
-            guarded(output, output.start, None)
+            output.start()
             self._publish_known_parameters(output)
         return _changes("output", [output.name for output in removed], [output.name for output in new])
 
-    def _publish_known_parameters(self, output: Output) -> None:
+    def _publish_known_parameters(self, output: GuardedOutput) -> None:
         for name, source in self._sources.items():
             parameters = source.known_parameters
             if parameters.version:
@@ -211,30 +208,37 @@ class Gateway:
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}
-        other_frames = [
-            source
+        changes = []
+        for name, source in self._sources.items():
+            like = wanted.get(name)
+            if like is not None and like != source.settings and like.connects_like(source.settings):
+                changes.append(f"coordinate frame of source {name} changed")
+                try:
+                    await source.change_frame(like)
+                except Exception as defect:  # noqa: BLE001 - the source starts again with the new frame
+                    source.fail(defect)
+        stopped = [
+            name
             for name, source in self._sources.items()
-            if name in wanted
-            and wanted[name] != source.settings
-            and wanted[name].connects_like(source.settings)
+            if source.settings != wanted.get(name) or name not in self._source_tasks
         ]
-        for source in other_frames:
-            await source.change_frame(wanted[source.name])
-        stopped = {
-            name: source for name, source in self._sources.items() if source.settings != wanted.get(name)
-        }
-        new = [settings for name, settings in wanted.items() if name in stopped or name not in self._sources]
+        new = [name for name in wanted if name in stopped or name not in self._sources]
         await asyncio.gather(*map(self._stop_source, stopped))
-        stopped = {name: self._sources[name] for name in stopped}  # a defect may have replaced one
-        for name in stopped.keys() - wanted.keys():
-            self._removed_sources[name] = source = self._sources.pop(name)
-            source.fan_out.close()
-        for settings in new:
-            self._add_source(settings, stopped.get(settings.name) or self._reopened(settings.name))
-            self._start_source(settings.name)
-        self._sources = {name: self._sources[name] for name in wanted}
-        changes = [f"coordinate frame of source {source.name} changed" for source in other_frames]
-        return changes + _changes("source", stopped, [settings.name for settings in new])
+        for name in stopped:
+            if name not in wanted:
+                self._removed_sources[name] = source = self._sources.pop(name)
+                source.fan_out.close()
+        defects = []
+        for name in new:
+            try:
+                self._add_source(wanted[name], self._sources.get(name) or self._reopened(name))
+                self._start_source(name)
+            except Exception as defect:  # noqa: BLE001 - raised below
+                defects.append(defect)
+        self._sources = {name: self._sources[name] for name in wanted if name in self._sources}
+        if defects:
+            raise defects[0]
+        return changes + _changes("source", stopped, new)
 
     def _reopened(self, name: str) -> Source | None:
         """Return the source of this name that was removed earlier, with the present outputs; None if new."""
@@ -244,9 +248,10 @@ class Gateway:
         return source
 
     async def _stop_source(self, name: str) -> None:
-        task = self._source_tasks.pop(name)
-        task.cancel()
-        await asyncio.wait([task])
+        task = self._source_tasks.pop(name, None)
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
 
     def _add_source(self, settings: SourceSettings, before: Source | None = None) -> None:
         fan_out = before.fan_out if before else FanOut(settings.name, self._outputs)
@@ -262,26 +267,20 @@ class Gateway:
 
     async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Publish on every output; wait until they have sent it, but at most _SENDING_TIMEOUT_S."""
-        sent = [
-            guarded(output, partial(output.publish_parameters, source, parameters), None)
-            for output in self._outputs
-        ]
+        sent = [output.publish_parameters(source, parameters) for output in self._outputs]
         pending = [future for future in sent if future is not None]
         if pending:
             await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
 
     def _announce_file(self, source: str, file: ServerFile) -> None:
         for output in self._outputs:
-            guarded(output, partial(output.announce_file, source, file), None)
+            output.announce_file(source, file)
 
     async def _follow_recording(self, source: str, start: bool, name: str) -> dict[str, Any]:
         """Let the outputs follow a recording; return what they add to the reply to the peer."""
         reply: dict[str, Any] = {}
         for output in self._outputs:
-            try:
-                reply |= await output.follow_recording(source, start=start, name=name)
-            except Exception as defect:  # noqa: BLE001 - the recording starts nevertheless
-                log_defect(output, defect)
+            reply |= await output.follow_recording(source, start=start, name=name)
         return reply
 
 
@@ -301,17 +300,17 @@ async def _run_to_defect(source: Source) -> BaseException:
     return end or RuntimeError("the source has ended, and nobody stopped it")
 
 
-async def _close_all(outputs: Sequence[Output]) -> None:
+async def _close_all(outputs: Sequence[GuardedOutput]) -> None:
     closing = (asyncio.create_task(_close(output), name=f"output {output.name}") for output in outputs)
     await asyncio.gather(*closing)
 
 
-async def _close(output: Output) -> None:
-    for close in (output.stop_queries, partial(WorkerThread(f"close {output.name}").run, output.close)):
-        try:
-            await close()
-        except Exception as defect:  # noqa: BLE001 - the others are closed nevertheless
-            log_defect(output, defect)
+async def _close(output: GuardedOutput) -> None:
+    await output.stop_queries()
+    try:
+        await WorkerThread(f"close {output.name}").run(output.close)
+    except RuntimeError:  # there is no room for another thread
+        output.close()
 
 
 def _changes(what: str, removed: Collection[str], new: Collection[str]) -> list[str]:

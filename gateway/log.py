@@ -2,11 +2,11 @@
 
 import logging
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from time import monotonic
-from typing import Final
+from typing import Final, TypeVar
 
 from gateway.safe_text import safe_text
 
@@ -23,6 +23,8 @@ If the next failure comes soon after that, the wait doubles, up to MAX_HOLD_S.
 MAX_REPEATS: Final = 5
 _REPEATS_WINDOW_S: Final = 300.0
 """How often EventLog and FailureLog log one kind of message in this time; further ones are DEBUG."""
+
+_Result = TypeVar("_Result")
 
 _fields: ContextVar[Mapping[str, str]] = ContextVar("log fields")
 
@@ -179,6 +181,14 @@ class DefectLog:
     def count(self) -> int:
         """How often there was a defect, repeats included."""
         return sum(self._counts.values())
+
+    def attempt(self, call: Callable[[], _Result], otherwise: _Result) -> _Result:
+        """Return what ``call`` returns. If it raises, log that and return ``otherwise``: others continue."""
+        try:
+            return call()
+        except Exception as defect:  # noqa: BLE001 - see above
+            self.log(defect)
+            return otherwise
 
     def log(self, defect: BaseException, text: str = "") -> None:
         """Log a defect. One that is raised at the same place as an earlier one is a repeat."""

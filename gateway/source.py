@@ -16,7 +16,6 @@ from gateway.messages.limits import encode_within_limits
 from gateway.messages.stamp import NOT_PUBLISHED
 from gateway.outputs.contract import Answer, ServerFile, ServerParameters
 from gateway.outputs.encodings import C3D
-from gateway.outputs.guard import health, query_results
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.known_parameters import ServerAnswer
@@ -217,7 +216,7 @@ class Source:
             sequence=self.sequence,
             streams=self.rated_statuses,
             outputs=[
-                (status, health(output), query_results(output, self.name))
+                (status, output.health(), (output.query_results or {}).get(self.name, {}))
                 for output, status in self.fan_out.outputs
             ],
             stall_timeout_s=self.settings.stall_timeout_s,

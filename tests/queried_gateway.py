@@ -165,7 +165,7 @@ async def run_gateway(
 
 def output_queries(gateway: Gateway) -> Any:
     """Return the object that answers queries on the only output of the gateway."""
-    queries = [queries for output in gateway.outputs if (queries := getattr(output, "_queries", None))]
+    queries = [queries for output in gateway.outputs if (queries := getattr(output.output, "_queries", None))]
     [only] = queries
     return only
 
@@ -173,7 +173,7 @@ def output_queries(gateway: Gateway) -> Any:
 async def wait_until_cached(gateway: Gateway) -> None:
     """Wait until the gateway answers queries, knows the parameters, and its handshakes are done."""
     await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
-    for output in gateway.outputs:
+    for output in (each.output for each in gateway.outputs):
         if isinstance(output, LcmOutput) and output._queries is not None and output.settings.queries:
             # The thread that receives requests opens it once it receives; a request before that is lost.
             replies = output._queries._reply_sender

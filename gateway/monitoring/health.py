@@ -10,7 +10,6 @@ from gateway.gateway import Gateway
 from gateway.losses import Loss, last_minute_text, route_name
 from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
-from gateway.outputs.guard import health as output_health
 from gateway.safe_text import safe_json
 from gateway.source import Source
 from gateway.stream.running_clock import running_clock
@@ -85,7 +84,7 @@ def _stream_health(
 
 
 def _output_health(output: Output) -> dict[str, str]:
-    health = output_health(output)
+    health = output.health()
     return {"output": output.name, "problem": "" if health.connected else health.problem}
 
 

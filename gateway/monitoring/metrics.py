@@ -26,7 +26,6 @@ from gateway.losses import Loss
 from gateway.messages.host_time import host_clock
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
-from gateway.outputs.guard import health as output_health
 from gateway.outputs.status import WHOLE_FRAME, OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import StreamState
@@ -263,7 +262,7 @@ class GatewayCollector(Collector):
             "output_connected",
             "1 if the output can send, else 0.",
             ("output",),
-            [((output.name,), output_health(output).connected) for output in self._gateway.outputs],
+            [((output.name,), output.health().connected) for output in self._gateway.outputs],
         )
         yield _counter(
             "queries",

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from gateway.config.settings import SourceSettings
 from gateway.gateway import Gateway
 from gateway.losses import Loss, last_minute_text
-from gateway.outputs.guard import health as output_health
 from gateway.outputs.status import OutputHealth
 from gateway.stream.status import StreamStatus
 from gateway.stream.status_text import source_text, stream_text, unusable_frames
@@ -13,7 +12,7 @@ from gateway.stream.status_text import source_text, stream_text, unusable_frames
 
 def status_lines(gateway: Gateway) -> list[str]:
     """Return a text for each source, for each output that cannot send, and for what an output loses."""
-    outputs = ((output.name, output_health(output)) for output in gateway.outputs)
+    outputs = ((output.name, output.health()) for output in gateway.outputs)
     losses = (
         (f"{source.name} to {output.name}", status.losses)
         for source in gateway.sources

@@ -45,7 +45,7 @@ class LoopThread:
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
         """Have the loop make ``call``, which holds ``num_bytes``; return False if too many wait.
 
-        A call of any size finds a place in an empty queue. The loop logs what ``call`` raises.
+        A call of any size finds a place in an empty queue. What ``call`` raises is logged once.
         """
         with self._lock:
             is_full = self._num_calls >= MAX_CALLS or self._num_bytes + num_bytes > MAX_BYTES
@@ -104,7 +104,7 @@ class LoopThread:
         with self._lock:
             self._num_calls -= 1
             self._num_bytes -= num_bytes
-        call()
+        self._defects.attempt(call, None)
 
 
 async def _finish(tasks: "set[asyncio.Task[Any]]") -> None:

@@ -1,13 +1,12 @@
 """Publishing one source's frames on every output."""
 
 from collections.abc import Callable, Collection, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Final
 
 from gateway.messages.encode import MESSAGE_TYPES, encode_content, has_lcm_form, lcm_content
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output, ServerParameters
-from gateway.outputs.guard import guarded
 from gateway.outputs.status import OutputStatus
 from gateway.publish.item_counts import ItemCounts
 from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
@@ -245,14 +244,14 @@ class FanOut:
         """Show on every output whether frames of the source arrive."""
         self._is_streaming = is_streaming
         for route in self._routes:
-            guarded(route.output, partial(route.output.show_streaming, self._source, is_streaming), None)
+            route.output.show_streaming(self._source, is_streaming)
 
     def show_measurement(self, is_running: bool | None) -> None:
         """Show on every output whether a measurement runs on the server; None if that is unknown."""
         if is_running is not self._is_measuring:
             self._is_measuring = is_running
             for route in self._routes:
-                guarded(route.output, partial(route.output.show_measurement, self._source, is_running), None)
+                route.output.show_measurement(self._source, is_running)
 
     def check_losses(self) -> None:
         """Log the end of each period in which messages were lost. Called once a second."""
@@ -289,5 +288,4 @@ class FanOut:
         self.set_parameters(parameters)
         for route in self._routes:
             if route.frame_route is not None:
-                publish = partial(route.output.publish_parameters, self._source, parameters)
-                guarded(route.output, publish, None)
+                route.output.publish_parameters(self._source, parameters)

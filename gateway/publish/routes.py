@@ -4,7 +4,6 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Final
 
 import rtc3d
@@ -15,7 +14,6 @@ from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name, message_timest
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output
-from gateway.outputs.guard import guarded
 from gateway.outputs.pacing import Pacer
 from gateway.outputs.status import WHOLE_FRAME, OutputStatus
 from gateway.rtc3d.components import ComponentType
@@ -204,8 +202,8 @@ class FrameRoute:
         self._sent = output_route.sent.setdefault(WHOLE_FRAME, SentCounter())
 
     def prepare(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> bool:
-        """Return whether to publish frames of ``layout``; never raises."""
-        return guarded(self._output_route.output, partial(self.publisher.prepare, layout, wanted), True)
+        """Return whether to publish frames of ``layout``."""
+        return self.publisher.prepare(layout, wanted)
 
     def publish(self, frame: Frame, stamp: Stamp, sequence: int, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""

@@ -13,6 +13,7 @@ import pytest
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.losses import Loss
 from gateway.outputs.contract import ServerFile
+from gateway.outputs.guard import GuardedOutput
 from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
@@ -177,9 +178,9 @@ async def reload(gateway: ServingGateway, ports: dict[str, int], **servers: Simu
     }
     sources = tuple(SourceSettings(name=name, port=each.port, **common) for name, each in servers.items())
     settings = gateway.gateway.settings.model_copy(update={"sources": sources})
-    gateway.gateway._given_outputs = [Rtc3dOutput(Rtc3dSettings(enabled=True, ports=ports))]
+    gateway.gateway._given_outputs = [GuardedOutput(Rtc3dOutput(Rtc3dSettings(enabled=True, ports=ports)))]
     await gateway.gateway.reload(settings)
-    assert gateway.gateway.outputs == [gateway.output]
+    assert [each.output for each in gateway.gateway.outputs] == [gateway.output]
     await until(lambda: gateway.output.health().connected)
 
 

@@ -78,8 +78,8 @@ class Lab:
     def __init__(self, gateway: Gateway) -> None:
         self.gateway = gateway
         [output] = gateway.outputs
-        assert isinstance(output, ExampleOutput)
-        self.output = output
+        assert isinstance(output.output, ExampleOutput)
+        self.output = output.output
         [self.source] = gateway.sources
         self.received: list[tuple[str, bytes]] = []
 

@@ -116,7 +116,7 @@ async def connected(gateway: Gateway) -> None:
 
 
 def example(gateway: Gateway, index: int = 0) -> ExampleOutput:
-    output = gateway.outputs[index]
+    output = gateway.outputs[index].output
     assert isinstance(output, ExampleOutput)
     return output
 
@@ -285,7 +285,7 @@ async def test_given_outputs_stay_at_a_reload(servers: Servers) -> None:
     output = MemoryOutput()
     async with running(settings("lab@first"), [output]) as gateway:
         assert await gateway.reload(settings("lab@second", example="new")) == ["source lab changed"]
-        assert list(gateway.outputs) == [output]
+        assert [each.output for each in gateway.outputs] == [output]
         assert output.is_open
         await connected(gateway)
         assert servers["second"].connection.is_open

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from gateway.config.settings import SourceSettings
 from gateway.log import current_log_fields
 from gateway.publish.fan_out import FanOut
 from gateway.queries.parameter_refresh import ParameterRefresh
@@ -45,6 +46,20 @@ def let_fail(monkeypatch: pytest.MonkeyPatch, owner: type, method: str) -> set[s
         return original(self, *args, **options)
 
     monkeypatch.setattr(owner, method, call)
+    return failing
+
+
+def let_outputs_fail(monkeypatch: pytest.MonkeyPatch, method: str) -> list[str]:
+    """Let a method raise of outputs whose address is in the list that is returned."""
+    failing = ["broken"]
+    original = getattr(RecordingOutput, method)
+
+    def call(self: Any, *args: Any, **options: Any) -> Any:
+        if self.settings.address in failing:
+            raise ZeroDivisionError("by the test")
+        return original.__get__(self) if isinstance(original, property) else original(self, *args, **options)
+
+    monkeypatch.setattr(RecordingOutput, method, property(call) if isinstance(original, property) else call)
     return failing
 
 
@@ -94,25 +109,87 @@ async def test_a_defect_in_one_source_is_logged_once_and_the_source_recovers(
         assert gateway.sources[0].fan_out.frames[ComponentType.MARKERS] > before
 
 
-@pytest.mark.parametrize(
-    "method", ["start", "health", "maintain", "show_streaming", "publish_parameters", "stop_queries", "close"]
-)
+@pytest.mark.parametrize("method", ["health", "maintain", "query_results", "stop_queries", "close"])
 async def test_a_defect_in_one_output_does_not_stop_the_others(
     servers: Servers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
 ) -> None:
-    def fail(*_: Any) -> None:
-        raise ZeroDivisionError("by the test")
-
+    let_outputs_fail(monkeypatch, method)
     async with running(settings(example="broken", other="elsewhere")) as gateway:
-        monkeypatch.setattr(gateway.outputs[0], method, fail)
         await connected(gateway)
         messages = subscribe("elsewhere")
         for _ in range(5):
             servers["lab"].connection.send_frames(1)
             await asyncio.sleep(1)
         assert len(messages) == 5
-    assert len([record for record in caplog.records if record.exc_info]) <= 1
+    assert len([record for record in caplog.records if record.exc_info]) == 1
     assert ("close", "elsewhere") in RecordingOutput.events
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("start", "serve_queries", "publisher", "frame_publisher", "count_losses", "watch_wanted"),
+        *("announce", "withdraw", "show_streaming", "show_measurement", "publish_parameters"),
+    ],
+)
+async def test_a_reload_with_a_defect_in_one_output_is_complete_and_the_next_one_repairs_it(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
+) -> None:
+    wanted = settings("lab", "hall", example="broken", other="elsewhere")
+    async with running(settings("lab", "yard", other="elsewhere")) as gateway:
+        await connected(gateway)
+        servers["yard"].connection.send_frames(1)
+        failing = let_outputs_fail(monkeypatch, method)
+        changes = await gateway.reload(wanted)
+        assert changes == ["output example changed", "source yard removed", "source hall added"]
+        await connected(gateway)
+        elsewhere, repaired = subscribe("elsewhere", source="hall"), subscribe("broken", source="hall")
+        servers["hall"].connection.send_frames(1)
+        await settle()
+        assert len(elsewhere) == 1
+        error = next(record for record in caplog.records if record.exc_info)
+        assert error.getMessage().startswith("example: defect in the gateway: ZeroDivisionError: by the test")
+        assert "reload the gateway" in gateway.outputs[0].health().problem
+        failing.clear()
+        repaired.clear()
+        assert await gateway.reload(wanted) == ["output example changed"]
+        assert gateway.outputs[0].health().connected
+        servers["hall"].connection.send_frames(2)
+        await settle()
+        assert (len(elsewhere), len(repaired)) == (2, 1)
+
+
+async def test_messages_that_a_defect_leaves_without_a_publisher_count_as_lost(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    let_outputs_fail(monkeypatch, "publisher")
+    async with running(settings(example="broken")) as gateway:
+        await connected(gateway)
+        servers["lab"].connection.send_frames(1, 2, 3)
+        [(_, status)] = gateway.sources[0].fan_out.outputs
+        assert [(loss.cause, loss.frames) for loss in status.losses if loss.frames] == [("defect", 3)]
+
+
+async def test_a_reload_with_a_defect_in_one_source_starts_the_others_and_can_be_repeated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Broken(Source):
+        def __init__(self, settings: SourceSettings, *rest: Any) -> None:
+            if settings.name == "hall":
+                raise ZeroDivisionError
+            super().__init__(settings, *rest)
+
+    wanted = settings("lab@other", "hall@other", "yard@other")
+    async with running(settings("lab", "hall", "yard")) as gateway:
+        await connected(gateway)
+        with monkeypatch.context() as patch:
+            patch.setattr("gateway.gateway.Source", Broken)
+            with pytest.raises(ZeroDivisionError):
+                await gateway.reload(wanted)
+        assert [source.settings.host for source in gateway.sources] == ["other", "hall", "other"]
+        assert await gateway.reload(wanted) == ["source hall changed"]
+        await connected(gateway)
+        assert [source.settings.host for source in gateway.sources] == ["other", "other", "other"]
 
 
 async def test_the_tasks_of_a_source_that_end_or_are_cancelled_are_started_again(

@@ -4,7 +4,6 @@ import asyncio
 import errno
 import logging
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Final
 
 from gateway.errors import system_reason
@@ -137,22 +136,17 @@ class FoxgloveOutput(Output):
     def _call(self, call: Callable[[], None]) -> None:
         """Have the thread make a call that must not be left out."""
         if self._thread is None:
-            self._make(call)
-        elif not self._thread.offer(partial(self._make, call)):
-            self._thread.run(self._make_later(call))
+            self._defects.attempt(call, None)
+        elif not self._thread.offer(call):
+            self._thread.run(_make(call))
 
     def _call_in_time(self, call: Callable[[], None], num_bytes: int) -> bool:
         """Have the thread make a call; return False if too many wait already."""
-        return self._thread is not None and self._thread.offer(partial(self._make, call), num_bytes)
+        return self._thread is not None and self._thread.offer(call, num_bytes)
 
-    def _make(self, call: Callable[[], None]) -> None:
-        try:
-            call()
-        except Exception as defect:  # noqa: BLE001 - other sources and frames are served
-            self._defects.log(defect)
 
-    async def _make_later(self, call: Callable[[], None]) -> None:
-        self._make(call)
+async def _make(call: Callable[[], None]) -> None:
+    call()
 
 
 def _bind_problem(error: OSError) -> str:

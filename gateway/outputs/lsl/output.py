@@ -141,15 +141,9 @@ class LslOutput(Output):
 
     def _submit(self, call: Callable[[], None]) -> None:
         """Have the thread that sends make ``call``; log what it raises."""
-        self._thread.submit(functools.partial(self._guarded, call))
+        self._thread.submit(functools.partial(self._defects.attempt, call, None))
 
     # In the thread that sends.
-
-    def _guarded(self, call: Callable[[], None]) -> None:
-        try:
-            call()
-        except Exception as defect:  # noqa: BLE001 - other sources continue
-            self._defects.log(defect)
 
     def _restart(self) -> None:
         self._processes.restart(self._reopen)
@@ -171,7 +165,7 @@ class LslOutput(Output):
             self._will_send = False
         suspended_us = self._suspended.read_us()
         for publisher in list(self._publishers.values()):
-            self._guarded(functools.partial(publisher.send_waiting, suspended_us))
+            self._defects.attempt(functools.partial(publisher.send_waiting, suspended_us), None)
         self._sent_s = time.monotonic()
 
     def _stop(self) -> None:

@@ -2,14 +2,12 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Final
 
 from gateway.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
 from gateway.outputs.event_loop import in_this_loop
-from gateway.outputs.guard import guarded
 from gateway.outputs.loop_thread import LoopThread
 from gateway.outputs.no_topics import IgnoringPublisher
 from gateway.outputs.status import OutputHealth
@@ -42,8 +40,8 @@ class VrpnOutput(Output):
             publisher.name_trackers()
 
     def _offer(self, call: Callable[[], None], num_bytes: int) -> bool:
-        """See LoopThread.offer; a defect in ``call`` is logged."""
-        return self._thread is not None and self._thread.offer(partial(guarded, self, call, None), num_bytes)
+        """See LoopThread.offer."""
+        return self._thread is not None and self._thread.offer(call, num_bytes)
 
     def publisher(self, topic: Topic) -> Publisher:  # noqa: ARG002 - of no topic
         """Return a publisher that does nothing: VRPN has no status and no clock."""

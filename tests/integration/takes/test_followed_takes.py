@@ -27,7 +27,7 @@ async def opened(gateway: Gateway) -> RecordedTakes:
     """Wait until the gateway knows the parameters and records takes; return them."""
     await wait_until_cached(gateway)
     await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
-    [takes] = [output.takes for output in gateway.outputs if isinstance(output, TakesOutput)]
+    [takes] = [output.output.takes for output in gateway.outputs if isinstance(output.output, TakesOutput)]
     return takes
 
 

@@ -58,7 +58,7 @@ async def running(settings: Settings) -> AsyncIterator[Gateway]:
 
 
 def takes_of(gateway: Gateway) -> RecordedTakes:
-    [output] = [output for output in gateway.outputs if isinstance(output, TakesOutput)]
+    [output] = [output.output for output in gateway.outputs if isinstance(output.output, TakesOutput)]
     return output.takes
 
 

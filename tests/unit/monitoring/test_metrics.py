@@ -16,6 +16,7 @@ from gateway.messages.host_time import HostClock, host_clock
 from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
+from gateway.outputs.guard import GuardedOutput
 from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.protocol_state import ProtocolState
@@ -112,8 +113,9 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
     lab.markers.losses.lost("quite unusual", "lost", frames=0)
     errors = (OutputError("stalled", cause="queue full"), ValueError("oops"))
     for (output, _), error in zip(lab.source.fan_out.outputs, errors, strict=True):
-        assert isinstance(output, ToyOutput)
-        output.error = error
+        assert isinstance(output, GuardedOutput)
+        assert isinstance(output.output, ToyOutput)
+        output.output.error = error
     lab.source.fan_out.publish_status(b"message")
     causes = ("unknown component", "skipped while behind", "not sent by the server", "C3D file")
     expected = dict.fromkeys(causes, 0) | {"frame rejected": 2, "quite unusual": 1}

@@ -1,6 +1,7 @@
 """Outputs that take whole frames: what they get, how it is numbered and counted, and how they close."""
 
 from gateway.errors import OutputError
+from gateway.outputs.guard import GuardedOutput
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ComponentType
 from tests.losses import amounts
@@ -85,7 +86,7 @@ def test_an_output_prepares_once_for_each_layout_until_something_changes() -> No
 
 def test_an_output_with_a_defect_in_preparing_gets_the_frames_and_others_are_not_disturbed() -> None:
     broken, healthy = FrameOutput("broken"), FrameOutput("healthy")
-    fan_out = FanOut("lab", [broken, healthy])
+    fan_out = FanOut("lab", [GuardedOutput(broken), healthy])
     broken.error = ZeroDivisionError("division by zero")
     publish_full(fan_out)
     assert len(healthy.frames) == 1
