@@ -22,15 +22,14 @@ _IDLE_S: Final = 0.5
 """A backlog that begins within this time after another one continues its pace, as in a stream of batches."""
 
 _TURN_S: Final = 0.002
-"""How long one call publishes; then other sources have their turn. A chunk that it has begun is finished."""
+"""How long one call publishes, or one frame if that takes longer; then other sources have their turn."""
 
 _RESOLUTION_S: Final = 0.001
 """The event loop's timers have whole milliseconds, so what is due in the next one is published now."""
 
 _MAX_CHUNK: Final = 16
 _MAX_CHUNK_WITHOUT_PACE: Final = 64
-_MAX_CHUNK_COMPONENTS: Final = 320
-"""How many frames, and components, are published between two readings of the clock."""
+"""How many frames are published between two readings of the clock at most."""
 
 
 class Backlog:
@@ -38,8 +37,9 @@ class Backlog:
 
     ``publish`` takes frames and when they arrived, as Ingest.receive does. ``speed`` is the pace as a
     multiple of the stream's own, according to the server's time stamps while they are those of a ``clock``.
-    Without a clock, or if ``speed`` is None, every frame is due at once; a call of ``publish_due`` still
-    takes a limited time. ``read_clocks`` does the same as HostClock.read.
+    Without a clock, or if ``speed`` is None because ``publish`` skips late frames, every frame is due at
+    once; a call of ``publish_due`` still takes a limited time. ``read_clocks`` does the same as
+    HostClock.read.
 
     The session stops reading while frames wait, so the number of frames is limited by the size of one read.
     """
@@ -54,6 +54,8 @@ class Backlog:
         self._publish = publish
         self._clock = clock
         self._speed = speed
+        self._skips_frames = speed is None
+        self._frame_s = 0.0  # how long it took to publish one of the newest frames
         self._read_clocks = read_clocks
         self._frames: list[Frame] = []  # waiting, without those before _next
         self._next = 0
@@ -81,6 +83,16 @@ class Backlog:
         self._next = 0
         self._utime = utime
         self._arrival_us = steady_us
+
+    def is_quick(self, num_frames: int) -> bool:
+        """Return whether so many frames can be published in one turn, judged by the newest ones."""
+        return num_frames * self._frame_s <= _TURN_S
+
+    def publish(self, frames: list[Frame], utime: int, steady_us: int) -> None:
+        """Publish frames at once, because nothing waits."""
+        began_s = self._now_s()
+        self._publish(frames, utime, steady_us)
+        self._frame_s = (self._now_s() - began_s) / len(frames)
 
     def publish_due(self) -> float | None:
         """Publish what is due. Return in how many s to call again, or None if nothing waits any more."""
@@ -112,15 +124,18 @@ class Backlog:
         at = self._next
         speed = self._speed
         has_pace = speed is not None and self._clock.has_clock
-        last = min(len(self._frames), at + (_MAX_CHUNK if has_pace else _MAX_CHUNK_WITHOUT_PACE))
-        num_components = 0
-        while at < last and num_components < _MAX_CHUNK_COMPONENTS:
+        num_frames = _MAX_CHUNK if has_pace else _MAX_CHUNK_WITHOUT_PACE
+        # Frames that take long, such as those of hundreds of tools, are published one by one. If late frames
+        # are skipped, only the last one of a chunk takes any time.
+        while not self._skips_frames and num_frames > 1 and not self.is_quick(num_frames):
+            num_frames //= 2
+        last = min(len(self._frames), at + num_frames)
+        while at < last:
             frame = self._frames[at]
             if speed is not None and has_pace:
                 if self._due_s >= now_s + _RESOLUTION_S:
                     break
                 self._due_s += self._wait_s(frame, speed)
-            num_components += len(frame.layout.fields)
             at += 1
         return at
 
@@ -141,4 +156,4 @@ class Backlog:
             self.clear()
         else:
             self._next = end
-        self._publish(frames, self._utime, self._arrival_us)
+        self.publish(frames, self._utime, self._arrival_us)

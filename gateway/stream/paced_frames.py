@@ -9,7 +9,7 @@ from gateway.stream.backlog import Backlog
 from gateway.stream.running_clock import running_clock
 
 MAX_TOGETHER: Final = 4
-"""Up to this many frames that arrive together are passed on at once. More are a backlog."""
+"""Up to this many frames that arrive together are passed on at once if that is quick. More are a backlog."""
 
 
 class PacedFrames:
@@ -17,18 +17,15 @@ class PacedFrames:
 
     While a backlog waits, it stops reading from the server with ``set_reading``. So the data stays in the
     kernel, and TCP makes the server wait when the kernel's buffer is full: memory is limited, and the other
-    sources get their turn. ``backlog`` passes frames on to ``on_frames``; ``on_defect`` takes what
-    ``on_frames`` raises meanwhile.
+    sources get their turn. ``backlog`` publishes the frames; ``on_defect`` takes what that raises meanwhile.
     """
 
     def __init__(
         self,
-        on_frames: Callable[[list[Frame], int, int], None],
         backlog: Backlog,
         set_reading: Callable[[bool], None],
         on_defect: Callable[[Exception], None],
     ) -> None:
-        self._on_frames = on_frames
         self._backlog = backlog
         self._set_reading = set_reading
         self._on_defect = on_defect
@@ -40,8 +37,9 @@ class PacedFrames:
     def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first; see Ingest.receive."""
         backlog = self._backlog
-        if len(frames) <= MAX_TOGETHER and backlog.is_empty:
-            self._on_frames(frames, utime, steady_us)
+        is_quick = len(frames) == 1 or (len(frames) <= MAX_TOGETHER and backlog.is_quick(len(frames)))
+        if is_quick and backlog.is_empty:
+            backlog.publish(frames, utime, steady_us)
             return
         backlog.add(frames, utime, steady_us)
         if self._timer is None:

@@ -82,7 +82,7 @@ class Session:
         self._status = status
         speed = stream.backlog_speed if stream.backlog == "all" else None
         backlog = Backlog(on_frames, status.clock, speed, read_clocks)
-        self._frames = PacedFrames(on_frames, backlog, self._set_reading, self._fail_by_defect)
+        self._frames = PacedFrames(backlog, self._set_reading, self._fail_by_defect)
         self._reading = Reading(self._process)
         self._files = files
         self._connect = connect

@@ -1,14 +1,15 @@
 """JSON for subscribers that cannot decode LCM's types: KEY/json beside the key of a component or a tool.
 
 A message is converted only while somebody subscribes to its JSON, at most ``zenoh.json_max_rate_hz`` times a
-second for each key, and in a thread of its own, which uses a fifth of a processor at most.
+second for each key, and in a thread of its own, which uses a fifth of a processor at most. The sources share
+this time evenly: the large frames of one do not delay the others.
 """
 
 import functools
 import logging
 import threading
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -37,6 +38,10 @@ _BURST_S: Final = 0.25
 _REST: Final = 4
 """How many times as long as a conversion the thread pauses after it."""
 
+_MAX_WAITING: Final = 1024
+_MAX_WAITING_BYTES: Final = 16 * 1024 * 1024
+"""How many messages of one source wait for their conversion, and their size."""
+
 _UTIME: Final = slice(8, 16)
 _CAPTURE_UTIME: Final = slice(16, 24)
 """Places in a message, behind the fingerprint."""
@@ -52,6 +57,8 @@ class JsonKeys:
         self._parameters: dict[str, ServerParameters] = {}  # by the source's name
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))
         self._lock = threading.Lock()
+        self._waiting: defaultdict[str, _Waiting] = defaultdict(_Waiting)  # by the source's name
+        self._used_s = 0.0  # what the source had used that was served last
         self._thread: SendThread | None = None
         self._closing = threading.Event()
 
@@ -80,19 +87,42 @@ class JsonKeys:
         """Count a message that is not sent as JSON."""
         self._losses[source].lost(cause, text, frames=0)
 
-    def offer(self, convert: Callable[[], None], num_bytes: int) -> bool:
-        """Have the thread make a call, which holds ``num_bytes``; return False if too many wait."""
+    def offer(self, source: str, convert: Callable[[], None], num_bytes: int) -> bool:
+        """Have the thread make a call, which holds ``num_bytes``; return False if too many wait.
+
+        A call of any size finds a place if the source has none waiting.
+        """
         with self._lock:
+            waiting = self._waiting[source]
             if self._closing.is_set():
                 return True  # a message more or less
+            if waiting.calls and (
+                len(waiting.calls) >= _MAX_WAITING or waiting.num_bytes + num_bytes > _MAX_WAITING_BYTES
+            ):
+                return False
+            if not waiting.calls:
+                # What it did not use while nothing waited does not let it use more now.
+                waiting.used_s = max(waiting.used_s, self._used_s)
+            waiting.calls.append((convert, num_bytes))
+            waiting.num_bytes += num_bytes
             if self._thread is None:
                 self._thread = SendThread("zenoh-json")
-        return self._thread.offer(functools.partial(self._convert, convert), num_bytes)
+        self._thread.submit(self._convert_next)
+        return True
 
-    def _convert(self, convert: Callable[[], None]) -> None:
+    def _convert_next(self) -> None:
+        """Make the next call of the source that has used the least time."""
+        with self._lock:
+            all_waiting = [each for each in self._waiting.values() if each.calls]
+            waiting = min(all_waiting, key=lambda each: each.used_s)
+            convert, num_bytes = waiting.calls.popleft()
+            waiting.num_bytes -= num_bytes
+            self._used_s = waiting.used_s
         began_s = time.monotonic()
         convert()
-        self._closing.wait(_REST * (time.monotonic() - began_s))
+        duration_s = time.monotonic() - began_s
+        waiting.used_s += duration_s
+        self._closing.wait(_REST * duration_s)
 
     def close(self) -> None:
         """End the thread."""
@@ -100,6 +130,15 @@ class JsonKeys:
             self._closing.set()
             if self._thread is not None:
                 self._thread.close()
+
+
+class _Waiting:
+    """The conversions of one source that wait, with the bytes that they hold, and the time used so far."""
+
+    def __init__(self) -> None:
+        self.calls: deque[tuple[Callable[[], None], int]] = deque()
+        self.num_bytes = 0
+        self.used_s = 0.0
 
 
 class JsonPace:
@@ -183,7 +222,7 @@ class JsonPublisher:
                 self._newest = None
 
     def _offer(self, convert: Callable[[], None], message: bytes) -> bool:
-        if self._keys.offer(convert, len(message)):
+        if self._keys.offer(self._topic.source, convert, len(message)):
             return True
         self._count_loss(
             "json queue full",

@@ -1,11 +1,14 @@
 """The Zenoh output: one session, its publishers, liveliness tokens and queryables."""
 
 import asyncio
+import logging
 from collections.abc import Mapping
+from functools import partial
 from typing import Final
 
 import zenoh
 
+from gateway.log import DefectLog
 from gateway.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, QueryService, ServerFile, ServerParameters
@@ -16,6 +19,7 @@ from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.worker_thread import WorkerThread
 
 _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
 _TEXTS: Final = SessionTexts(
@@ -26,6 +30,8 @@ _TEXTS: Final = SessionTexts(
     no_router="no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints",
     opened="the session is open",
 )
+
+logger = logging.getLogger(__name__)
 
 
 class ZenohOutput(Output):
@@ -53,6 +59,8 @@ class ZenohOutput(Output):
         self._alive: dict[str, zenoh.LivelinessToken | None] = {}
         self._streaming: dict[str, zenoh.LivelinessToken | None] = {}
         self._queries: ZenohQueries | None = None
+        self._declarer = WorkerThread("zenoh-declare")
+        self._defects = DefectLog(logger, self.name)
 
     @property
     def session(self) -> zenoh.Session | None:
@@ -84,15 +92,31 @@ class ZenohOutput(Output):
         return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
 
     def publisher(self, topic: Topic) -> ZenohPublisher:
-        """Return a new publisher of ``topic``. It can send when the session is open."""
+        """Return a new publisher of ``topic``. It can send when the session is open.
+
+        A server may have hundreds of tools. Their keys are declared in a thread, because each takes 1 ms;
+        until then, they have no subscribers.
+        """
+        is_of_item = len(topic.path) > 1
         key = zenoh_key(self.settings.prefix, topic.source, *topic.path)
         publisher = ZenohPublisher(self._link, key, topic.type_name, self.settings.express, self._forget)
         publisher.json = self._json.publisher(topic, key, publisher.update_wanted)
         with self._lock:
             self._publishers.append(publisher)
-            if self.session is not None:
-                publisher.declare(self.session)
+            session = self.session
+            if session is not None and not is_of_item:
+                publisher.declare(session)
+        if session is not None and is_of_item:
+            declare = partial(self._declare_late, publisher, session)
+            self._declarer.submit(partial(self._defects.attempt, declare, None))
         return publisher
+
+    def _declare_late(self, publisher: ZenohPublisher, session: zenoh.Session) -> None:
+        try:
+            publisher.declare(session)
+        except zenoh.ZError:
+            if self.session is session:  # it has not been closed meanwhile
+                raise
 
     def _forget(self, publisher: ZenohPublisher) -> None:
         with self._lock:

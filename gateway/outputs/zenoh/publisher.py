@@ -72,7 +72,7 @@ class ZenohPublisher:
         self._is_closed = False
 
     def declare(self, session: zenoh.Session) -> None:
-        """Declare the publisher on an open session."""
+        """Declare the publisher on an open session. Any thread may do so."""
         publisher = session.declare_publisher(
             self._key,
             encoding=zenoh.Encoding(LCM).with_schema(self._type_name),
@@ -85,6 +85,8 @@ class ZenohPublisher:
         self._publisher = publisher
         if self.json is not None:
             self.json.declare(session)
+        if self._is_closed:  # by another thread
+            self._undeclare()
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""
@@ -133,6 +135,9 @@ class ZenohPublisher:
         self._is_closed = True
         self.wanted = False
         self._forget(self)
+        self._undeclare()
+
+    def _undeclare(self) -> None:
         if self.json is not None:
             self.json.close()
         publisher, self._publisher = self._publisher, None

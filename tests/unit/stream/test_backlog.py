@@ -22,7 +22,7 @@ def frames(count: int, first_ms: int = 0, step_ms: int = 1) -> list[Frame]:
 class Subscriber:
     """A backlog and its clock. ``published`` has each frame's number, and when it was published, in s."""
 
-    def __init__(self, speed: float = 2.0) -> None:
+    def __init__(self, speed: float | None = 2.0) -> None:
         self.now_s = 100.0
         self.costs_s = 0.0
         """How long it takes to publish one frame."""
@@ -195,16 +195,27 @@ def test_one_call_publishes_only_for_a_while() -> None:
     assert 100 <= len(subscriber.published) <= 100 + 64
 
 
-def test_one_call_publishes_few_frames_of_many_components() -> None:
-    """So the time between two readings of the clock is limited, too."""
+@pytest.mark.parametrize(("costs_ms", "in_one_call"), [(0.13, 16), (0.6, 4), (1.5, 2), (7.0, 1)])
+def test_one_call_publishes_few_frames_that_take_long(costs_ms: float, in_one_call: int) -> None:
+    """As those of hundreds of tools do: other sources have their turn after 2 ms, or after one frame."""
     subscriber = Subscriber()
     subscriber.clock.has_clock = False
-    subscriber.costs_s = 64 * 0.02 * MS
-    body = frame(0).body
-    many = split_frame((64).to_bytes(4, "big") + body[4:] * 64, "big")
-    subscriber.arrive([many] * 100)
-    assert subscriber.backlog.publish_due() == 0.0
-    assert len(subscriber.published) == 5
+    subscriber.costs_s = costs_ms * MS
+    subscriber.backlog.publish(frames(1), *subscriber.read_clocks())
+    subscriber.arrive(frames(100, 1))
+    for first in range(1, 65, in_one_call):
+        subscriber.published.clear()
+        assert subscriber.backlog.publish_due() == 0.0
+        assert subscriber.numbers == list(range(first, first + in_one_call))
+
+
+def test_late_frames_that_are_skipped_come_in_large_chunks_although_the_last_one_takes_long() -> None:
+    subscriber = Subscriber(speed=None)
+    subscriber.costs_s = 7.0 * MS
+    subscriber.arrive(frames(200))
+    for end in (64, 128):
+        assert subscriber.backlog.publish_due() == 0.0
+        assert len(subscriber.published) == end
 
 
 def test_what_waits_can_be_hurried_and_dropped() -> None:

@@ -1,7 +1,9 @@
 """The keys with JSON: who gets them, how often, and what is counted."""
 
+import functools
 import json
 import logging
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -17,7 +19,7 @@ from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.zenoh.json_keys import MAX_DESCRIPTION_CHARACTERS
+from gateway.outputs.zenoh.json_keys import MAX_DESCRIPTION_CHARACTERS, JsonKeys
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.publisher import ZenohPublisher
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -308,6 +310,46 @@ def test_no_event_is_left_out(lab: Lab) -> None:
     wait_until(lambda: len(lab.samples) >= 500)
     assert [received["sequence"] for received in lab.received] == list(range(500))
     assert lab.lost == {}
+
+
+# Sources ------------------------------------------------------------------------------------------------
+
+
+def wait_for(event: threading.Event) -> None:
+    event.wait()
+
+
+def test_sources_that_wait_share_the_time_of_the_thread_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("gateway.outputs.zenoh.json_keys.time.monotonic", lambda: now_s)
+    converted: list[str] = []
+    keys, can_begin = JsonKeys(1.0), threading.Event()
+
+    def convert(source: str, duration_s: float) -> None:
+        nonlocal now_s
+        now_s += duration_s
+        converted.append(source)
+
+    assert keys.offer("crowd", functools.partial(wait_for, can_begin), 1)
+    for source, duration_s, count in (("crowd", 0.008, 3), ("lab", 0.002, 6)):
+        for _ in range(count):
+            assert keys.offer(source, functools.partial(convert, source, duration_s), 1)
+    can_begin.set()
+    wait_until(lambda: len(converted) == 9)
+    assert "".join(source[0] for source in converted) == "cllllcllc"
+    keys.close()
+
+
+def test_what_waits_of_one_source_is_bounded_and_leaves_room_for_the_others() -> None:
+    keys, can_begin = JsonKeys(1.0), threading.Event()
+    assert keys.offer("crowd", functools.partial(wait_for, can_begin), 1)
+    for source in ("crowd", "lab"):
+        while keys.offer(source, lambda: None, 0):
+            pass
+    assert keys.offer("yard", lambda: None, 1 << 30)
+    assert not keys.offer("yard", lambda: None, 1)
+    can_begin.set()
+    keys.close()
 
 
 # What is refused -----------------------------------------------------------------------------------------
