@@ -26,6 +26,7 @@ from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.rtc3d.server_description import only_components
 from gateway.stream.parameters import UNANSWERED, Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import SessionNumbers, StreamStatus
@@ -86,6 +87,7 @@ class Source:
             *(settings.host, settings.port),
         )
         self._has_new_frame = before is not None and not before.settings.has_frame_of(settings)
+        self._has_new_components = before is not None and before.settings.components != settings.components
         self.sequence: int = NOT_PUBLISHED if before is None else before.sequence
         """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
@@ -138,6 +140,8 @@ class Source:
             await self.queries.parameters.known.make_void("the configuration names another server")
         elif self._has_new_frame and self.known_parameters.version:
             await self.queries.parameters.begin_version()
+        elif self._has_new_components and self.known_parameters.version:
+            await self._publish_parameters(self.name, self.known_parameters)
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(_wait_for(self._failure))
@@ -262,12 +266,19 @@ class Source:
     def known_parameters(self) -> ServerParameters:
         """The newest parameters as the outputs get them; empty ones if the server gives none."""
         known = self.queries.parameters.known
-        xml, parsed = (b"", Parameters())
-        if known.newest is not None:
-            xml, parsed = known.newest.xml, known.newest.parsed.parameters
+        components = self.settings.components
         return ServerParameters(
-            xml, self.queries.session, known.version, parsed=parsed, frame=self.queries.frame
+            b"" if known.newest is None else known.newest.xml,
+            *(self.queries.session, known.version),
+            parsed=only_components(self._parsed, components),
+            frame=self.queries.frame,
+            components=components,
         )
+
+    @property
+    def _parsed(self) -> Parameters:
+        newest = self.queries.parameters.known.newest
+        return Parameters() if newest is None else newest.parsed.parameters
 
     def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:
         return self.queries.parameters.read_for_handshake(connection)
@@ -283,7 +294,7 @@ class Source:
                     stream.status.parameters_changed(version)
                     if answer is not None:
                         stream.status.replace_limitation(UNANSWERED, "")
-                self._streams.parameters_changed(self.known_parameters.parsed)
+                self._streams.parameters_changed(self._parsed)
             self.fan_out.set_parameters(self.known_parameters)
 
     # C3D files and recordings.

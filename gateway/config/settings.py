@@ -185,6 +185,12 @@ class SourceSettings(Section):
         """See Section."""
         return {} if self.frame_id is not None else {"frame_id": Effective(self.name)}
 
+    @property
+    def components(self) -> frozenset[ComponentType]:
+        """The components that the streams request."""
+        streams = (StreamSettings(),) if self.streams == "auto" else self.streams
+        return frozenset(component for stream in streams for component in stream.components)
+
     def connects_like(self, other: "SourceSettings") -> bool:
         """Return whether these settings differ from ``other`` at most in the frame of poses."""
         return self == other.model_copy(update={"frame_id": self.frame_id, "transform": self.transform})

@@ -16,7 +16,7 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.status import OutputHealth
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
 
@@ -120,8 +120,9 @@ class ServerParameters(NamedTuple):
 
     ``session`` is the number of its session, ``version`` grows whenever the parameters change. ``message``
     is the recorded ``parameters_t`` if a take is replayed: an output that publishes this type sends it
-    unchanged. ``parsed`` is what the XML says, and ``frame`` the coordinate frame of the source's poses; in
-    answers to peers, they are not filled in.
+    unchanged. ``components`` are those that the source's streams request, ``parsed`` is what the XML says of
+    them, without the items of others, and ``frame`` the coordinate frame of the source's poses; in answers to
+    peers, they are not filled in.
     """
 
     xml: bytes
@@ -131,6 +132,7 @@ class ServerParameters(NamedTuple):
     message: bytes = b""
     parsed: Parameters = Parameters()
     frame: CoordinateFrame = CoordinateFrame("")
+    components: frozenset[ComponentType] = frozenset(WIRE_ORDER)
 
 
 class ServerFile(NamedTuple):

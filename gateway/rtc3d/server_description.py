@@ -1,9 +1,11 @@
 """What a server's parameters (§6) say about one component: its rate, its items and their labels."""
 
+from collections.abc import Collection
+from dataclasses import replace
 from typing import Final
 
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import Parameters, Parameters3D, only_sections
 
 _MIN_HZ: Final = 0.01
 _MAX_HZ: Final = 1e6
@@ -58,3 +60,12 @@ def described_labels(parameters: Parameters, component: ComponentType) -> list[s
     if component is ComponentType.TOOLS and parameters.tools:
         return [tool.label for tool in parameters.tools.tools]
     return []
+
+
+def only_components(parameters: Parameters, components: Collection[ComponentType]) -> Parameters:
+    """Return the parameters without the items of other components. The unit of all positions remains."""
+    sections = {"events" if each is ComponentType.EVENT else each.key for each in components}
+    kept = only_sections(parameters, {"general", *sections})
+    if parameters.markers is not None and kept.markers is None:
+        return replace(kept, markers=Parameters3D(unit=parameters.length_unit))
+    return kept

@@ -5,7 +5,7 @@ import json
 import sys
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any, Final
 
 import zenoh
@@ -16,6 +16,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.ros2.message_types import ROS_TYPES
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
@@ -124,6 +125,25 @@ async def test_a_reload_adds_and_removes_sources_and_the_output(router: str) -> 
                 await wait_until_async(lambda: "/robots/hall_2/markers" in topics_on(node))
                 assert "/mocap/hall_2/markers" not in topics_on(node)
         await wait_until_async(lambda: not topics_on(node))
+
+
+async def test_topics_belong_to_the_components_that_streams_request(router: str) -> None:
+    """A topic on which nothing comes misleads. A reload adds and removes them, even without the server."""
+    wanted = {"/diagnostics", "/mocap/lab/markers", "/mocap/lab/force_1/wrench"}
+    others = {"/tf", "/mocap/lab/Tool_1/pose", "/mocap/lab/analog"}
+    with open_zenoh("client", connect=router) as node:
+        async with AsyncExitStack() as server:
+            every = settings_of(router, {"lab": await server.enter_async_context(simulated())})
+            [lab] = every.sources
+            streams = (StreamSettings(components=(ComponentType.MARKERS, ComponentType.FORCE)),)
+            some = every.model_copy(update={"sources": (lab.model_copy(update={"streams": streams}),)})
+            async with gateway_of(some) as gateway:
+                await wait_until_async(lambda: topics_on(node) == wanted)
+                await gateway.reload(every)
+                await wait_until_async(lambda: topics_on(node) == wanted | others)
+                await server.aclose()
+                await gateway.reload(some)
+                await wait_until_async(lambda: topics_on(node) == wanted)
 
 
 async def test_frames_are_requested_only_while_ros_wants_them(router: str) -> None:

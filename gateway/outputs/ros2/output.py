@@ -63,10 +63,18 @@ class Ros2Output(Output):
     def _declare_all(self, session: zenoh.Session) -> None:
         """Declare everything on the new session, in the sending thread."""
         self._node = node = RosNode(session, self.settings)
-        for topic in (self._tf, self._diagnostics):
-            topic.declare(node)
+        self._diagnostics.declare(node)
+        self._declare_tf()
         for source in list(self._sources.values()):
             source.declare(node)
+
+    def _declare_tf(self) -> None:
+        """Declare /tf if the streams of any source request tools, in the sending thread."""
+        if self._node is not None and any(source.has_tools for source in list(self._sources.values())):
+            self._tf.declare(self._node)
+        else:
+            self._tf.undeclare()
+        self._on_tf_wanted()
 
     # The sending thread.
 
@@ -117,7 +125,10 @@ class Ros2Output(Output):
         """Open the topics that belong to the parameters."""
         publisher = self._sources.get(source)
         if publisher is not None:
+            had_tools = publisher.has_tools
             publisher.set_parameters(parameters)
+            if publisher.has_tools is not had_tools:
+                self.submit(self._declare_tf)
         return None
 
     def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
@@ -132,6 +143,7 @@ class Ros2Output(Output):
     def withdraw(self, source: str) -> None:
         """Forget the source; its FramePublisher is closed."""
         self._sources.pop(source, None)
+        self.submit(self._declare_tf)
 
     # What is wanted.
 

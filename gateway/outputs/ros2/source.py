@@ -61,6 +61,11 @@ class RosSource:
         """Return whether somebody subscribes to anything that these components are published on."""
         return not self._wanted.isdisjoint(components)
 
+    @property
+    def has_tools(self) -> bool:
+        """Whether its streams request tools, whose poses are on /tf, too. Any thread may read it."""
+        return ComponentType.TOOLS in self._parameters.components
+
     def update_wanted(self) -> None:
         """Note that subscribers have come or gone, or topics. In any thread."""
         with self._lock:  # or what one thread has seen could replace what another sees later

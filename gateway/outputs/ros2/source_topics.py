@@ -41,7 +41,7 @@ MAX_TOOLS: Final = 256
 MAX_PLATES: Final = 64
 """How many tools and plates can have topics of their own. The server determines how many there are."""
 
-NOT_YET: Final = ServerParameters(b"", 0, 0)
+NOT_YET: Final = ServerParameters(b"", 0, 0, components=frozenset())
 """Stands for the parameters before the first are there."""
 
 _LENGTH_COMPONENTS: Final = (ComponentType.MARKERS, ComponentType.TOOLS)

@@ -4,9 +4,10 @@ From the design document of rmw_zenoh (ros2/rmw_zenoh, docs/design.md) and its s
 and publishers visible: ``ros2 topic list`` shows what they say. ROS drops a message without an attachment.
 """
 
-import hashlib
 import struct
 from typing import Final, NamedTuple
+
+import xxhash
 
 from gateway.outputs.ros2.message_types import RosType
 
@@ -15,6 +16,7 @@ _NODE: Final = "NN"
 _PUBLISHER: Final = "MP"
 _SUBSCRIPTION: Final = "MS"
 _NO_ENCLAVE: Final = "%"
+_DEFAULT_DEPTH: Final = 42
 
 NODE_ID: Final = 0
 """The id of the gateway's node in its session. It has only one."""
@@ -31,12 +33,15 @@ class QoS(NamedTuple):
 
     @property
     def code(self) -> str:
-        """The text in tokens. An empty field stands for the default of ROS: here reliable and volatile.
+        """The text in tokens. A field with the default of rmw_zenoh is empty: reliable, volatile, depth 42.
+
+        A node encodes it anew to compute the gid, so writing a default would give another one.
 
         The fields are reliability, durability, history and depth, deadline, lifespan and liveliness.
         """
         best_effort = "2"
-        return f"{'' if self.is_reliable else best_effort}::,{self.depth}:,:,:,,"
+        depth = "" if self.depth == _DEFAULT_DEPTH else self.depth
+        return f"{'' if self.is_reliable else best_effort}::,{depth}:,:,:,,"
 
 
 class Node(NamedTuple):
@@ -105,11 +110,11 @@ def data_key(domain_id: int, topic: str, ros_type: RosType, type_hash: str) -> s
 
 
 def gid_of(token: str) -> bytes:
-    """Return the global id of the publisher with this token. ROS needs it to differ from all others.
+    """Return the global id of the publisher with this token, as nodes compute it for their graph.
 
-    rmw_zenoh_cpp uses another hash (XXH3), but compares the id with nothing.
+    That is the low half of XXH3-128, then the high half, both little-endian: its usual form backwards.
     """
-    return hashlib.blake2b(token.encode(), digest_size=_GID_BYTES).digest()
+    return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
 def attachment(sequence: int, source_time_ns: int, gid: bytes) -> bytes:

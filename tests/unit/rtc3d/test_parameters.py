@@ -27,7 +27,12 @@ from gateway.rtc3d.parameters_changes import (
     statistics_xml,
 )
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.rtc3d.server_description import described_labels, described_rate_hz, num_described_items
+from gateway.rtc3d.server_description import (
+    described_labels,
+    described_rate_hz,
+    num_described_items,
+    only_components,
+)
 from tests.spec_parameters import ALL, ANALOG, BY_SECTION, GENERAL, spec_xml
 
 
@@ -63,6 +68,19 @@ def test_a_component_is_described_by_its_own_section() -> None:
             assert (described_rate_hz(parameters, kind), *counts) == expected[kind]
     assert Parameters().length_unit == "mm"
     assert Parameters(markers=Parameters3D(unit="m")).length_unit == "m"
+
+
+@pytest.mark.parametrize("kinds", [{each} for each in ComponentType] + [set(), set(ComponentType)])
+def test_only_components_have_items_but_all_have_the_unit(kinds: set[ComponentType]) -> None:
+    """The unit of tools is in the section of markers. Outputs open nothing for what nobody requests."""
+    given = replace(ALL, markers=Parameters3D(unit="m", markers=(Marker("1"),)))
+    kept = only_components(given, kinds)
+    assert (kept.general, kept.length_unit) == (given.general, "m")
+    for kind in ComponentType:
+        expected = num_described_items(given, kind) if kind in kinds else 0
+        assert num_described_items(kept, kind) == expected
+    assert (kept.events == given.events) is (ComponentType.EVENT in kinds)
+    assert only_components(Parameters(), kinds) == Parameters()
 
 
 @pytest.mark.parametrize(

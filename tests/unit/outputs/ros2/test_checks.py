@@ -45,7 +45,7 @@ def test_a_router_without_nodes_and_then_with_some(lab: RosLab) -> None:
     tokens = [
         lab.peer.liveliness().declare_token(key) for key in (*keys, "@ros2_lv/4/abc/0/0/NN/%/%/elsewhere")
     ]
-    wait_until(lambda: len(lab.tokens()) == 14)
+    wait_until(lambda: len(lab.tokens()) == 13)
     found = findings(lab.settings)
     assert found["gateway"] == (Result.PASSING, "the node /mocap/rtc3d_gateway is visible in domain 3")
     named = ", ".join(f"/arm/node_{number}" for number in range(8))

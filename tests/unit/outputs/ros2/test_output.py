@@ -15,10 +15,12 @@ import pytest
 import zenoh
 import zenoh.ext
 
+from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2 import output as output_module
 from gateway.outputs.ros2.output import Ros2Output
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.source import RosSource
+from gateway.outputs.ros2.wire import gid_of
 from gateway.rtc3d.components import ComponentType
 from tests.networks import zenoh_keys
 from tests.ros_lab import ALL, RosLab, frame_of, parameters, ros_lab, stamp, tools_frame
@@ -131,6 +133,32 @@ async def test_subscribers_of_shared_topics_concern_every_source(monkeypatch: py
     assert lab.node.sent == {"/tf": [1, 2]}
 
 
+def test_tf_is_there_while_any_source_requests_tools(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic on which nothing can come misleads; its subscribers must not keep a source at work."""
+    lab = Output(monkeypatch)
+    markers = parameters(markers=1)._replace(components=frozenset({ComponentType.MARKERS}))
+    one, two = (lab.output.frame_publisher(name) for name in ("one", "two"))
+
+    def use(name: str, given: ServerParameters) -> None:
+        lab.output.publish_parameters(name, given)
+        lab.sender.run()
+
+    use("one", markers)
+    assert "/tf" not in lab.node.open
+    for name in ("one", "two"):
+        use(name, parameters())  # without a description of tools, which frames may have nevertheless
+        assert "/tf" in lab.node.open
+    lab.match("/tf")
+    assert [each.wants([ComponentType.TOOLS]) for each in (one, two)] == [True, True]
+    use("one", markers)
+    assert "/tf" in lab.node.open
+    two.close()
+    lab.output.withdraw("two")
+    lab.sender.run()
+    assert "/tf" not in lab.node.open
+    assert not one.wants([ComponentType.TOOLS])
+
+
 def test_only_equal_settings_are_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reload without changes disturbs no node."""
     one, same, other = (Output(monkeypatch, domain_id=domain_id).output for domain_id in (0, 0, 1))
@@ -183,13 +211,13 @@ _HASH = "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8
     [
         (
             {"domain_id": 7, "namespace": "", "distribution": "humble"},
-            "@ros2_lv/7/{zid}/0/3/MP/%/%/rtc3d_gateway/%lab%wand%pose/geometry_msgs::msg::dds_::PoseStamped_/"
+            "MP/%/%/rtc3d_gateway/%lab%wand%pose/geometry_msgs::msg::dds_::PoseStamped_/"
             "TypeHashNotSupported/2::,10:,:,:,,",
             "7/lab/wand/pose/geometry_msgs::msg::dds_::PoseStamped_/TypeHashNotSupported",
         ),
         (
             {"namespace": "site/mocap", "reliability": "reliable", "depth": 5, "distribution": "rolling"},
-            "@ros2_lv/0/{zid}/0/3/MP/%/%site%mocap/rtc3d_gateway/%site%mocap%lab%wand%pose/"
+            "MP/%/%site%mocap/rtc3d_gateway/%site%mocap%lab%wand%pose/"
             f"geometry_msgs::msg::dds_::PoseStamped_/{_HASH}/::,5:,:,:,,",
             f"0/site/mocap/lab/wand/pose/geometry_msgs::msg::dds_::PoseStamped_/{_HASH}",
         ),
@@ -213,7 +241,11 @@ def test_nodes_see_and_hear_topics_of_a_domain_namespace_distribution_and_qos(
         wait_until(lambda: received)
         assert str(received[0].key_expr) == key
         [node] = [each for each in lab.tokens() if "/NN/" in each]
-        assert token.format(zid=node.split("/")[2]) in lab.tokens()
+        [shown] = [each for each in lab.tokens() if "%wand%pose" in each]
+        assert shown.startswith(node.partition("/0/0/NN")[0])
+        assert shown.split("/", 5)[5] == token
+        assert received[0].attachment is not None
+        assert received[0].attachment.to_bytes()[17:] == gid_of(shown)
         lab.output.close()
         wait_until(lambda: not lab.tokens())
 

@@ -11,6 +11,7 @@ from gateway.outputs.ros2.message_types import POINT_CLOUD
 from gateway.outputs.ros2.router import client_config
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.topic import RosNode, RosTopic
+from gateway.outputs.ros2.wire import gid_of
 
 ENDPOINT = "tcp/192.0.2.9:7447"
 
@@ -44,7 +45,7 @@ def test_a_topic_is_a_publisher_and_a_token_with_an_id_of_its_own(
     tokens = [each.args[0] for each in declare_token.call_args_list]
     assert [token.split("/")[4:6] for token in tokens] == [["0", "NN"], ["1", "MP"], ["2", "MP"]]
     assert all(",3:" in token for token in tokens[1:])
-    assert len({topic._declared and topic._declared.gid for topic in topics}) == 2
+    assert [topic._declared and topic._declared.gid for topic in topics] == [*map(gid_of, tokens[1:])]
     listener = session.declare_publisher.return_value.declare_matching_listener.call_args.args[0]
     assert not listener.indirect
     for is_matching in (True, True):

@@ -1,6 +1,7 @@
 """Names, keys, tokens and attachments: those in the design document of rmw_zenoh; hashes from rosbags."""
 
 import re
+import struct
 
 import pytest
 from hypothesis import given
@@ -15,6 +16,10 @@ STRING = RosType(
     "std_msgs/msg/String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 )
 SESSION = "8b20917502ee955ac4476e0266340d5c"
+TF_TOKEN = (
+    f"@ros2_lv/0/{SESSION}/0/1/MP/%/%site%mocap/rtc3d_gateway/%tf/tf2_msgs::msg::dds_::TFMessage_/"
+    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087/2::,10:,:,:,,"
+)
 
 
 def test_keys_and_tokens_of_the_design_document() -> None:
@@ -28,10 +33,7 @@ def test_keys_and_tokens_of_the_design_document() -> None:
     node = Node(0, SESSION, "site/mocap", "rtc3d_gateway")
     assert node.token == f"@ros2_lv/0/{SESSION}/0/0/NN/%/%site%mocap/rtc3d_gateway"
     token = node.publisher_token(1, "/tf", TF_MESSAGE, TF_MESSAGE.type_hash, QoS(False, 10))
-    assert token == (
-        f"@ros2_lv/0/{SESSION}/0/1/MP/%/%site%mocap/rtc3d_gateway/%tf/tf2_msgs::msg::dds_::TFMessage_/"
-        f"{TF_MESSAGE.type_hash}/2::,10:,:,:,,"
-    )
+    assert token == TF_TOKEN
 
 
 @pytest.mark.parametrize(
@@ -51,11 +53,31 @@ def test_what_a_token_shows(token: str, seen: SeenEntity | None) -> None:
     assert seen_entity(token) == seen
 
 
-def test_an_attachment_by_hand_and_gids_that_differ_for_each_token() -> None:
+def test_an_attachment_by_hand() -> None:
     by_hand = bytes.fromhex("0100000000000000 e803000000000000 10 000102030405060708090a0b0c0d0e0f")
     assert attachment(1, 1000, bytes(range(16))) == by_hand
-    gids = {gid_of(token) for token in ("a", "b", "c")}
-    assert [len(gid) for gid in gids] == [16] * 3
+
+
+@pytest.mark.parametrize(
+    ("token", "low", "high"),
+    [
+        ("", 0x6001C324468D497F, 0x99AA06D3014798D8),  # published vectors of XXH3-128
+        ("abc", 0x78AF5F94892F3950, 0x06B05AB6733A6185),
+        (TF_TOKEN, 0x5FBD799F45817D90, 0xFD44188B2550BE05),  # by the Go module github.com/zeebo/xxh3
+    ],
+)
+def test_gids_are_those_that_nodes_compute_from_the_token(token: str, low: int, high: int) -> None:
+    """A node finds the publisher of a message in its graph by the gid."""
+    assert gid_of(token) == struct.pack("<QQ", low, high)
+
+
+@pytest.mark.parametrize(
+    ("qos", "code"),
+    [(QoS(True, 42), "::,:,:,:,,"), (QoS(False, 42), "2::,:,:,:,,"), (QoS(False, 43), "2::,43:,:,:,,")],
+)
+def test_defaults_of_rmw_zenoh_are_left_out_of_tokens(qos: QoS, code: str) -> None:
+    """A node encodes a token anew before it hashes it; a default that is written changes the gid."""
+    assert qos.code == code
 
 
 @pytest.mark.parametrize("ros_type", ROS_TYPES, ids=lambda ros_type: ros_type.name)
