@@ -27,7 +27,9 @@
 A message says what happened, to which server or file, and what to do.
 """
 
+import errno
 import os
+from typing import Final
 
 
 class GatewayError(Exception):
@@ -140,6 +142,14 @@ class QueryError(GatewayError):
     def __init__(self, message: str, *, code: str = "bad-request") -> None:
         super().__init__(message)
         self.code = code
+
+
+NO_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
+"""The system's errors if the process, or the computer, has no file descriptor left."""
+
+FILES_ADVICE: Final = (
+    "close programs that are connected to the gateway, or let it open more (LimitNOFILE of the service)"
+)
 
 
 def system_reason(error: OSError) -> str:

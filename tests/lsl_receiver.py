@@ -17,22 +17,16 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any, Final
 
-_CONFIG: Final = """\
-[ports]
-IPv6 = disable
-[multicast]
-ResolveScope = machine
-[lab]
-SessionID = {session}
-"""
+_PAGE: Final = Path(__file__).parent.parent / "docs/how-to/lsl.md"
 
 _POLL_S: Final = 0.01
 
 
 def lsl_config(folder: Path) -> Path:
-    """Write a configuration of liblsl for one test: nothing leaves this computer, and no others are seen."""
+    """Write the configuration of liblsl that the page recommends for one computer, for one test only."""
+    recommended = _PAGE.read_text().partition("```ini\n")[2].partition("```")[0]
     file = folder / "lsl_api.cfg"
-    file.write_text(_CONFIG.format(session=secrets.token_hex(8)))
+    file.write_text(recommended.replace("this-computer", secrets.token_hex(8)) + "[ports]\nIPv6 = disable\n")
     return file
 
 

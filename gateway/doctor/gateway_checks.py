@@ -27,6 +27,9 @@ def check_gateway(
             yield _gateway.not_tested(check, "no running gateway could be asked")
         return
     yield _gateway.passing("health", f"a gateway answers on {where}")
+    for problem in report.process:
+        found, _, remedy = problem.partition("; ")
+        yield _gateway.failing("health", found, as_sentence(remedy))
     served = {stream.source for stream in report.streams}
     for source in sources:
         if source not in served:

@@ -71,8 +71,9 @@ class RunningLoss(BaseModel):
 
 
 class HealthReport(BaseModel):
-    """The health page of a running gateway."""
+    """The health page of a running gateway. ``process`` are the problems of the whole process."""
 
+    process: list[str] = []
     streams: list[RunningStream]
     outputs: list[RunningOutput]
     losses: list[RunningLoss]

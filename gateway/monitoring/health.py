@@ -32,10 +32,11 @@ class _Route(NamedTuple):
         return route_name(self.source, self.stream, self.output)
 
 
-def health_page(gateway: Gateway) -> Page:
+def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
     """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem.
 
-    If something was lost in the last minute, the gateway is degraded, which is still 200.
+    ``process_problems`` are those of the whole process, see ProcessLimits. If something was lost in the last
+    minute, the gateway is degraded, which is still 200.
     """
     now_s = running_clock().time()  # a stop of this process does not make the newest frames older
     streams = [
@@ -45,6 +46,7 @@ def health_page(gateway: Gateway) -> Page:
     ]
     outputs = [_output_health(output) for output in gateway.outputs]
     problems = [
+        *(f"gateway: {problem}" for problem in process_problems),
         *(f"{each['source']} ({each['stream']}): {each['problem']}" for each in streams if each["problem"]),
         *(f"{each['output']}: {each['problem']}" for each in outputs if each["problem"]),
     ]
@@ -54,6 +56,7 @@ def health_page(gateway: Gateway) -> Page:
         "status": "unhealthy" if problems else "degraded" if losses else "healthy",
         "healthy": not problems,
         "reasons": [*problems, *losses],
+        "process": list(process_problems),
         "streams": streams,
         "outputs": outputs,
         "losses": [loss for route in routes for loss in _losses_json(route)],

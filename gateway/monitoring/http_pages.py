@@ -6,14 +6,18 @@ untrusted: size, duration and number of connections are bounded, and so is how o
 
 import asyncio
 import contextlib
+import functools
 import logging
 import math
+import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from typing import Final, NamedTuple
 
+from gateway.errors import NO_FILES
 from gateway.log import DefectLog
+from gateway.monitoring.process_limits import ReservedFiles
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +32,14 @@ REQUEST_TIMEOUT_S: Final = 5.0
 
 MAX_PAGE_AGE_S: Final = 0.1
 """How long a page is served again: building it takes the event loop some ms, however many clients ask."""
+
+_RESERVED_FILES: Final = 8
+"""How many connections are served when the process has no file descriptor left, to say so."""
+
+_ACCEPT_PAUSE_S: Final = 0.1
+"""How long connections wait in the kernel when none can be accepted."""
+
+_BACKLOG: Final = 100
 
 _MAX_DISCARDED_BYTES: Final = 65536
 """How much to read after the request, such as the body of a POST; more is reset."""
@@ -46,39 +58,96 @@ class HttpPages:
 
     def __init__(self, pages: Mapping[str, Callable[[], Page]]) -> None:
         self._pages = pages
-        self._server: asyncio.Server | None = None
+        self._listening: list[socket.socket] = []
+        self._reserve = ReservedFiles(_RESERVED_FILES)
         self._built: dict[str, tuple[float, Page]] = {}
         """The newest page of each path, and when it was built, on the monotonic clock in s."""
         self._defects = DefectLog(logger, "metrics")
-        self._connections: dict[asyncio.Task[None], asyncio.WriteTransport] = {}
+        self._connections: dict[asyncio.Task[None], None] = {}
         """The open connections, oldest first."""
 
     async def start(self, addresses: Sequence[str], port: int) -> None:
         """Listen on IP addresses; raises OSError if one of them or the port cannot be bound."""
-        self._server = await asyncio.start_server(self._serve, addresses, port, limit=MAX_REQUEST_BYTES)
+        try:
+            for address in addresses:
+                self._listening.append(_listen(address, port))
+        except OSError:
+            await self.close()
+            raise
+        self._reserve.refill()
+        for listening in self._listening:
+            self._resume(listening)
 
     async def close(self) -> None:
         """Stop listening and close all connections."""
-        if self._server is not None:
-            self._server.close()
-        # Abort instead of cancelling: before Python 3.12, asyncio's streams log a cancellation as an error.
-        for transport in self._connections.values():
-            transport.abort()
+        listening, self._listening = self._listening, []
+        for each in listening:
+            asyncio.get_running_loop().remove_reader(each)
+            each.close()
+        for task in self._connections:
+            task.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
+        self._reserve.close()
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        if task is None:
+    # There is no asyncio.Server: if the process has no file descriptor left, uvloop's closes connections
+    # without a word, although /healthz is wanted most then.
+
+    def _resume(self, listening: socket.socket) -> None:
+        if listening in self._listening:
+            asyncio.get_running_loop().add_reader(listening, self._accept, listening)
+
+    def _accept(self, listening: socket.socket) -> None:
+        """Accept a connection; if that is not possible, disconnect the oldest one and wait for a moment."""
+        loop = asyncio.get_running_loop()
+        try:
+            connection = self._accepted(listening)
+        except OSError as error:
+            if error.errno in NO_FILES:
+                self._disconnect_oldest()
+                loop.remove_reader(listening)
+                loop.call_later(_ACCEPT_PAUSE_S, self._resume, listening)
             return
         if len(self._connections) >= MAX_CONNECTIONS:
-            oldest = next(iter(self._connections))
-            self._connections.pop(oldest).abort()
-        self._connections[task] = writer.transport
+            self._disconnect_oldest()
+        task = loop.create_task(self._serve(connection))
+        self._connections[task] = None
+        task.add_done_callback(functools.partial(self._end, connection))
+
+    def _accepted(self, listening: socket.socket) -> socket.socket:
+        """Return the next connection, with a reserved file descriptor if no other is left. Raises OSError."""
+        self._reserve.refill()
         try:
-            # The client caused these errors; an operator of the gateway can do nothing about them.
-            with contextlib.suppress(
-                TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError
-            ):
+            return listening.accept()[0]
+        except OSError as error:
+            if error.errno not in NO_FILES or not self._reserve.use():
+                raise
+        return listening.accept()[0]
+
+    def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
+        connection.close()
+        self._connections.pop(task, None)
+        self._reserve.refill()
+        if not task.cancelled() and (defect := task.exception()) is not None:
+            self._defects.log(defect)
+
+    def _disconnect_oldest(self) -> None:
+        oldest = next(iter(self._connections), None)
+        if oldest is not None:
+            del self._connections[oldest]
+            oldest.cancel()
+
+    async def _serve(self, connection: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        connection.setblocking(False)
+        reader = asyncio.StreamReader(MAX_REQUEST_BYTES, loop)
+        protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
+        # The client caused these errors; an operator of the gateway can do nothing about them.
+        with contextlib.suppress(
+            TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError
+        ):
+            transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
+            writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+            try:
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     head = await reader.readuntil(b"\r\n\r\n")
                     writer.write(self._response(head))
@@ -88,9 +157,8 @@ class HttpPages:
                     discarded = 0
                     while discarded < _MAX_DISCARDED_BYTES and (data := await reader.read(4096)):
                         discarded += len(data)
-        finally:
-            writer.transport.abort()
-            self._connections.pop(task, None)
+            finally:
+                transport.abort()
 
     def _response(self, head: bytes) -> bytes:
         method = head.partition(b" ")[0]
@@ -123,6 +191,14 @@ class HttpPages:
                 page = _error_page(HTTPStatus.INTERNAL_SERVER_ERROR, "see the log")
             self._built[path] = now_s, page
         return page
+
+
+def _listen(address: str, port: int) -> socket.socket:
+    """Return a socket that listens on an IP address. Raises OSError."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    listening = socket.create_server((address, port), family=family, backlog=_BACKLOG)
+    listening.setblocking(False)
+    return listening
 
 
 def _error_page(status: HTTPStatus, reason: str = "only GET and HEAD are served") -> Page:

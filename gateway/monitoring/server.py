@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import Final
 
 from gateway.config.settings import MetricsSettings
+from gateway.errors import system_reason
 from gateway.gateway import Gateway
 from gateway.monitoring.health import health_page
 from gateway.monitoring.http_pages import HttpPages
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
+from gateway.monitoring.process_limits import ProcessLimits
 from gateway.stream.names import is_address, look_up
 
 _LOOK_UP_TIMEOUT_S: Final = 5.0
@@ -21,13 +23,19 @@ logger = logging.getLogger(__name__)
 class MonitoringServer:
     """Serves the metrics and the health of one gateway over HTTP."""
 
-    def __init__(self, settings: MetricsSettings, gateway: Gateway) -> None:
+    def __init__(
+        self, settings: MetricsSettings, gateway: Gateway, limits: ProcessLimits | None = None
+    ) -> None:
+        limits = limits or ProcessLimits()
         self._settings = settings
         self._loop_delay = LoopDelay()
         self._look_up: asyncio.Task[None] | None = None
         registry = metrics_registry(gateway, self._loop_delay)
         self._pages = HttpPages(
-            {"/metrics": lambda: metrics_page(registry), "/healthz": lambda: health_page(gateway)}
+            {
+                "/metrics": lambda: metrics_page(registry),
+                "/healthz": lambda: health_page(gateway, limits.problems()),
+            }
         )
 
     async def start(self) -> None:
@@ -66,7 +74,7 @@ class MonitoringServer:
                 "metrics: cannot listen on %s, port %d: %s; continuing without /metrics and /healthz: "
                 "stop the program that uses the port, or set metrics.address and metrics.port, and restart "
                 "the gateway",
-                *(address, port, error.strerror or error),
+                *(address, port, system_reason(error)),
             )
         else:
             logger.info("metrics: /metrics and /healthz are served on %s, port %d", address, port)

@@ -17,8 +17,8 @@ SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 
 RECORDING: Final[KeyPath] = ("recording",)
 
-ANY: Final = ("NAME",)
-"""Stands for the values of an option that is a name."""
+_ANY: Final = {"NAME", "OPTIONS"}
+"""Each stands for the values of an option that is any text."""
 
 _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "parameters": {"format": ("xml", "json"), "fresh": ("true", "false"), "stale": ("ok",)},
@@ -26,7 +26,7 @@ _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "status": {"format": ("lcm", "json")},
     "c3d": {},
     "schema": {},
-    "recording": {"set": ("start", "stop"), "name": ANY},
+    "recording": {"set": ("start", "stop"), "name": ("NAME",), "options": ("OPTIONS",)},
 }
 """The options of each kind of question, with the values that each accepts."""
 
@@ -35,7 +35,8 @@ class Question(NamedTuple):
     """A query for one key of one source. ``kind`` decides which of the other fields are used.
 
     ``name`` is the section ("" for all), the component's key, the type, or the name of a recording. ``set``
-    is start, stop, or "" if the query does not have it.
+    is start, stop, or "" if the query does not have it. ``options`` are for the server that starts a
+    recording.
     """
 
     kind: Literal["parameters", "component", "status", "c3d", "schema", "recording"]
@@ -44,6 +45,7 @@ class Question(NamedTuple):
     fresh: bool = False
     stale_ok: bool = False
     set: str = ""
+    options: str = ""
 
 
 def known_keys(components: Collection[ComponentType]) -> list[KeyPath]:
@@ -75,9 +77,10 @@ def parse_question(
     """
     kind, name = _kind_and_name(path, components)
     _check_options(options, [kind])
+    for option in ("name", "options"):
+        if option in options and options.get("set") != "start":
+            raise QueryError(f"{option} is an option of set=start only")
     if "name" in options:
-        if options.get("set") != "start":
-            raise QueryError("name is an option of set=start only")
         name = options["name"]
         check_name(name)
     return Question(
@@ -87,6 +90,7 @@ def parse_question(
         fresh=options.get("fresh") == "true",
         stale_ok="stale" in options,
         set=options.get("set", ""),
+        options=options.get("options", ""),
     )
 
 
@@ -119,7 +123,7 @@ def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
             raise QueryError(
                 f"unknown option {quoted(name)} of {', '.join(kinds)}; accepted: {known or 'none'}"
             )
-        if accepted[name] != dict.fromkeys(ANY) and value not in accepted[name]:
+        if _ANY.isdisjoint(accepted[name]) and value not in accepted[name]:
             raise QueryError(f"{name}={quoted(value)} is not accepted; accepted: {', '.join(accepted[name])}")
 
 

@@ -215,5 +215,8 @@ class SourceQueries:
     async def _recording(self, question: Question) -> Answer:
         if not question.set:
             raise QueryError("recording needs an option; accepted: set=start;name=NAME, set=stop")
-        content = await self._recordings.control(start=question.set == "start", name=question.name)
-        return Answer(json_bytes(content), JSON)
+        if question.set == "start":
+            content, reply = await self._recordings.start(question.name, question.options)
+        else:
+            content, reply = await self._recordings.stop()
+        return Answer(json_bytes(content), JSON, {"reply": reply} if reply else {})

@@ -23,6 +23,8 @@ _KNOWN_COMMANDS: Final = (
 )
 _Named = TypeVar("_Named")
 _NUMBER: Final = re.compile(r"\d{1,9}(\.\d{1,20})?", re.ASCII)
+_OPTION: Final = re.compile(r"([a-z]+) *= *([^,]*)", re.IGNORECASE | re.ASCII)
+_UNITS_S: Final = {"seconds": 1, "minutes": 60, "hours": 3600}
 _MIN_HZ: Final = 1e-6  # the lowest frequency that str(Frequency), with six decimals, can represent
 
 
@@ -131,7 +133,7 @@ class ControlRecording:
 
     start: bool
     options: str = ""
-    """What follows Start, for example ",file=take.c3d"."""
+    """What follows Start, for example ",file=take1,duration=5,durationunits=seconds" (field note 26)."""
 
     def __str__(self) -> str:
         return f"Recording Start{self.options}" if self.start else "Recording Stop"
@@ -220,6 +222,25 @@ def _parse_recording(parameter: str) -> ControlRecording:
     if action.startswith("stop") and parameter[4:5] in {"", ",", " "}:
         return ControlRecording(start=False)
     raise CommandError("Recording takes Start or Stop, as in: Recording Start,file=take.c3d")
+
+
+def recording_options(text: str) -> dict[str, str]:
+    """Return the options in a command that starts a recording, or in its reply, by keyword in lower case."""
+    return {keyword.lower(): value.strip() for keyword, value in _OPTION.findall(text)}
+
+
+def recording_duration_s(options: str) -> float | None:
+    """Return the duration in the options of a recording, None if there is none. Raises CommandError."""
+    named = recording_options(options)
+    if "duration" not in named:
+        return None
+    unit_s = _UNITS_S.get(named.get("durationunits", "seconds").lower())
+    if unit_s is None or not _NUMBER.fullmatch(named["duration"]):
+        raise CommandError(
+            f"duration takes a number, and durationunits one of {', '.join(_UNITS_S)}, as in: "
+            "Recording Start,file=take1,duration=5,durationunits=seconds"
+        )
+    return float(named["duration"]) * unit_s
 
 
 def _parse_stream_frames(parameters: Sequence[str]) -> StreamFrames | StopStreaming:

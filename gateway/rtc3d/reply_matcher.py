@@ -46,7 +46,7 @@ ANSWERING_TYPES: Final[dict[type[Command], frozenset[PacketType]]] = {
 }
 """The packet types that answer each command; an error packet answers any command."""
 
-_VERBS: Final = r"(version|setbyteorder|sendparameters|sendcurrentframe|streamframes|bye)\b"
+_VERBS: Final = r"(version|setbyteorder|sendparameters|sendcurrentframe|streamframes|bye|recording)\b"
 _ACKNOWLEDGED: Final = re.compile(rf"(?:ok\W*)?{_VERBS}")
 """The command at the start of an acknowledgement's text, as all known servers write it (field note 1)."""
 _REFUSED: Final = re.compile(rf"\b{_VERBS}")

@@ -120,6 +120,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._is_full = False  # whether as many bytes as may wait for the client to read
         self._was_full = False  # whether it has been full before
         self._has_ended = False  # whether the client has closed its sending half
+        self._recording_end: asyncio.TimerHandle | None = None  # of a recording that has a duration
         self._first_sent_s: float | None = None  # when the first frame was sent, on the monotonic clock
         self._last_sent_s = 0.0  # when the newest frame was sent
         self.closed: asyncio.Future[None] = self._loop.create_future()
@@ -127,7 +128,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self.sent_counts = SentCounts()
         """What was sent to this client."""
         self.session = ClientSession(
-            SessionCallbacks(owner.frames, self._parameters_xml, owner.frames_requested)
+            SessionCallbacks(owner.frames, self._parameters_xml, owner.frames_requested, self._record_for)
         )
 
     @property
@@ -154,6 +155,7 @@ class ClientConnection(asyncio.BufferedProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
         self._inbox.clear()
+        self._record_for(None)
         self.filter.connection_lost()
         self._owner.connection_closed(self, exc)
         self.closed.set_result(None)
@@ -315,6 +317,14 @@ class ClientConnection(asyncio.BufferedProtocol):
             )
             self.close()
         self._close_if_ended()
+
+    def _record_for(self, duration_s: float | None) -> None:
+        """See SessionCallbacks."""
+        if self._recording_end is not None:
+            self._recording_end.cancel()
+            self._recording_end = None
+        if duration_s is not None:
+            self._recording_end = self._loop.call_later(duration_s, self.session.end_recording)
 
     def _parameters_xml(self, sections: Sequence[str]) -> bytes:
         address, port = self.transport.get_extra_info("sockname")[:2]

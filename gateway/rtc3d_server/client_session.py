@@ -18,6 +18,7 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
     parse_command,
+    recording_duration_s,
 )
 from gateway.rtc3d.components import ByteOrder, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
@@ -47,6 +48,10 @@ class SessionCallbacks:
     frames_requested: Callable[[], int | None]
     """Called when the client requests frames; returns the measurement's time in µs, None without one."""
 
+    record_for: Callable[[float | None], None] = lambda _duration_s: None
+    """Called when the client starts or stops a recording, with the time in s after which the caller has to
+    call ``end_recording``; None if only the client stops it."""
+
 
 class ClientSession:
     """The protocol with one client, independent of the transport.
@@ -73,7 +78,7 @@ class ClientSession:
         self.frames_without_events = 0
         """The number of frames that lack events, because too many waited for the client."""
         self.is_recording = False
-        """Whether the client started a recording, as WaveFront's clients do (field notes 16 and 18)."""
+        """Whether the client started a recording, as WaveFront's clients do (field notes 16, 18 and 26)."""
         self.said_bye = False
         """Whether the client sent Bye: close the connection once the replies are sent."""
 
@@ -180,8 +185,8 @@ class ClientSession:
                 self._stream_command = self._schedule = None
                 if not self._frame_requests:
                     self._events_from_us = None
-            case ControlRecording(start):
-                self._set_recording(start=start)
+            case ControlRecording(start, options):
+                self._set_recording(start=start, options=options)
             case Bye():
                 self.said_bye = True
                 return [encode_packet(PacketType.COMMAND, b"bye")]  # exactly these bytes: field note 14
@@ -223,7 +228,13 @@ class ClientSession:
         self.frames_without_events += packet.lacks_events
         return packet
 
-    def _set_recording(self, *, start: bool) -> None:
+    def end_recording(self) -> None:
+        """End the recording, because its duration is over."""
+        self._set_recording(start=False)
+
+    def _set_recording(self, *, start: bool, options: str = "") -> None:
+        """Start or stop a recording. Raises CommandError if the duration in ``options`` is none."""
+        self._callbacks.record_for(recording_duration_s(options))
         self.is_recording = start
         _log.info("%s: recording %s", self.name, "started" if start else "stopped")
 

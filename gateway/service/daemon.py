@@ -11,6 +11,7 @@ from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.log import DefectLog, defect_text
+from gateway.monitoring.process_limits import ProcessLimits, raise_file_limit
 from gateway.monitoring.server import MonitoringServer
 from gateway.monitoring.status_line import status_lines
 from gateway.service.process_end import Signals, named_tasks
@@ -27,6 +28,7 @@ async def serve(load: Callable[[], Settings], every_second: Callable[[], None] =
     ``every_second`` is called about once a second.
     Raises ConfigError if the settings cannot be used at the start.
     """
+    raise_file_limit()
     daemon = Daemon(load, Gateway(load()), every_second)
     in_loop = asyncio.get_running_loop().call_soon_threadsafe
     Signals(lambda: in_loop(daemon.request_stop), lambda: in_loop(daemon.hang_up), daemon.unfinished)
@@ -46,7 +48,8 @@ class Daemon:
         self._gateway = gateway
         self._every_second = every_second
         self._defects = DefectLog(logger, "gateway")
-        self._monitoring = MonitoringServer(gateway.settings.metrics, gateway)
+        self._limits = ProcessLimits()
+        self._monitoring = MonitoringServer(gateway.settings.metrics, gateway, self._limits)
         self._systemd = SystemdNotifier()
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
@@ -110,7 +113,7 @@ class Daemon:
 
     def _status_line(self) -> str:
         try:
-            lines = status_lines(self._gateway)
+            lines = [*self._limits.problems(), *status_lines(self._gateway)]
         except Exception as defect:  # noqa: BLE001 - what shows the status must not stop the gateway
             self._defects.log(defect)
             lines = [defect_text(defect)]
@@ -128,7 +131,7 @@ class Daemon:
 
     async def _replace_monitoring(self) -> None:
         await self._monitoring.close()
-        self._monitoring = MonitoringServer(self._gateway.settings.metrics, self._gateway)
+        self._monitoring = MonitoringServer(self._gateway.settings.metrics, self._gateway, self._limits)
         await self._monitoring.start()
 
     async def _reload(self) -> None:

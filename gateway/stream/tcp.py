@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 from gateway.config.settings import SourceSettings
-from gateway.errors import ConnectError
+from gateway.errors import FILES_ADVICE, NO_FILES, ConnectError
 from gateway.stream.names import look_up
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
@@ -91,6 +91,5 @@ async def _connect(
             f"connection refused by {server}; is the RT server running, and is this its port?"
         ) from error
     except OSError as error:
-        raise ConnectError(
-            f"no connection to {server}: {error.strerror or error}; check address, cable and routing"
-        ) from error
+        advice = FILES_ADVICE if error.errno in NO_FILES else "check address, cable and routing"
+        raise ConnectError(f"no connection to {server}: {error.strerror or error}; {advice}") from error

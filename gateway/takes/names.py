@@ -10,6 +10,8 @@ from gateway.errors import QueryError
 MAX_NAME_LENGTH: Final = 100
 
 _NAME: Final = re.compile(r"[\w.+-][\w .+-]*")
+_EXTENSION: Final = re.compile(r"\.[A-Za-z]\w{1,4}$")
+_OTHER: Final = re.compile(r"[^\w .+-]")
 _NUMBER: Final = re.compile(r"(\d+)")
 
 
@@ -20,6 +22,15 @@ def check_name(name: str) -> None:
             f"{name[:MAX_NAME_LENGTH]!r} cannot be the name of a take: expected 1 to {MAX_NAME_LENGTH} "
             "letters, digits, spaces and any of '_.-+', without a space or a dot at the beginning"
         )
+
+
+def name_of_file(path: str) -> str:
+    """Return the name of the take of a server's file: without folder, extension and what no take can have.
+
+    Returns "" if nothing remains.
+    """
+    name = _EXTENSION.sub("", re.split(r"[\\/]", path)[-1].strip("'\" "))
+    return _OTHER.sub("_", name).lstrip(" .")[:MAX_NAME_LENGTH]
 
 
 def default_name(source: str) -> str:

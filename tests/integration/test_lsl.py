@@ -29,6 +29,8 @@ SCENE: Final = (
     *("--markers", "4", "--tools", "2", "--analog", "3", "--plates", "1"),
 )
 TIMEOUT_S: Final = 30.0
+WAITING_S: Final = 3.0
+"""How long no gateway runs: longer than the first searches of liblsl, which come in quick succession."""
 
 
 class Lab:
@@ -47,10 +49,14 @@ class Lab:
         }
         self.file.write_text(yaml.safe_dump(self.configuration))
         self._exit = ExitStack()
+        self._gateway = self._exit.enter_context(ExitStack())
 
     def start(self, **environ: str) -> None:
-        log = self._exit.enter_context(self.log_file.open("wb"))
-        self._exit.enter_context(program("run", "--config", str(self.file), stderr=log, environ=environ))
+        log = self._gateway.enter_context(self.log_file.open("wb"))
+        self._gateway.enter_context(program("run", "--config", str(self.file), stderr=log, environ=environ))
+
+    def stop(self) -> None:
+        self._gateway.close()
 
     def receive(self, *names: str) -> LslReceiver:
         """Connect a receiver, and wait until it has the streams."""
@@ -139,6 +145,18 @@ def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path) -
         lab.close()
     times_s = [time_s for time_s, _ in receiver.samples["lab_3d"]]
     assert np.diff(times_s).tolist() == pytest.approx([1 / RATE_HZ] * (len(times_s) - 1), abs=5e-3)
+
+
+def test_receivers_that_wait_continue_with_all_streams_of_the_next_gateway(tmp_path: Path) -> None:
+    """With ResolveScope = machine alone, they find one of five."""
+    with running(tmp_path) as lab:
+        receiver = lab.receive(*NAMES)
+        wait_until(lambda: all(has(receiver, name, 1)() for name in NAMES), TIMEOUT_S)
+        lab.stop()
+        time.sleep(WAITING_S)
+        receiver.forget()
+        lab.start()
+        wait_until(lambda: all(has(receiver, name, 1)() for name in NAMES), TIMEOUT_S)
 
 
 def test_the_doctor_finds_the_streams_of_a_running_gateway(tmp_path: Path) -> None:

@@ -305,10 +305,13 @@ async def test_recordings_are_started_and_stopped_for_a_single_source() -> None:
         await query_all(peer, "mocap/**?set=start")
         await query(peer, "mocap/lab/parameters?fresh=true")
         assert server.received == []
-        reply = await query(peer, "mocap/lab/recording?set=start;name=walk 1")
+        options = "duration=900,durationunits=seconds"
+        reply = await query(peer, f"mocap/lab/recording?set=start;name=walk 1;options={options}")
         assert reply.json == {"source": "lab", "sent": "start", "name": "walk 1", "is_named": True}
+        start = f"Recording Start,file=walk 1,{options}"
+        assert reply.attachment == {"reply": f"OK-{start}"}
         assert (await query(peer, "mocap/lab/recording?set=stop")).json == {"source": "lab", "sent": "stop"}
-        assert server.commands[-2:] == ["Recording Start,file=walk 1.c3d", "Recording Stop"]
+        assert server.commands[-2:] == [start, "Recording Stop"]
         for change in ("start", "stop"):
             assert (await query(peer, f"mocap/lab/recording?set={change}")).json["sent"] == change
         await wait_until_async(lambda: len(server.received) == 2)

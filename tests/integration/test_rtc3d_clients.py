@@ -142,9 +142,12 @@ async def test_recordings_are_passed_on_to_the_server_with_remote_control() -> N
             client.send(packet(DATA, event))
             assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
             assert is_recording(simulator) is is_started
-        for text, is_started in (("Recording Start,file=walk.c3d", True), ("Recording Stop", False)):
+        named = "Recording Start,file=take1.tsv,duration=900,durationunits=seconds"
+        for text, is_started in ((named, True), ("Recording Stop", False)):
             assert await client.ask(text) == (COMMAND, f"OK-{text}".encode())
             assert is_recording(simulator) is is_started
+        await client.ask("Recording Start,duration=0.01")
+        await until(lambda: not is_recording(simulator))
 
 
 # Reloads ------------------------------------------------------------------------------------

@@ -12,7 +12,14 @@ from typing import Any, BinaryIO, Final, Protocol
 from gateway.errors import CommandError, FrameError, QueryError
 from gateway.log import DefectLog
 from gateway.rtc3d import commands
-from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, Packet, PacketType, decode_text
+from gateway.rtc3d.packets import (
+    PACKET_HEADER,
+    PACKET_HEADER_BYTES,
+    Packet,
+    PacketType,
+    decode_text,
+    encode_packet,
+)
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS, error_packet, recording_switch
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.worker_thread import WorkerThread
@@ -45,8 +52,10 @@ for a client to which data is being sent. It also ends connections on which noth
 
 _log = logging.getLogger(__name__)
 
-ControlRecording = Callable[[str, bool, str], Coroutine[Any, Any, None]]
-"""Starts (True) or stops the recording of a source, with a name or ""; raises QueryError."""
+ControlRecording = Callable[[str, bool, str], Coroutine[Any, Any, str]]
+"""Starts (True) or stops the recording of a source, with options or ""; raises QueryError.
+
+Returns the text of the server's reply, "" if it sent none."""
 
 
 class FilterOwner(Protocol):
@@ -65,8 +74,8 @@ class FilterOwner(Protocol):
     def apply_parameters(self) -> None:
         """Serve the newest parameters of the source."""
 
-    def control_recording(self, *, start: bool, name: str) -> Coroutine[Any, Any, None]:
-        """Start or stop a recording on the source's server. Raises QueryError."""
+    def control_recording(self, *, start: bool, options: str) -> Coroutine[Any, Any, str]:
+        """Start or stop a recording on the source's server; return its reply or "". Raises QueryError."""
 
     def file_lost(self, client: str, path: Path, reason: str) -> None:
         """Count and log a C3D file that a client does not get."""
@@ -170,7 +179,9 @@ class ClientFilter(ConnectionFilter):
     async def _control(self, packet: Packet, control: commands.ControlRecording) -> list[bytes]:
         try:
             async with asyncio.timeout(_CONTROL_S):
-                await self._owner.control_recording(start=control.start, name=recording_name(control.options))
+                reply = await self._owner.control_recording(start=control.start, options=control.options)
+            if reply:
+                return [encode_packet(PacketType.COMMAND, reply.encode("latin-1"))]
             return self.connection.answer(packet)
         except (QueryError, TimeoutError) as error:
             text = str(error) or f"no answer within {_CONTROL_S:g} s"
@@ -251,12 +262,6 @@ def asks_for_parameters(packet: Packet) -> bool:
     """Return whether a packet is SendParameters."""
     words = decode_text(packet.body[:_LONGEST_NAME]).split() if packet.type == PacketType.COMMAND else []
     return bool(words) and words[0].lower() == "sendparameters"
-
-
-def recording_name(options: str) -> str:
-    """Return the name in the options of a recording, such as ",file=take 1.c3d"; "" if there is none."""
-    name, _, value = options.strip(" ,").partition("=")
-    return value.strip().removesuffix(".c3d") if name.strip().lower() == "file" else ""
 
 
 def _done(control: commands.ControlRecording) -> str:

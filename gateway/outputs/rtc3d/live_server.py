@@ -222,9 +222,9 @@ class LiveServer(RtServer):
 
     # For connections ------------------------------------------------------------------------
 
-    def control_recording(self, *, start: bool, name: str) -> Coroutine[Any, Any, None]:
-        """Start or stop a recording on the source's server. Raises QueryError."""
-        return self._control(self._state.source, start, name)
+    def control_recording(self, *, start: bool, options: str) -> Coroutine[Any, Any, str]:
+        """Start or stop a recording on the source's server; return its reply or "". Raises QueryError."""
+        return self._control(self._state.source, start, options)
 
     def file_lost(self, client: str, path: Path, reason: str) -> None:
         """Count and log a C3D file that a client does not get."""

@@ -198,15 +198,16 @@ class Rtc3dOutput(Output):
         """Use ``service`` for clients that start and stop recordings."""
         self._queries = service
 
-    async def _control_recording(self, source: str, start: bool, name: str) -> None:
-        """Ask the gateway's event loop. Called in the thread. Raises QueryError."""
+    async def _control_recording(self, source: str, start: bool, options: str) -> str:
+        """Ask the gateway's event loop; return the server's reply or "". In the thread. Raises QueryError."""
         assert self._loop is not None  # noqa: S101 - there is a source, so watch_wanted was called
         assert self._queries is not None  # noqa: S101 - the gateway has set it before ``start``
-        options = {CONTROL_OPTION: "start" if start else "stop"}
-        if start and name:
-            options["name"] = name
-        answer = self._queries.answer(source, _RECORDING, options)
-        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(answer, self._loop))
+        query = {CONTROL_OPTION: "start" if start else "stop"}
+        if start and options:
+            query["options"] = options
+        answering = self._queries.answer(source, _RECORDING, query)
+        answer = await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(answering, self._loop))
+        return str(answer.attachment.get("reply", ""))
 
     # Ports ----------------------------------------------------------------------------------
 

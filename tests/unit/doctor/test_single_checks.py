@@ -90,6 +90,11 @@ def test_only_sources_that_are_not_served_are_warnings() -> None:
     assert results(report, "lab", "hall") == [("stream", Result.WARNING), *passing]
 
 
+def test_what_the_system_refuses_to_the_gateway_is_a_failure() -> None:
+    report = HealthReport(process=["no file; close some"], streams=[stream()], outputs=[], losses=[])
+    assert results(report, "lab")[0] == ("health", Result.FAILING)
+
+
 @pytest.mark.parametrize(("last_minute", "result"), [(0, Result.NOTE), (1, Result.WARNING)])
 def test_only_recent_loss_is_a_warning(last_minute: int, result: Result) -> None:
     """What was lost long ago is history."""

@@ -160,7 +160,7 @@ async def test_an_exception_in_a_page_is_logged_once_and_ends_only_that_request(
 
 async def test_closing_disconnects_clients_and_frees_the_port(site: Site) -> None:
     again = HttpPages({})
-    with pytest.raises(OSError, match="address already in use"):
+    with pytest.raises(OSError, match="Address already in use"):
         await again.start(["127.0.0.1"], site.port)
     reader, writer = await site.connect()
     await wait_until_async(lambda: site.pages._connections)

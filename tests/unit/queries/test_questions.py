@@ -25,6 +25,10 @@ MARKERS_ONLY = frozenset({ComponentType.MARKERS})
         ("schema/rtc3d.marker_t", {}, Question("schema", "marker_t")),
         ("recording", {"set": "start"}, Question("recording", set="start")),
         ("recording", {"set": "start", "name": "walk 1"}, Question("recording", "walk 1", set="start")),
+        (
+            *("recording", {"set": "start", "options": ",duration=5"}),
+            Question("recording", set="start", options=",duration=5"),
+        ),
         ("recording", {}, Question("recording")),
     ],
 )
@@ -45,6 +49,7 @@ def test_an_unknown_key_is_refused(key: str) -> None:
     ("options", "text"),
     [
         ({"set": "stop", "name": "walk"}, "name is an option of set=start only"),
+        ({"set": "stop", "options": "duration=5"}, "options is an option of set=start only"),
         ({"name": "walk"}, "name is an option of set=start only"),
         ({"set": "start", "name": ""}, "cannot be the name of a take"),
         ({"set": "start", "name": "../x"}, "cannot be the name of a take"),

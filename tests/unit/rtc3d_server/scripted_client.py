@@ -13,12 +13,14 @@ class ScriptedClient:
     def __init__(self, rate_hz: float = 100.0) -> None:
         self.scene = CountingScene(rate_hz)
         self.elapsed_us: int | None = 0
+        self.recording_durations_s: list[float | None] = []
         general = General(name="server under test")
         self.session = ClientSession(
             SessionCallbacks(
                 frames=lambda components: self.scene.frames(components, 24),
                 parameters_xml=lambda sections: self.scene.parameters_xml(sections, general),
                 frames_requested=lambda: self.elapsed_us,
+                record_for=self.recording_durations_s.append,
             )
         )
 

@@ -88,6 +88,33 @@ def test_a_recording_is_started_and_stopped(
 
 
 @pytest.mark.parametrize(
+    ("options", "duration_s"),
+    [
+        ("", None),
+        (",file=take1,duration=5,durationunits=seconds", 5),
+        (",DurationUnits=Minutes,Duration = 1.5 ,file=take1.tsv", 90),
+    ],
+)
+def test_the_duration_ends_a_recording(
+    client: ScriptedClient, options: str, duration_s: float | None
+) -> None:
+    """Field note 26, in any order and any case."""
+    client.send(f"Recording Start{options}")
+    assert client.recording_durations_s == [duration_s]
+    client.session.end_recording()
+    assert (client.session.is_recording, client.recording_durations_s[1:]) == (False, [None])
+
+
+@pytest.mark.parametrize("options", [",duration=soon", ",duration=-1", ",duration=5,durationunits=frames"])
+def test_a_duration_that_the_server_does_not_understand_is_an_error(
+    client: ScriptedClient, options: str
+) -> None:
+    [(packet_type, text)] = client.send(f"Recording Start{options}")
+    assert (packet_type, b"one of seconds, minutes, hours" in text) == (ERROR, True)
+    assert not client.session.is_recording
+
+
+@pytest.mark.parametrize(
     "body",
     [
         b"",

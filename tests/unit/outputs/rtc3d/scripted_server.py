@@ -154,7 +154,7 @@ class ScriptedServer(LiveServer):
         self.losses = self.state.losses = Losses(logging.getLogger(__name__), "lab to rtc3d")
         self.changes: list[bool] = []
         self.asked: list[tuple[str, bool, str]] = []
-        self.answers: asyncio.Queue[Exception | None] = asyncio.Queue()
+        self.answers: asyncio.Queue[Exception | str] = asyncio.Queue()
         super().__init__(self.state, "127.0.0.1", 0, max_clients, self._wanted_changed, self._control)
         self.files = self.disk = Disk()  # type: ignore[assignment]
         self._live_scene._arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
@@ -166,13 +166,15 @@ class ScriptedServer(LiveServer):
     def _wanted_changed(self) -> None:
         self.changes.append(self.state.wanted)
 
-    def _control(self, source: str, start: bool, name: str) -> Coroutine[Any, Any, None]:
-        self.asked.append((source, start, name))
+    def _control(self, source: str, start: bool, options: str) -> Coroutine[Any, Any, str]:
+        self.asked.append((source, start, options))
         return self._answer()
 
-    async def _answer(self) -> None:
-        if (error := await self.answers.get()) is not None:
-            raise error
+    async def _answer(self) -> str:
+        answer = await self.answers.get()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
     def client(self) -> Client:
         return Client(self)

@@ -12,7 +12,6 @@ from gateway.outputs.rtc3d.client_filter import (
     MAX_HELD_PACKETS,
     asks_for_parameters,
     recording_control,
-    recording_name,
 )
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
 from gateway.rtc3d.commands import ControlRecording
@@ -66,15 +65,15 @@ async def test_the_system_is_asked_to_notice_vanished_clients() -> None:
 
 @in_virtual_time
 async def test_a_recording_is_acknowledged_once_it_is_done(server: ScriptedServer, client: Client) -> None:
-    """Commands after it wait, so that a client sees the replies in order."""
-    start, stop = "Recording Start,file=walk.c3d", "Recording Stop"
-    assert await client.ask(start, stop, "Version 1.0") == []
-    assert server.asked == [("lab", True, "walk")]
-    await server.answers.put(None)
+    """Commands after it wait, so that a client sees the replies in order. It gets those of the server."""
+    options = ", File=take1.tsv,duration=5,durationunits=seconds"
+    assert await client.ask(f"recording Start{options}", "Recording Stop", "Version 1.0") == []
+    assert server.asked == [("lab", True, options)]
+    await server.answers.put("ok file=take1_002.tsv\xe9")
     await settle()
-    assert client.receive() == [(COMMAND, f"OK-{start}".encode())]
+    assert client.receive() == [(COMMAND, b"ok file=take1_002.tsv\xe9")]
     assert server.asked[1:] == [("lab", False, "")]
-    await server.answers.put(None)
+    await server.answers.put("")
     await settle()
     assert client.receive() == [(COMMAND, b"OK-Recording Stop"), VERSION]
     await asyncio.sleep(20)
@@ -253,17 +252,6 @@ def test_the_recording_packet_starts_and_stops(sign: str, ending: bytes) -> None
 )
 def test_only_recording_commands_start_and_stop(sent: Packet, control: ControlRecording | None) -> None:
     assert recording_control(sent) == control
-
-
-@pytest.mark.parametrize(
-    ("options", "name"),
-    [
-        *(("", ""), (",rate=200", ""), (",file=walk.c3d", "walk"), (" file=walk", "walk")),
-        *((", File = walk 1.c3d ", "walk 1"), (r",file=C:\data\walk.c3d", r"C:\data\walk")),
-    ],
-)
-def test_the_name_of_a_recording(options: str, name: str) -> None:
-    assert recording_name(options) == name
 
 
 def test_requests_for_parameters_are_recognised() -> None:

@@ -12,7 +12,8 @@ import pytest
 from gateway.errors import GatewayError, OutputError
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
-from gateway.outputs.contract import CONTROL_OPTION, ServerFile, ServerParameters
+from gateway.outputs.contract import CONTROL_OPTION, Answer, ServerFile, ServerParameters
+from gateway.outputs.encodings import JSON
 from gateway.outputs.rtc3d import output as output_module
 from gateway.outputs.rtc3d.live_server import SourceState
 from gateway.outputs.rtc3d.output import Rtc3dOutput
@@ -63,7 +64,7 @@ class Server:
     port: int
     max_clients: int
     wanted_changed: Callable[[], None]
-    control: Callable[[str, bool, str], Coroutine[Any, Any, None]]
+    control: Callable[[str, bool, str], Coroutine[Any, Any, str]]
     taken: list[tuple[int, frozenset[ComponentType]]] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
     num_applied: int = 0
@@ -301,13 +302,14 @@ async def test_a_defect_in_one_frame_does_not_end_the_thread() -> None:
 
 @in_virtual_time
 async def test_recordings_are_passed_on_to_the_source() -> None:
-    """The name belongs to the start only."""
+    """The options belong to the start only."""
     asked: list[object] = []
     changes: list[int] = []
 
     class Queries:
-        async def answer(self, source: str, path: Sequence[str], options: Mapping[str, str]) -> None:
+        async def answer(self, source: str, path: Sequence[str], options: Mapping[str, str]) -> Answer:
             asked.append((source, path, dict(options)))
+            return Answer(b"{}", JSON, {"reply": "OK"} if "options" in options else {})
 
     output = Rtc3dOutput(settings({"lab": LAB}))
     output.serve_queries(Queries())  # type: ignore[arg-type]
@@ -315,9 +317,11 @@ async def test_recordings_are_passed_on_to_the_source() -> None:
     output.announce("lab")
     output.start()
     await settle()
-    for start, name in ((True, "walk"), (True, ""), (False, "walk")):
-        await Server.opened["lab"].control("lab", start, name)
-    options = ({CONTROL_OPTION: "start", "name": "walk"}, {CONTROL_OPTION: "start"}, {CONTROL_OPTION: "stop"})
+    controls = ((True, ",file=a,b=c"), (True, ""), (False, ",x"))
+    replies = [await Server.opened["lab"].control("lab", *control) for control in controls]
+    assert replies == ["OK", "", ""]
+    start = {CONTROL_OPTION: "start"}
+    options = (start | {"options": ",file=a,b=c"}, start, {CONTROL_OPTION: "stop"})
     assert asked == [("lab", ("recording",), each) for each in options]
     Server.opened["lab"].wanted_changed()
     await settle()

@@ -1,0 +1,93 @@
+"""What the system may refuse to the whole process: further open files, which connections are, too."""
+
+import contextlib
+import errno
+import logging
+import os
+import resource
+from typing import Final
+
+from gateway.errors import FILES_ADVICE, NO_FILES
+from gateway.log import HOLD_S, FailureLog
+
+MAX_FILES: Final = 65_536
+"""How many files the gateway wants to open at most: more than the clients that its outputs accept."""
+
+logger = logging.getLogger(__name__)
+
+
+def raise_file_limit() -> None:
+    """Let the process open as many files as the system allows it, at most MAX_FILES.
+
+    The limit that programs start with is usually 1024, for the sake of programs that use select().
+    """
+    with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        wanted = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
+        if soft != resource.RLIM_INFINITY and soft < wanted:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+class ProcessLimits:
+    """Finds out what the system refuses now, and logs when that begins and ends."""
+
+    def __init__(self) -> None:
+        self._failures = FailureLog(logger, "gateway", HOLD_S)
+
+    def problems(self) -> list[str]:
+        """Return what the system refuses now, and what to do. Call it once a second, or more often."""
+        problem = _file_problem()
+        if problem:
+            self._failures.failed(problem)
+        else:
+            self._failures.recovered("files can be opened again")
+        return [problem] if problem else []
+
+
+def _file_problem() -> str:
+    most = ""
+    try:
+        os.close(os.open(os.devnull, os.O_RDONLY))
+    except OSError as error:
+        if error.errno == errno.ENFILE:
+            return (
+                "the computer has no file descriptor left, so nobody can connect, and no file can be opened; "
+                "end programs that have many files open, or raise fs.file-max"
+            )
+        if error.errno in NO_FILES:
+            with contextlib.suppress(OSError):  # a sandbox may forbid it
+                most = f" {resource.getrlimit(resource.RLIMIT_NOFILE)[0]}"
+            return (
+                f"all{most} file descriptors of the gateway are in use, so nobody can connect, and no file "
+                f"can be opened; {FILES_ADVICE}"
+            )
+    return ""
+
+
+class ReservedFiles:
+    """File descriptors that are kept for when none is left.
+
+    ``use`` frees one, and whatever opens a file next gets it. ``refill`` takes back what is free again.
+    """
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._reserved: list[int] = []
+
+    def use(self) -> bool:
+        """Free one; return False if none is left."""
+        if not self._reserved:
+            return False
+        os.close(self._reserved.pop())
+        return True
+
+    def refill(self) -> None:
+        """Reserve as many as are missing, if the system allows it."""
+        with contextlib.suppress(OSError):
+            while len(self._reserved) < self._number:
+                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
+
+    def close(self) -> None:
+        """Free all."""
+        while self.use():
+            pass
