@@ -32,12 +32,14 @@ class Field(NamedTuple):
     """The place of a dataclass's field in XML: ``path`` leads there from the dataclass's element.
 
     If a step of ``path`` ends in *, the element is repeated and the field is a tuple. @id is the attribute.
-    ``kind`` is str, int, float or a dataclass in LAYOUT.
+    ``kind`` is str, int, float or a dataclass in LAYOUT. If it ``may_be_empty``, an empty text does not
+    become the default.
     """
 
     name: str
     path: str
     kind: type = str
+    may_be_empty: bool = False
 
 
 _ID_LABEL_DESCRIPTION: Final = (
@@ -74,7 +76,11 @@ LAYOUT: Final[dict[type, tuple[Field, ...]]] = {
     ),
     Tool: (*_ID_LABEL_DESCRIPTION, Field("marker_ids", "Markers/Marker*/@id")),
     ParametersAnalog: (Field("channels", "Channels/Channel*", AnalogChannel),),
-    AnalogChannel: (*_ID_LABEL_DESCRIPTION, Field("unit", "Unit"), Field("frequency_hz", "Frequency", float)),
+    AnalogChannel: (
+        *_ID_LABEL_DESCRIPTION,
+        Field("unit", "Unit", may_be_empty=True),
+        Field("frequency_hz", "Frequency", float),
+    ),
     ParametersForce: (Field("plates", "Plates/Plate*", Plate),),
     Plate: (
         Field("id", "@id"),

@@ -58,10 +58,11 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
 
     Parses liberally (field note 9): unknown elements and text between elements are ignored, sections may
     be absent, NULs at the end and white space around texts are dropped, and the case of tags is ignored.
-    A field that is absent or cannot be read gets its default; a cell of a calibration matrix gets NaN. XML
-    that is not well-formed, such as the specification's own examples in §6.5 and §6.6, is repaired as a
-    human would read it. ``recovered`` has a line for each fault, up to MAX_RECOVERED. Items after the first
-    MAX_ITEMS of a list, and texts after MAX_TEXT_CHARACTERS, are left out.
+    A field that is absent or cannot be read gets its default; a cell of a calibration matrix gets NaN. An
+    analog channel with an empty unit has none. XML that is not well-formed, such as the specification's own
+    examples in §6.5 and §6.6, is repaired as a human would read it. ``recovered`` has a line for each fault,
+    up to MAX_RECOVERED. Items after the first MAX_ITEMS of a list, and texts after MAX_TEXT_CHARACTERS, are
+    left out.
 
     Raises ParametersError, and nothing else, if the XML has no parameters, declares entities, or is larger
     than MAX_XML_BYTES.
@@ -215,6 +216,9 @@ def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) 
 def _read(kind: type, element: etree._Element, notes: list[str]) -> Any:
     """Return the dataclass ``kind`` that ``element`` describes; absent fields have their defaults."""
     values = {field.name: _value(element, field.path, field.kind, notes) for field in LAYOUT[kind]}
+    for field in LAYOUT[kind]:
+        if field.may_be_empty and values[field.name] is None and element.find(field.path) is not None:
+            values[field.name] = ""
     return kind(**{name: value for name, value in values.items() if value is not None})
 
 

@@ -171,6 +171,14 @@ def test_absent_and_empty_values_get_their_defaults() -> None:
     )
 
 
+def test_an_analog_channel_with_an_empty_unit_has_none() -> None:
+    """The unit of a channel can be unknown, and mV would be wrong by 1000 for one in V."""
+    xml = encode_parameters(Parameters(analog=ParametersAnalog((AnalogChannel("1", unit=""),))))
+    analog = parse_parameters(xml).parameters.analog
+    assert analog is not None
+    assert analog.channels[0].unit == ""
+
+
 @pytest.mark.parametrize("number", ["3020.0", "9" * 400, "9" * 5000])
 def test_a_port_that_is_not_a_whole_number_is_none_and_reported(number: str) -> None:
     parameters, [note] = parse_parameters(

@@ -1,5 +1,6 @@
 import logging
 import os
+import struct
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ import pytest
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D, Point
-from gateway.simulator.c3d_scene import C3dScene, _markers
+from gateway.simulator import c3d_reader
+from gateway.simulator.c3d_recording import _markers
+from gateway.simulator.c3d_scene import C3dScene
 
 MISSING = b"\xff" * 12 + bytes.fromhex("4479C000")  # X, Y, Z all ones; 999.0
 
@@ -113,6 +116,37 @@ def test_parameters_are_those_of_the_file(path: Path) -> None:
     assert [channel.unit for channel in plate.channels] == ["N", "N", "N", "Nmm", "Nmm", "Nmm"]
 
 
+def test_units_that_the_file_does_not_say_are_not_invented(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Field note 28: one unit for many channels. Points are in mm in nearly all files."""
+    content = new_recording()
+    content["parameters"]["POINT"]["UNITS"]["value"] = []
+    content["parameters"]["ANALOG"]["UNITS"]["value"] = [
+        "V"
+    ] * 7  # ezc3d would add empty ones to a single one
+    path = written(content, tmp_path)
+    seven, one = b"\xff\2\1\7VVVVVVV\0", b"\xff\2\1\1V\6      "  # the spaces are a description
+    path.write_bytes(path.read_bytes().replace(seven, one))
+    parameters = C3dScene(path).parameters
+    assert parameters.markers is not None
+    assert parameters.analog is not None
+    assert parameters.force is not None
+    assert [channel.unit for channel in parameters.analog.channels] == ["V"] + [""] * 6
+    [plate] = parameters.force.plates
+    found = [parameters.markers.unit, plate.corners[0].unit, plate.channels[5].unit]
+    assert found == ["mm", "mm", "Nmm"]
+    assert [text in caplog.text for text in ("6 of its 7 analog channels", "mm is assumed")] == [True, True]
+
+
+def test_a_unit_cut_to_four_characters_is_whole(tmp_path: Path) -> None:
+    content = new_recording()
+    content["parameters"]["POINT"]["UNITS"]["value"] = ["mete"]
+    markers = C3dScene(written(content, tmp_path)).parameters.markers
+    assert markers is not None
+    assert markers.unit == "m"
+
+
 def test_markers_without_labels_are_numbered(tmp_path: Path) -> None:
     content = new_recording()
     content["parameters"]["POINT"]["LABELS"]["value"] = ["heel", ""]
@@ -145,6 +179,63 @@ def test_force_plates_of_an_unknown_type_are_left_out_with_a_warning(
     assert "force plates" in caplog.text
 
 
+def test_the_group_event_is_played_at_its_times_in_each_pass(tmp_path: Path) -> None:
+    """Times count from frame 1 of the trial, and this file begins with frame 101, after 1 s."""
+    content = new_recording()
+    for name, values in (
+        ("USED", [3]),
+        ("LABELS", ["Foot Strike", "Foot Off"]),
+        ("LABELS2", ["Foot Strike"]),
+        ("CONTEXTS", ["Right", "Left"]),
+        ("CONTEXTS2", ["Left"]),
+    ):
+        content.add_parameter("EVENT", name, values)
+    content.add_parameter("EVENT", "TIMES", np.array([[0.0, 0.0], [1.03, 1.02]]))
+    content.add_parameter("EVENT", "TIMES2", np.array([[0.0], [1.0]]))
+    content.add_parameter("TRIAL", "ACTUAL_START_FIELD", [101, 0])
+    take = C3dScene(written(content, tmp_path))
+    assert take.parameters.events is not None
+    labels = {int(each.id): each.label for each in take.parameters.events.events}
+    [context] = take.parameters.events.events[0].parameters
+    sides = {int(each.value): each.label for each in context.expected_values}
+    events = take.events(20_000, 80_001)
+    found = [
+        (each["timestamp"], labels[each["id"]], sides[each["param1"]], each["param2"]) for each in events
+    ]
+    assert context.description == "Context"
+    assert found == [
+        (20_000, "Foot Off", "Left", -1),
+        (30_000, "Foot Strike", "Right", -1),
+        (50_000, "Foot Strike", "Left", -1),
+        (70_000, "Foot Off", "Left", -1),
+        (80_000, "Foot Strike", "Right", -1),
+    ]
+
+
+def test_events_of_the_header_are_played_if_there_is_no_group(path: Path) -> None:
+    whole = bytearray(path.read_bytes())
+    struct.pack_into("<HH2x2f", whole, 149 * 2, 0x3039, 2, 0.04, 0.01)
+    whole[198 * 2 : 198 * 2 + 8] = b"LHS RTO "
+    path.write_bytes(whole)
+    take = C3dScene(path)
+    assert take.parameters.events is not None
+    labels = {int(each.id): each.label for each in take.parameters.events.events}
+    events = take.events(0, 50_000)
+    assert [(each["timestamp"], labels[each["id"]]) for each in events] == [(10_000, "RTO"), (40_000, "LHS")]
+
+
+def test_events_outside_of_the_frames_are_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = new_recording()
+    content.add_parameter("EVENT", "USED", [2])
+    content.add_parameter("EVENT", "LABELS", ["a", "b"])
+    content.add_parameter("EVENT", "TIMES", np.array([[1.0, 0.0], [0.0, 0.049]]))
+    events = C3dScene(written(content, tmp_path)).events(0, 50_000)
+    assert events["timestamp"].tolist() == [40_000]  # with the last frame, so that --once has it, too
+    assert "1 of 2 events" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [(b"", "is not a C3D file"), (b"no C3D file\n" * 999, "is not a C3D file"), (None, "No such file")],
@@ -171,6 +262,41 @@ def test_a_file_cut_short_before_its_data_is_refused_and_one_cut_in_it_plays_up_
             C3dScene(path)
     path.write_bytes(whole[:-600])
     assert C3dScene(path).num_frames == 4
+
+
+def test_a_file_with_an_impossible_size_is_refused_before_it_is_read(path: Path) -> None:
+    """ezc3d would allocate what the file states."""
+    whole = bytearray(path.read_bytes())
+    at = whole.index(b"LABELS", 512) + len("LABELS") + 2  # behind the offset: type, number of sizes, sizes
+    whole[at : at + 5] = b"\xff\x03\xff\xff\xff"
+    path.write_bytes(whole)
+    with pytest.raises(TakeError, match="its parameter POINT:LABELS would have 16581375 bytes") as raised:
+        C3dScene(path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "problem"),
+    [("_MEMORY_BYTES", 200 * 1024**2, "more than 210 MB of memory"), ("_WALL_FACTOR", 0, "more than 0 s")],
+)
+def test_a_file_that_takes_too_much_is_refused(
+    path: Path, limit: str, value: int, problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not every damage is visible in the sizes; this file has a rate that would make ezc3d use 28 GB."""
+    monkeypatch.setattr(c3d_reader, limit, value)
+    monkeypatch.setattr(c3d_reader, "_MEMORY_PER_BYTE", 0)
+    monkeypatch.setattr(c3d_reader, "problem_of_sizes", lambda *_: "")
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(struct.pack("<f", 1000.0), struct.pack("<f", 1e10)))
+    with pytest.raises(TakeError, match=problem) as raised:
+        C3dScene(path)
+    assert str(path) in str(raised.value)
+
+
+def test_a_file_that_makes_ezc3d_crash_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(TakeError, match=r"take\.c3d cannot be read as a C3D file: reading it crashed"):
+        C3dScene(path)
 
 
 def test_without_ezc3d_the_error_says_how_to_install_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
