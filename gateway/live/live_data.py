@@ -48,6 +48,8 @@ class LiveSource(Source):
         """The server's parameters; without any section until they come."""
         self.parameters_version = 0
         self.newest_status: rtc3d.status_t | None = None
+        self.first_status: rtc3d.status_t | None = None
+        """The first status since the gateway's start that came here."""
         self.num_unreadable = 0
         """How many parameters and statuses could not be read."""
         self._read_parameters: bytes | None = None
@@ -107,7 +109,9 @@ class LiveSource(Source):
 
     def _decode_status(self, message: bytes) -> None:
         try:
-            self.newest_status = decode(message)
+            former, self.newest_status = self.newest_status, decode(message)
+            if former is None or former.sequence > self.newest_status.sequence:
+                self.first_status = self.newest_status
             self._status_s = time.monotonic()
         except ProtocolError as error:
             self.num_unreadable += 1

@@ -35,6 +35,9 @@ SKIPPED: Final = "skipped while behind"
 FRAME_REJECTED: Final = "frame rejected"
 """The cause under which frames that contradict themselves are counted."""
 
+NOT_SENT: Final = "not sent by the server"
+"""The cause under which frames that the server numbered and did not send are counted."""
+
 _CONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING)
 _RECEIVING: Final = (StreamState.STREAMING, StreamState.NO_MEASUREMENT)
 
@@ -257,7 +260,7 @@ class StreamStatus:
     def frames_unsent(self, num_frames: int, num_messages: int) -> None:
         """Count frames that the server numbered and did not send."""
         self.losses.lost(
-            "not sent by the server",
+            NOT_SENT,
             f"the server did not send {num_frames} of the frames that it numbered; "
             "is it too busy, or did this gateway not read for too long?",
             messages=num_messages,

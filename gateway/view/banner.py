@@ -30,12 +30,8 @@ def banner_html(
         )
     if len(sources) > MAX_SOURCES:
         lines += f"<p class=dim>and {counted(len(sources) - MAX_SOURCES, 'more source')}</p>"
-    # The last line appears after some seconds, by an animation of the style sheet. A new text begins it
-    # again, and the text differs every second. So the page itself says when this program has gone.
-    return (
-        f"<section data-second={int(now_s)}>{lines}"
-        "<p class=frozen>This page gets nothing any more. What it shows is old.</p></section>"
-    )
+    # The second changes as long as this program runs; otherwise, the page itself says so (style.py).
+    return f"<section data-second={int(now_s)}>{lines}</section>"
 
 
 def _live_line(source: LiveSource, now_s: float) -> str:

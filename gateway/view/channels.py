@@ -43,6 +43,13 @@ def choices(sources: Sequence[LiveSource]) -> dict[str, Channel]:
     return found
 
 
+def first_choice(offered: Mapping[str, Channel]) -> str | None:
+    """Return what most people look at first: the vertical force on a plate, otherwise the first channel."""
+    return next(
+        (text for text, channel in offered.items() if channel.field == "fz"), next(iter(offered), None)
+    )
+
+
 def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
     for key in _KEYS:
         component = source.components.get(key)

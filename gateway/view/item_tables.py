@@ -14,17 +14,25 @@ MAX_ROWS: Final = 40
 
 _MAX_EVENT_CHARACTERS: Final = 200
 
+_LEGEND: Final = (
+    "<p class=legend>A name in <span class=bad>red</span> is missing in the newest frame. Bars: "
+    "<span class=good>always visible</span>, <span class=waiting>90 % or more</span>, "
+    "<span class=bad>less</span>.</p>"
+)
+
 
 def items_html(source: LiveSource) -> str:
     """Return the markers and tools of a source with their visibility over the last seconds."""
     parts = [f"<h3>{html_text(source.name)}</h3>"]
     markers, tools = source.components.get("3d"), source.components.get("6d")
+    if markers is None and tools is None:
+        parts.append("<p class=dim>no markers and no tools</p>")
+    else:
+        parts.append(_LEGEND)
     if tools is not None:
         parts.append(_visibility_html(tools, "tool"))
     if markers is not None:
         parts.append(_visibility_html(markers, "marker"))
-    if markers is None and tools is None:
-        parts.append("<p class=dim>no markers and no tools</p>")
     return f"<section class=items>{''.join(parts)}</section>"
 
 
@@ -47,19 +55,20 @@ def _visibility_html(component: LiveComponent, noun: str) -> str:
             name = f"<span class=dim>{name}</span>"
         elif not is_visible[index]:
             name = f"<span class=bad>{name}</span>"
-        cells = [name, _bar(float(shares[index]))]
+        # Markers have an empty column, so that the bars of both tables align.
+        error = ""
         if noun == "tool":
-            error = float(component.newest_items["error"][index])
-            cells.append(f"{value_text(error)} {html_text(units[index])}" if is_visible[index] else NONE)
-        rows.append(tuple(cells))
-    headings = (f"{counted(num_items, noun)}", "visible, last 10 s", *(("error",) if noun == "tool" else ()))
+            value = float(component.newest_items["error"][index])
+            error = f"{value_text(value)} {html_text(units[index])}" if is_visible[index] else NONE
+        rows.append((name, _bar(float(shares[index])), error))
+    headings = (f"{counted(num_items, noun)}", "visible, last 10 s", "error" if noun == "tool" else "")
     return table(headings, rows) + _rest(shares, noun)
 
 
 def _bar(share: float) -> str:
     level = "good" if share == 1 else "waiting" if share >= 0.9 else "bad"
     width = f"<i class={level} style=width:{100 * share:.0f}%></i>"
-    return f"<span class=bar>{width}</span> {share_text(share)}"
+    return f"<span class=bar>{width}</span><span class=share>{share_text(share)}</span>"
 
 
 def _rest(shares: Array, noun: str) -> str:

@@ -11,7 +11,7 @@ from viser import uplot
 from gateway.live.component import LiveComponent
 from gateway.live.live_data import LiveSource
 from gateway.takes.component_rows import Array
-from gateway.view.channels import Channel, choices, component_of, samples
+from gateway.view.channels import Channel, choices, component_of, first_choice, samples
 from gateway.view.envelope import COLUMN_US, NUM_COLUMNS, Envelope
 
 MAX_PLOTS: Final = 8
@@ -93,6 +93,8 @@ class Plots:
         self._folder = server.gui.add_folder(None)
         self._choices: dict[str, Channel] = {}
         self._plots: dict[str, _Plot] = {}  # by their titles
+        self._has_begun = False
+        """Whether somebody has chosen a channel, or the first one was chosen for them."""
 
     def take(self, sources: Sequence[LiveSource]) -> None:
         """Take what came since the last call."""
@@ -110,8 +112,7 @@ class Plots:
         """Add and remove the plots that the user chose."""
         added, removed = self._add.value, self._remove.value
         if added in self._choices and len(self._plots) < MAX_PLOTS and added not in self._plots:
-            with self._folder:
-                self._plots[added] = _Plot(self._server, self._choices[added], added)
+            self._plot(added)
         for title in [*self._plots] if removed == _ALL else [removed]:
             plot = self._plots.pop(title, None)
             if plot is not None:
@@ -121,9 +122,18 @@ class Plots:
             self._remove.value = _CHOOSE  # type: ignore[misc]
             self._offer()
 
+    def _plot(self, title: str) -> None:
+        self._has_begun = True
+        with self._folder:
+            self._plots[title] = _Plot(self._server, self._choices[title], title)
+
     def offer(self, sources: Sequence[LiveSource]) -> None:
-        """Offer the channels that there are now."""
-        self._choices = choices(sources)
+        """Offer the channels that there are now. The first time that they are known, plot a useful one."""
+        former, self._choices = self._choices, choices(sources)
+        first = first_choice(self._choices)
+        # Once the channels of the same sources and components came twice, no more come a moment later.
+        if first and not self._has_begun and self._add.value == _CHOOSE and [*former] == [*self._choices]:
+            self._plot(first)
         titles = {plot.channel: title for title, plot in self._plots.items()}
         for text, channel in self._choices.items():
             title = titles.get(channel, text)

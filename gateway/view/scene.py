@@ -46,6 +46,7 @@ class Scene:
         self._turn(sources)
         for source in sources:
             self._sources[source.channels].update(source, self._world.up, self._switches, now_s)
+        self._world.show_scale(forces=any(scene.has_plates for scene in self._sources.values()))
         self._fit(clients, now_s)
 
     def pause(self) -> None:

@@ -70,6 +70,11 @@ class SourceScene:
         return bool(self._group.visible)
 
     @property
+    def has_plates(self) -> bool:
+        """Whether force plates are shown."""
+        return self.is_visible and len(self._plates.corners) > 0
+
+    @property
     def points(self) -> list[np.ndarray]:
         """The positions of everything, each of shape (points, 3), in metres; NaN is missing."""
         return [self._markers.positions, self._tools.positions, self._plates.corners]

@@ -3,19 +3,14 @@
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-import rtc3d
-
 from gateway.live.component import LiveComponent
 from gateway.live.latency import Percentiles
 from gateway.live.live_data import LiveData, LiveSource
-from gateway.losses import counts_text
 from gateway.rtc3d.components import WIRE_ORDER
-from gateway.stream.status_text import Level
+from gateway.view.loss_text import losses_html
 from gateway.view.state_text import gateway_states, states_html
 from gateway.view.texts import (
-    NONE,
     age_text,
-    clock_text,
     count_text,
     counted,
     html_text,
@@ -23,10 +18,6 @@ from gateway.view.texts import (
     rate_text,
     table,
 )
-
-_MAX_SENTENCE_CHARACTERS: Final = 300
-_MAX_LINES: Final = 20
-"""How many streams and outputs, each with its drops, are shown."""
 
 _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
 """A median latency between computers outside of these says that their clocks differ."""
@@ -47,8 +38,7 @@ def source_html(source: LiveSource, shown: Mapping[str, Percentiles], *, is_take
         parts.append(_rates_table(source, components, is_take=is_take))
         parts.append(_latency_table(components, shown, is_take=is_take))
         parts += [f"<p class=waiting>{text}</p>" for text in clock_warning(components) if not is_take]
-    losses = [f"<p class={level.value}>{text}</p>" for level, text in _losses(source)]
-    parts += losses or ["<p class=good>nothing lost, dropped or skipped</p>"]
+    parts.append(losses_html(source, components))
     return f"<section>{''.join(parts)}</section>"
 
 
@@ -98,17 +88,15 @@ def _origin(source: LiveSource) -> Iterator[str]:
 def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent], *, is_take: bool) -> str:
     rows = []
     for key, component in components.items():
-        check = source.series_by_key[key].check
         rows.append(
             (
                 key,
                 count_text(len(component.newest_items)) if key != "event" else "",
                 _rate(component, is_take=is_take) if key != "event" else "",
                 count_text(source.series_by_key[key].num_messages),
-                f"<span class=bad>{count_text(check.num_lost)}</span>" if check.num_lost else "0",
             )
         )
-    return table(("", "items", "Hz", "messages", "lost"), rows)
+    return table(("", "items", "Hz", "messages"), rows)
 
 
 def _rate(component: LiveComponent, *, is_take: bool) -> str:
@@ -140,50 +128,3 @@ def _latency_table(
     if is_take:
         return table(headings[:2], [row[:2] for row in rows])
     return table(headings, rows)
-
-
-def _losses(source: LiveSource) -> Iterator[tuple[Level, str]]:
-    """Say what is lost, skipped or wrong anywhere, by cause."""
-    for key, component in _components(source).items():
-        check = source.series_by_key[key].check
-        if check.num_lost:
-            gaps = counted(check.num_gaps, "gap")
-            yield Level.BAD, f"{key}: {counted(check.num_lost, 'message')} lost in {gaps}"
-        if check.num_restarts:
-            yield Level.WAITING, f"{key}: numbers restarted {counted(check.num_restarts, 'time')}"
-        if check.has_two_publishers:
-            yield Level.BAD, f"{key}: two gateways publish on the same key"
-        if component.num_malformed:
-            yield Level.BAD, f"{key}: {counted(component.num_malformed, 'malformed message')}"
-    if source.num_skipped:
-        yield Level.WAITING, f"skipped for display: {counted(source.num_skipped, 'message')}"
-    if source.num_unreadable:
-        unreadable = counted(source.num_unreadable, "message")
-        yield Level.BAD, f"parameters or status that cannot be read: {unreadable}"
-    if source.newest_status is not None:
-        yield from _status_losses(source.newest_status)
-
-
-def _status_losses(status: rtc3d.status_t) -> Iterator[tuple[Level, str]]:
-    """Say what the gateway has lost since its start, and what its streams and outputs lack."""
-    for stream in status.streams[:_MAX_LINES]:
-        name = html_text(stream.components)
-        if stream.drops:
-            yield Level.WAITING, f"dropped at {name}: {_drops(stream.drops)}"
-        for limitation in stream.limitations[:_MAX_LINES]:
-            yield Level.WAITING, f"{name}: {html_text(limitation, _MAX_SENTENCE_CHARACTERS)}"
-        if stream.last_error:
-            at = clock_text(stream.last_error_utime / 1e6)
-            error = html_text(stream.last_error, _MAX_SENTENCE_CHARACTERS)
-            yield Level.WAITING, f"last error of {name}, {at}: {error}"
-    for output in status.outputs[:_MAX_LINES]:
-        if not output.connected:
-            problem = html_text(output.problem or NONE, _MAX_SENTENCE_CHARACTERS)
-            yield Level.BAD, f"output {html_text(output.name)}: {problem}"
-        if output.drops:
-            yield Level.WAITING, f"dropped at output {html_text(output.name)}: {_drops(output.drops)}"
-
-
-def _drops(drops: list[rtc3d.loss_t]) -> str:
-    texts = counts_text((drop.cause, drop.messages, drop.frames) for drop in drops[:_MAX_LINES])
-    return html_text(texts, _MAX_SENTENCE_CHARACTERS)

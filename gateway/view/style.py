@@ -1,8 +1,33 @@
-"""The style sheet of the panel, for light and dark."""
+"""The style sheet of the panel, for light and dark, and the script that comes with it."""
 
 from typing import Final
 
-STYLE: Final = """<style>
+_SCRIPT: Final = """
+if (!window.gatewayScript) {
+  window.gatewayScript = true;
+  document.querySelector(`[style*='width: 20em'] [style*='cursor: pointer']`)?.click();
+  let second, changed = performance.now();
+  setInterval(() => {
+    const banner = document.querySelector('[data-second]'), now = performance.now();
+    if (!banner) return;
+    if (banner.dataset.second !== second) [second, changed] = [banner.dataset.second, now];
+    if (now - changed < 4000 || banner.querySelector('.frozen')) return;
+    const line = document.createElement('p');
+    line.className = 'frozen';
+    line.textContent = 'This page gets nothing ' + 'any more. What it shows is old.';
+    banner.append(line);
+  }, 500);
+}
+"""
+"""Runs once in each page, when the style sheet is loaded: viser offers no other way to add a script.
+
+It closes the sheet that viser shows instead of a panel on narrow screens, where it would cover the picture;
+a tap on its title opens it. Then it adds a line to the banner while this program does not change the banner.
+"""
+
+STYLE: Final = (
+    f'<style onload="{_SCRIPT}">'
+    """
 :root { --g-good: #2b8a3e; --g-waiting: #b35900; --g-bad: #c92a2a; --g-line: #0002; --g-on-bad: #fff }
 [data-mantine-color-scheme=dark] { --g-good: #69db7c; --g-waiting: #ffc078; --g-bad: #ff8787; --g-line: #fff2;
   --g-on-bad: #2c0b0b }
@@ -23,12 +48,16 @@ STYLE: Final = """<style>
 .gateway .last { float: right; opacity: .65; font-variant-numeric: tabular-nums }
 .gateway .stopped { background: var(--g-bad); color: var(--g-on-bad); border-radius: 4px; padding: 5px 8px;
   margin: 4px 0 }
-.gateway .bar { display: inline-block; width: 70px; height: 7px; margin-right: 6px;
-  background: var(--g-line) }
+.gateway .items table { table-layout: fixed }
+.gateway .items th:nth-child(2) { width: 132px }
+.gateway .items th:nth-child(3) { width: 84px }
+.gateway .bar { display: inline-block; width: 64px; height: 7px; background: var(--g-line) }
+.gateway .share { display: inline-block; width: 56px }
+.gateway .legend { font-size: 11.5px }
 .gateway .bar i { display: block; height: 100%; background: currentColor }
 .gateway .events :is(td, th) { text-align: left }
 .gateway .events td:not(:first-child) { white-space: normal; overflow-wrap: anywhere }
-.gateway .frozen { max-height: 0; overflow: hidden; background: var(--g-bad); color: var(--g-on-bad);
-  border-radius: 4px; padding: 0 8px; animation: gateway-frozen 1ms 4s forwards }
-@keyframes gateway-frozen { to { max-height: 4em; padding: 5px 8px } }
+.gateway .frozen { background: var(--g-bad); color: var(--g-on-bad); border-radius: 4px; padding: 5px 8px }
+[style*="width: 20em"] { width: 100vw !important }
 </style>"""
+)

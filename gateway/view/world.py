@@ -4,6 +4,7 @@ from typing import Final
 
 import viser
 
+from gateway.descriptions.plate_forces import METRES_PER_NEWTON
 from gateway.view.axes import PLANES, UP_AXES, UpAxis, on_floor
 from gateway.view.colors import GREY
 
@@ -37,6 +38,10 @@ class World:
         for axis, grid in self._grids.items():
             grid.visible = axis == up
         self._unit.position = on_floor(up, 1.0, 0.0)
+
+    def show_scale(self, *, forces: bool) -> None:
+        """Say at the mark for 1 m how much force an arrow of this length is, if there are ``forces``."""
+        self._unit.text = f"1 m = {1 / METRES_PER_NEWTON:.0f} N" if forces else "1 m"
 
     def show_floor(self, *, visible: bool) -> None:
         """Show or hide the floor."""

@@ -131,10 +131,22 @@ def test_a_stop_is_said_with_its_reason_until_data_come_again(page: Page, shown:
 
 
 def test_the_page_says_that_it_gets_nothing_any_more(page: Page, shown: Shown) -> None:
+    line = page.get_by_text("This page gets nothing any more")
     expect(page.locator(".gateway").first).to_contain_text("● live lab", timeout=TIMEOUT_MS)
-    page.wait_for_function("document.querySelector('.gateway .frozen').clientHeight == 0")
+    expect(line).to_have_count(0)
     shown.stop_panel()
-    page.wait_for_function("document.querySelector('.gateway .frozen').clientHeight > 10")
+    expect(line).to_be_visible(timeout=TIMEOUT_MS)
+
+
+def test_on_a_phone_the_panel_is_closed_until_somebody_taps_its_title(
+    shown: Shown, new_page: NewPage
+) -> None:
+    page = new_page(viewport={"width": 390, "height": 844}, has_touch=True)
+    page.goto(shown.address)
+    page.wait_for_function("document.querySelector('.gateway')?.getClientRects().length === 0")
+    page.get_by_text("rtc3d-gateway").tap(timeout=TIMEOUT_MS)
+    expect(page.get_by_role("tab", name="Sources")).to_be_visible(timeout=TIMEOUT_MS)
+    assert page.evaluate("document.querySelector('.gateway').clientWidth") == 390
 
 
 def test_a_spike_is_within_its_plot(page: Page, shown: Shown) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from gateway.live.live_data import LiveSource
 from gateway.rtc3d.components import ComponentType
-from gateway.view.channels import MAX_CHOICES, Channel, choices, component_of, samples
+from gateway.view.channels import MAX_CHOICES, Channel, choices, component_of, first_choice, samples
 from gateway.view.item_tables import MAX_ROWS, events_html, items_html, worst_first
 from tests.takes import START_UTIME
 from tests.unit.view.live_lab import NAN, Lab, text_of, wait
@@ -31,6 +31,7 @@ def test_markers_by_visibility_and_tools_with_their_error(lab: Lab) -> None:
         lab.send_markers(True, number == 0, number > 0)
     lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 1, 2, 3, 0.1234), (NAN,) * 8])
     text = text_of(items_html(lab.source))
+    assert "|A name in|red|is missing in the newest frame." in text
     assert "|3 markers|visible, last 10 s|" in text
     assert "|RASI|25.0 %|&lt;img src=x onerror=alert(1)&gt;|75.0 %|LASI|100 %|" in text
     assert "|tool 2|0 %|–|tool 1|100 %|0.123 mm|" in text
@@ -100,6 +101,14 @@ def test_channels_have_names_and_units(lab: Lab) -> None:
     assert [*found][:3] == ["lab analog 1: EMG (V)", "lab analog 2: Sync (mV)", "lab force 1: plate 1 Fx"]
     assert [*found.values()][2] == Channel("lab", "force", 0, "fx")
     assert len(found) == 2 + 6
+
+
+def test_the_first_choice_is_a_vertical_force_otherwise_the_first_channel(lab: Lab) -> None:
+    assert first_choice({}) is None
+    lab.send(ComponentType.ANALOG, [1.0, 2.0])
+    assert first_choice(choices([lab.source])) == "lab analog 1: channel 1 (mV)"
+    lab.send(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])
+    assert first_choice(choices([lab.source])) == "lab force 1: plate 1 Fz"
 
 
 def test_choices_are_bounded(lab: Lab) -> None:

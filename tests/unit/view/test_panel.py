@@ -108,6 +108,23 @@ def test_a_spike_is_in_the_plot_of_its_channel(panel: Panel, lab: Lab, show: Sho
     assert np.nanmax(highest) == 99
 
 
+def test_a_first_plot_is_chosen_when_the_channels_are_known_and_stays_removed(
+    panel: Panel, lab: Lab, show: Show
+) -> None:
+    plots = panel._plots
+    lab.send(ComponentType.ANALOG, [0.0, 1.0])
+    show()
+    lab.send(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])
+    show()
+    assert not plots._plots  # other channels came
+    show()
+    assert [*plots._plots] == ["lab force 1: plate 1 Fz"]
+    plots._remove.value = "lab force 1: plate 1 Fz"  # type: ignore[misc]
+    for _ in range(3):
+        show()
+    assert not plots._plots
+
+
 def test_plots_are_limited_renamed_and_removed(panel: Panel, lab: Lab, show: Show) -> None:
     lab.send(ComponentType.ANALOG, range(20))
     show()

@@ -235,6 +235,15 @@ def test_a_plate_is_where_the_parameters_say_and_its_arrow_at_the_centre_of_pres
     assert picture.points("forces") == [[0.2, 0.35, 0], [0.2, 0.45, 0.5]]
 
 
+def test_the_mark_for_1_m_says_how_long_arrows_are_only_where_there_are_plates(picture: Picture) -> None:
+    lab = picture.lab()
+    lab.send(MARKERS, [(500, 0, 0, 0)])
+    picture.show()
+    assert picture.scene._world._unit.text == "1 m"
+    picture.show_parameters(lab, PLATE)
+    assert picture.scene._world._unit.text == "1 m = 1000 N"
+
+
 def test_the_up_axis_is_that_of_the_plates_until_somebody_chooses(picture: Picture) -> None:
     wall = replace(PLATE, corners=(Point(0, 0, 600), Point(0, 0, 0), Point(400, 0, 0), Point(400, 0, 600)))
     picture.show_parameters(picture.lab(), wall)

@@ -33,7 +33,7 @@ def test_state_server_rates_and_latency_by_stage(lab: Lab) -> None:
     lab.send_markers(True, True)
     text = shown_text(lab)
     assert "|lab|streaming 200.0 Hz|server 192.0.2.9:3020 · gateway 1.2.3 on gatewaypc|" in text
-    assert "|3d|2|0.0|of 200.0|1|0|" in text
+    assert "|3d|2|0.0|of 200.0|1|" in text
     assert re.search(r"captured → gateway.*3d\|2.00 / 2.00\|\d[^|]* / \d[^|]*\|16.0 / 33.0\|", text)
     assert "nothing lost, dropped or skipped" in text
     assert "clock" not in text
@@ -65,7 +65,8 @@ def test_messages_that_are_lost_on_the_way(lab: Lab) -> None:
     for sequence in (0, 5, 6, 8, 0):
         lab.send(ComponentType.MARKERS, [(1, 2, 3, 4)], sequence=sequence)
     text = shown_text(lab)
-    assert "3d: 5 messages lost in 2 gaps" in text
+    assert "|lost messages|server|gateway|here|all|3d|0|0|5|5|" in text
+    assert "3d: 2 gaps in the numbers of the messages" in text
     assert "3d: numbers restarted 1 time" in text
     assert "nothing lost" not in text
 
@@ -85,6 +86,36 @@ def test_drops_by_cause_of_streams_and_outputs(lab: Lab) -> None:
     assert re.search(r"last error of 3d, \d\d:\d\d:20: connection refused", text)
 
 
+def test_losses_have_one_figure_for_each_component_and_place(lab: Lab) -> None:
+    """What the gateway skips while the view runs is a gap in the numbers, too, but is not lost twice."""
+
+    def send(num_unsent: int, num_skipped: int, sequence: int) -> None:
+        drops = [
+            loss("not sent by the server", 2 * num_unsent, num_unsent),
+            loss("skipped while behind", 2 * num_skipped, num_skipped),
+            loss("C3D file", 1, 0),
+        ]
+        lab.send_status(stream("3d 6d event", drops=drops), sequence=sequence)
+        assert lab.source
+
+    send(400, 90, sequence=0)
+    lab.send_markers(True)
+    lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 0, 0, 0, 0)])
+    lab.send(ComponentType.EVENT, [(1, 2, 3, 4, 5)])
+    send(400, 91, sequence=1)
+    lab.send(ComponentType.MARKERS, [(1, 2, 3, 4)], sequence=4)  # one skipped, two lost on the way
+    lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 0, 0, 0, 0)], sequence=2)
+    text = shown_text(lab)
+    assert "|here|all|3d|400|91|2|493|6d|400|91|0|491|event|0|0|0|0|Server and gateway: since" in text
+
+
+def test_what_an_output_drops_is_beside_the_components(lab: Lab) -> None:
+    lab.send_status(stream(), outputs=[output("zenoh", drops=[loss("not open", 982, 196)]), output("lcm")])
+    text = shown_text(lab)
+    assert "|here|all|output zenoh|–|982|–|982|Server" in text
+    assert "output lcm" not in text
+
+
 def test_nothing_of_a_gateway_is_html(lab: Lab) -> None:
     evil: dict[str, Any] = {"problem": HOSTILE, "drops": [loss(HOSTILE, 1, 1)]}
     streams = stream(HOSTILE, HOSTILE, limitations=[HOSTILE], last_error=HOSTILE, **evil)
@@ -92,7 +123,7 @@ def test_nothing_of_a_gateway_is_html(lab: Lab) -> None:
     lab.send_status(streams, outputs=[output(HOSTILE, connected=False, **evil)], **names)
     html = source_html(lab.source, {}, is_take=False)
     assert "<img" not in html
-    assert html.count("&lt;img") == 14
+    assert html.count("&lt;img") == 15
 
 
 def test_a_status_of_any_size_is_cut() -> None:
