@@ -142,6 +142,13 @@ def test_documents_clone_the_repository_that_the_project_names() -> None:
     assert next(iter(blocks("README.md", "sh"))).text.startswith("git clone ")
 
 
+def test_readme_is_short_and_shows_the_data_of_a_server_within_300_words() -> None:
+    """It was 350 lines long, and came to the reader's own server after 868 words."""
+    text = (ROOT / "README.md").read_text()
+    assert text.count("\n") <= 150
+    assert len(text.partition("rtc3d-gateway view")[0].split()) < 300
+
+
 def test_one_command_changes_the_address_of_the_repository_everywhere(tmp_path: Path) -> None:
     clone_into(tmp_path)
     new = "https://git.example.net/lab/gateway.git"
