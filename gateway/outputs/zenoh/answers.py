@@ -120,18 +120,27 @@ class ZenohAnswers:
 
     def receive(self, source: str, query: zenoh.Query) -> None:
         """Take a query about ``source``, or refuse it."""
+        if self._is_admitted(source, query):
+            options = tuple(sorted(_options(query).items()))
+            self._add(_Question(source, str(query.key_expr), options), query)
+
+    def reply(self, source: str, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
+        """Reply to a query about ``source`` with answers, by key, that are known already, or refuse it."""
+        if self._is_admitted(source, query):
+            self._send([query], source, answers)
+
+    def _is_admitted(self, source: str, query: zenoh.Query) -> bool:
         selected = str(query.key_expr)
         refusal = self._admission.admit(source, selected[:MAX_KEY_CHARS])
         if refusal is not None:
             self._refuse(source, query, refusal)
-            return
+            return False
         try:
             _check(query, selected)
-            question = _Question(source, selected, tuple(sorted(_options(query).items())))
         except QueryError as error:
             self._send([query], source, error)
-            return
-        self._add(question, query)
+            return False
+        return True
 
     def _refuse(self, source: str, query: zenoh.Query, refusal: Refusal) -> None:
         error = refusal.error

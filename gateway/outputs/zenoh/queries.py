@@ -13,12 +13,11 @@ from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 import zenoh
-import zenoh.ext
 
 from gateway.losses import Losses
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.admission import Admission, QueryLimits
-from gateway.outputs.contract import QueryService, ServerParameters
+from gateway.outputs.contract import Answer, QueryService, ServerParameters
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.outputs.send_thread import SendThread
 from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
@@ -41,15 +40,13 @@ _AGAIN_S: Final = 0.5
 logger = logging.getLogger(__name__)
 
 
-_AnyPublisher = zenoh.ext.AdvancedPublisher | zenoh.Publisher
-
-
 class _Declared(NamedTuple):
     """What is declared on the session for one source."""
 
     queryable: zenoh.Queryable[None]
-    publisher: _AnyPublisher
-    subscriber_watch: zenoh.Publisher
+    publisher: zenoh.Publisher
+    history: zenoh.Queryable[None]
+    history_token: zenoh.LivelinessToken
 
 
 class ZenohQueries:
@@ -120,8 +117,9 @@ class ZenohQueries:
             self._parameters.pop(source, None)
             declared = self._declared.pop(source, None)
         if declared is not None:
+            declared.history_token.undeclare()
+            declared.history.undeclare()
             declared.queryable.undeclare()
-            declared.subscriber_watch.undeclare()
             # The thread may be sending on this one, and Zenoh refuses to undeclare it meanwhile.
             self._sender.submit(declared.publisher.undeclare)
 
@@ -136,12 +134,29 @@ class ZenohQueries:
                 self._call_in_loop(self._publish_soon, source)
 
         queryable = session.declare_queryable(f"{key}/**", on_query)
-        publisher = _parameters_publisher(session, f"{key}/parameters")
-        # An AdvancedPublisher does not report its subscribers, so a plain publisher on the same key does.
-        # Otherwise plain subscribers that connect late would have to wait for the next change.
-        subscriber_watch = session.declare_publisher(f"{key}/parameters")
-        subscriber_watch.declare_matching_listener(in_zenoh_thread(on_matching))
-        return _Declared(queryable, publisher, subscriber_watch)
+        parameters = f"{key}/parameters"
+        publisher = session.declare_publisher(
+            parameters, encoding=XML, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
+        )
+        publisher.declare_matching_listener(in_zenoh_thread(on_matching))
+
+        # A late AdvancedSubscriber finds this token and asks this key for what it has missed, as it does with
+        # an AdvancedPublisher of Zenoh. The answer counts against the limits of queries; one from the cache
+        # of an AdvancedPublisher would not.
+        history = f"{parameters}/@adv/pub/{session.info.zid()}/uhlc/_"
+
+        def on_history(query: zenoh.Query) -> None:
+            with self._lock:
+                newest = self._parameters.get(source)
+            answers = {} if newest is None else {parameters: Answer(newest.xml, XML, _facts(newest))}
+            self._answers.reply(source, query, answers)
+
+        return _Declared(
+            queryable,
+            publisher,
+            session.declare_queryable(history, in_zenoh_thread(on_history)),
+            session.liveliness().declare_token(history),
+        )
 
     def _call_in_loop(self, call: Callable[..., object], *arguments: Any) -> None:
         """Call ``call`` in the event loop, from one of Zenoh's threads."""
@@ -204,12 +219,8 @@ class ZenohQueries:
             del self._unsent[source]
             declared, parameters = self._declared.get(source), self._parameters.get(source)
         if declared is not None and parameters is not None:
-            attachment = {
-                "session": parameters.session,
-                "parameters_version": parameters.version,
-                "frame": parameters.frame.facts,
-            }
-            self._put(source, declared.publisher.put, parameters.xml, attachment=json_bytes(attachment))
+            attachment = json_bytes(_facts(parameters))
+            self._put(source, declared.publisher.put, parameters.xml, attachment=attachment)
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Announce a C3D file on the key that returns it."""
@@ -241,27 +252,13 @@ class ZenohQueries:
         await self._answers.close()
 
 
-def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
-    try:
-        return zenoh.ext.declare_advanced_publisher(
-            session,
-            key,
-            encoding=XML,
-            # The cache serves late AdvancedSubscribers, so that they need not query.
-            cache=zenoh.ext.CacheConfig(max_samples=1),
-            publisher_detection=True,
-            congestion_control=_RELIABLE,
-            priority=_LOW_PRIORITY,
-        )
-    except zenoh.ZError as error:
-        logger.warning(
-            "zenoh: late subscribers have to query %s themselves: %s; "
-            "set timestamping: {enabled: true} in Zenoh's configuration file",
-            *(key, zenoh_reason(error)),
-        )
-        return session.declare_publisher(
-            key, encoding=XML, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
-        )
+def _facts(parameters: ServerParameters) -> dict[str, Any]:
+    """Return what is attached to published parameters."""
+    return {
+        "session": parameters.session,
+        "parameters_version": parameters.version,
+        "frame": parameters.frame.facts,
+    }
 
 
 def _set_done(future: asyncio.Future[None]) -> None:

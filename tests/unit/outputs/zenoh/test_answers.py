@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from gateway.losses import Losses
-from gateway.outputs.contract import Answer, KeyPath
+from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -136,14 +136,16 @@ async def test_a_query_with_wildcards_counts_once_for_each_of_its_keys(
         assert counted == [2]  # besides the query itself
 
 
+@pytest.mark.parametrize("selector", ["mocap/lab/status", "mocap/lab/parameters/@adv/**?_anyke"])
 async def test_queries_beyond_the_rate_get_an_error_and_are_counted(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, selector: str
 ) -> None:
     async with open_lab(max_queries_per_key_per_s=10.0, max_queries_per_s=1000.0) as lab:
+        lab.output.publish_parameters("lab", ServerParameters(b"<xml/>", 1, 1))
         queries = lab.output._queries
         assert queries is not None
         monkeypatch.setattr(queries._admission, "_monotonic", lambda: 1000.0)  # all within a moment
-        codes = await lab.codes("mocap/lab/status", 60)
+        codes = await lab.codes(selector, 60)
         assert codes["ok"] == 10
         assert codes == {"ok": codes["ok"], "rate": 60 - codes["ok"]}
         assert lab.output.query_results == {"lab": codes}

@@ -77,11 +77,10 @@ class Service:
 class Lab:
     """An output that serves the source "lab", and a client connected to it."""
 
-    def __init__(self, *, has_time_stamps: bool = True) -> None:
+    def __init__(self) -> None:
         self.service = Service()
         self.endpoint = free_endpoint()
-        keys = zenoh_keys("peer", listen=self.endpoint) | {"timestamping": {"enabled": has_time_stamps}}
-        self.output = ZenohOutput(ZenohSettings(config=keys))
+        self.output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=self.endpoint)))
         self.output.serve_queries(self.service)  # type: ignore[arg-type]  # it has the methods that are called
         self.samples: list[zenoh.Sample] = []
 
@@ -220,12 +219,7 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
 # Parameters and files ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("has_time_stamps", [True, False])
-async def test_parameters_are_published_with_their_encoding_and_a_low_priority(
-    has_time_stamps: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    lab = Lab(has_time_stamps=has_time_stamps)
-    await lab.open()
+async def test_parameters_are_published_with_their_encoding_and_a_low_priority(lab: Lab) -> None:
     lab.subscribe("mocap/lab/parameters")
     frame = CoordinateFrame("lab", 0.01, translation_m=(0, 0, 2))
     lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4, frame=frame))
@@ -245,17 +239,6 @@ async def test_parameters_are_published_with_their_encoding_and_a_low_priority(
     }
     assert sample.congestion_control == zenoh.CongestionControl.BLOCK
     assert sample.priority == zenoh.Priority.DATA_LOW
-    if has_time_stamps:
-        assert caplog.messages == []
-    else:
-        [message] = caplog.messages
-        start = "zenoh: late subscribers have to query mocap/lab/parameters themselves: "
-        assert message.startswith(start)
-        assert message.endswith("; set timestamping: {enabled: true} in Zenoh's configuration file")
-        assert "imestamp" in message.removeprefix(start).partition(";")[0]
-    await lab.output.stop_queries()
-    lab.output.close()
-    lab.peer.close()
 
 
 async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab) -> None:
