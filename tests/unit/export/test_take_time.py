@@ -19,10 +19,15 @@ OFFSET_S = 2.5
 
 
 def messages() -> list[Message]:
-    """Return a take whose frames begin 2.5 s after its first message; the first has a time 40 ms too late."""
-    first, *others = scene_messages(
-        SCENE, 300, start_us=2_499_000, keep=lambda c, _: c is ComponentType.MARKERS
-    )
+    """Return a take whose frames begin 2.5 s after its first message; the first has a time 40 ms too late.
+
+    Analog begins 0.5 s later, so a C3D file does.
+    """
+
+    def keep(component: ComponentType, sample: int) -> bool:
+        return component is ComponentType.MARKERS or (component is ComponentType.ANALOG and sample >= 500)
+
+    first, *others = scene_messages(SCENE, 300, start_us=2_499_000, keep=keep)
     late = (int.from_bytes(first[1][16:24], "big") + 40_000).to_bytes(8, "big")
     return [
         description(),
@@ -46,7 +51,7 @@ def test_trc_and_csv_count_from_the_beginning_of_the_take(tmp_path: Path) -> Non
     assert head[3] == f"walk.trc time_0={BEGIN}.000000Z"
 
 
-@pytest.mark.parametrize(("from_s", "first"), [(None, OFFSET_S), (4.0, 4.0)])
+@pytest.mark.parametrize(("from_s", "first"), [(None, OFFSET_S + 0.5), (4.0, 4.0)])
 def test_a_c3d_file_counts_from_its_first_frame_and_says_when_that_was(
     tmp_path: Path, from_s: float | None, first: float
 ) -> None:
