@@ -65,7 +65,7 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     for record in records:
         name = f"{groups.get(record.group, record.group)}:{record.name}"
         if record.values_offset + record.num_bytes > end:
-            return f"its parameter {safe_text(name)} would have {record.num_bytes} bytes, more than there are"
+            return f"its parameter {safe_text(name)} would have {record.num_bytes} bytes, more than it has"
         if record.num_bytes == record.element_bytes in _FORMATS and record.values_offset + 4 <= len(head):
             value_format = order + _FORMATS[record.element_bytes]
             (numbers[name],) = struct.unpack_from(value_format, head, record.values_offset)
@@ -73,9 +73,9 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     ratio = rates_hz[0] / rates_hz[1] if processor != _DEC and rates_hz[1] > 0 else 1.0
     samples = ratio if math.isfinite(ratio) else 1.0
     values = 4 * numbers.get("POINT:USED", 0) + numbers.get("ANALOG:USED", 0) * samples
-    room = file_bytes - data_start
-    if 2 * values > max(room, 0):
-        return f"each of its frames would have at least {2 * values:.0f} bytes, and there are {max(room, 0)}"
+    room = max(file_bytes - data_start, 0)
+    if 2 * values > room:
+        return f"each of its frames would have at least {2 * values:.0f} bytes, and it has {room} for all"
     return ""
 
 

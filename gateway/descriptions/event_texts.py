@@ -14,10 +14,15 @@ MAX_EVENT_AGE_US: Final = 1_000_000
 
 
 class EventText(NamedTuple):
-    """What an event is called, and its parameters, such as "Button id number: 3; ON/OFF state: ON"."""
+    """What an event is called, and the names and values of its parameters, such as "State" and "ON"."""
 
     label: str
-    description: str
+    values: tuple[tuple[str, str], ...]
+
+    @property
+    def description(self) -> str:
+        """All parameters, such as "Button id number: 3; ON/OFF state: ON"."""
+        return "; ".join(f"{name}: {value}" for name, value in self.values)
 
 
 def event_text(parameters: Parameters, item: Any) -> EventText:
@@ -25,16 +30,16 @@ def event_text(parameters: Parameters, item: Any) -> EventText:
     definition = _definition(parameters, int(item["id"]))
     values = [int(item[name]) for name in ("param1", "param2", "param3")]
     described = definition.parameters if definition else ()
-    texts = []
+    found = []
     for index, value in enumerate(values):
         if index < len(described):
             name = described[index].description or f"param{index + 1}"
             if value != UNUSED:
-                texts.append(f"{name}: {_value(described[index], value)}")
+                found.append((name, _value(described[index], value)))
         elif value != UNUSED:
-            texts.append(f"param{index + 1}: {value}")
+            found.append((f"param{index + 1}", str(value)))
     label = definition.label.strip() if definition else ""
-    return EventText(label or f"event {int(item['id'])}", "; ".join(texts))
+    return EventText(label or f"event {int(item['id'])}", tuple(found))
 
 
 def _definition(parameters: Parameters, number: int) -> EventDefinition | None:

@@ -13,6 +13,7 @@ from gateway.export.c3d_groups import encode_head_that_fits
 from gateway.export.c3d_points import encode_points, residual_step
 from gateway.export.job import ExportJob
 from gateway.export.measurements import named_measurements
+from gateway.export.take_time import utc_text
 
 _KEYS: Final = ("3d", "analog", "force")
 """The components that can be in a file; the first one that a source has gives the rate of the frames."""
@@ -53,6 +54,12 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
     if missing:
         job.note(
             f"{path.name}: {missing} of {content.num_frames} frames are missing in the take; they are empty"
+        )
+    start_s = content.start_s
+    if start_s * shape.rate_hz >= 1:
+        begin = utc_text(content.measurement, start_s)
+        job.note(
+            f"{path.name}: time 0 is its first frame, {start_s:.3f} s after the take's beginning ({begin})"
         )
     if incomplete_samples:
         job.note(f"{path.name}: {incomplete_samples} analog samples are missing in the take; they are NaN")

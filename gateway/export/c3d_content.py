@@ -8,6 +8,7 @@ from gateway.export.c3d_plates import PlatePlan, plan_plates
 from gateway.export.frame_grid import place
 from gateway.export.job import ExportJob
 from gateway.export.measurements import Measurement, Part, Placed
+from gateway.export.take_time import seconds_of_row
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import Array
 
@@ -30,6 +31,11 @@ class C3dContent(NamedTuple):
     plates: list[PlatePlan]
     first_row: int
     num_frames: int
+
+    @property
+    def start_s(self) -> float:
+        """When the first frame was captured, in seconds since the beginning of the take."""
+        return seconds_of_row(self.measurement, self.first_row)
 
     @property
     def num_points(self) -> int:

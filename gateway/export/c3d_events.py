@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
+from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, EventText, event_text
 from gateway.descriptions.fitting_labels import printable
 from gateway.export.c3d_format import MAX_LIST, Parameter
 from gateway.export.job import ExportJob
@@ -13,6 +13,7 @@ from gateway.takes.component_rows import Array
 from gateway.takes.series import Series
 
 _MINUTE_S: Final = 60.0
+_SIDES: Final = {"Left", "Right"}
 _MARGIN_S: Final = 1.0
 """An event within this time before the first frame or after the last one belongs to the measurement."""
 
@@ -22,6 +23,26 @@ def event_times_us(events: Series) -> Array:
     own = events.items["timestamp"]
     is_near = abs(own.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
     return np.where(is_near, own, events.timestamp_us)
+
+
+def _context_of(text: EventText) -> str:
+    """Return Left, Right or General, by a parameter of the event, or else by a word of its label.
+
+    A parameter called Context, as the simulator has it for events of C3D files, can say something else.
+    """
+    named = _value_of(text, "context")
+    if named:
+        return named
+    for words in ([value.strip() for _, value in text.values], text.label.split()):
+        sides = _SIDES & {word.capitalize() for word in words}
+        if len(sides) == 1:
+            return sides.pop()
+    return "General"
+
+
+def _value_of(text: EventText, name: str) -> str:
+    """Return the value of a parameter of the event; "" if it has none of this name."""
+    return next((value for each, value in text.values if each.strip().casefold() == name), "")
 
 
 def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> list[Parameter]:
@@ -45,10 +66,10 @@ def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_ro
     minutes, rest = np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)
     return [
         Parameter("USED", np.array(count, np.int16)),
-        Parameter("CONTEXTS", ["General"] * count),
+        Parameter("CONTEXTS", [printable(_context_of(text)) for text in texts]),
         Parameter("LABELS", [printable(text.label) for text in texts]),
         Parameter("DESCRIPTIONS", [printable(text.description) for text in texts]),
-        Parameter("SUBJECTS", [""] * count),
+        Parameter("SUBJECTS", [printable(_value_of(text, "subject")) for text in texts]),
         Parameter("TIMES", np.stack([minutes, rest]).astype(np.float32)),
         Parameter("ICON_IDS", np.zeros(count, np.int16)),
         Parameter("GENERIC_FLAGS", np.zeros(count, np.int16)),

@@ -2,6 +2,8 @@
 
 from typing import Final
 
+import numpy as np
+
 from gateway import version_text
 from gateway.descriptions.fitting_labels import fitting_labels, printable
 from gateway.errors import TakeError
@@ -18,6 +20,7 @@ from gateway.export.c3d_format import (
 )
 from gateway.export.c3d_plates import plate_group
 from gateway.export.job import ExportJob
+from gateway.export.take_time import utc_text
 
 _TEXT_SIZES: Final = (MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
 """How long labels may be, in bytes; the parameters of a file have 130 kB at most."""
@@ -49,6 +52,10 @@ def _groups(job: ExportJob, content: C3dContent, shape: Shape, max_bytes: int) -
     labels, descriptions, units = _channel_texts(content)
     groups["ANALOG"] += _texts(job, labels, descriptions, max_bytes, "channel")
     groups["ANALOG"] += text_lists("UNITS", [printable(unit) for unit in units])
+    groups["TRIAL"] += [
+        Parameter("DATE_TIME", [utc_text(content.measurement, content.start_s)]),
+        Parameter("TIME_OFFSET", np.array(content.start_s, np.float32)),
+    ]
     groups["FORCE_PLATFORM"] = plate_group(content.plates)
     events = event_group(job, content.measurement, content.first_row, content.num_frames)
     if events:

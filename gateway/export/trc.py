@@ -9,6 +9,7 @@ import numpy as np
 from gateway.descriptions.fitting_labels import fitting_labels
 from gateway.export.job import ExportJob
 from gateway.export.measurements import Measurement, named_measurements
+from gateway.export.take_time import seconds_of_row, utc_text
 from gateway.takes.component_rows import Array
 
 _COLUMNS: Final = (
@@ -49,7 +50,8 @@ def _head(job: ExportJob, measurement: Measurement, name: str) -> str:
     values = (rate, rate, grid.num_rows, len(labels), unit, rate, 1, grid.num_rows)
     axes = [f"{axis}{number}" for number in range(1, len(labels) + 1) for axis in "XYZ"]
     lines = [
-        f"PathFileType\t4\t(X/Y/Z)\t{_NOT_IN_LABELS.sub('_', name)}",
+        # Readers take the rest of the line as the name of the file. They allow no more keys in the next two.
+        f"PathFileType\t4\t(X/Y/Z)\t{_NOT_IN_LABELS.sub('_', name)} time_0={utc_text(measurement)}",
         "\t".join(_COLUMNS),
         "\t".join(map(str, values)),
         "Frame#\tTime\t" + "".join(f"{label}\t\t\t" for label in labels),
@@ -65,11 +67,12 @@ def _write_rows(job: ExportJob, measurement: Measurement, path: Path, file: IO[b
     Each cell ends in a tab: OpenSim ignores an empty cell at the end of a line, unless a tab follows.
     """
     frames, grid = measurement.frames, measurement.grid
+    start_s = seconds_of_row(measurement, 0)
     for start in range(0, grid.num_rows, _BLOCK_ROWS):
         stop = min(start + _BLOCK_ROWS, grid.num_rows)
         positions = frames.block(start, stop)[..., :3]
         lines = [
-            f"{row + 1}\t{row / grid.rate_hz:.6f}\t{_cells(markers)}\n"
+            f"{row + 1}\t{start_s + row / grid.rate_hz:.6f}\t{_cells(markers)}\n"
             for row, markers in enumerate(positions, start)
         ]
         file.write("".join(lines).encode())

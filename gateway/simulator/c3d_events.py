@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.descriptions.event_texts import UNUSED
+from gateway.descriptions.labels import common
 from gateway.rtc3d.components import LONG_EVENT, Items
 from gateway.rtc3d.parameters import EventDefinition, EventParameter, ExpectedValue, ParametersEvents
 from gateway.rtc3d_server.scene import NO_EVENTS
@@ -120,7 +121,10 @@ def _define(texts: _Texts) -> tuple[ParametersEvents, dict[str, npt.NDArray[np.i
     """Return a definition for each label, and the fields of the events: their ids, context and subject."""
     count = len(texts.seconds)
     labels = [label or _NO_LABEL for label in _padded(texts.labels, count)]
-    descriptions = _padded(texts.descriptions, count)
+    # A description of a single event, such as the number of a plate, is not that of all.
+    descriptions: dict[str, set[str]] = {}
+    for label, description in zip(labels, _padded(texts.descriptions, count), strict=True):
+        descriptions.setdefault(label, set()).add(description)
     parameters: list[EventParameter] = []
     numbers: dict[str, npt.NDArray[np.int64]] = {}
     for name, values in (("Context", texts.contexts), ("Subject", texts.subjects)):
@@ -134,7 +138,7 @@ def _define(texts: _Texts) -> tuple[ParametersEvents, dict[str, npt.NDArray[np.i
     ids = {label: number for number, label in enumerate(dict.fromkeys(labels), start=1)}
     numbers["id"] = np.array([ids[label] for label in labels])
     definitions = tuple(
-        EventDefinition(str(number), label, descriptions[labels.index(label)], tuple(parameters))
+        EventDefinition(str(number), label, common(descriptions[label]) or "", tuple(parameters))
         for label, number in ids.items()
     )
     return ParametersEvents(definitions), numbers

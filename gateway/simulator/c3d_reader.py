@@ -91,8 +91,10 @@ def _read_in_process(path: Path, file_bytes: int) -> tuple[C3dRecording, list[st
         raise _malformed(path, f"took more than {cpu_s} s of CPU time")
     if done.returncode == _NO_MEMORY:
         raise _malformed(path, f"needed more than {memory_bytes / 1e6:.0f} MB of memory")
+    if done.returncode < 0:
+        raise _malformed(path, f"crashed ({signal.Signals(-done.returncode).name})")
     if done.returncode:
-        raise _malformed(path, f"crashed (status {done.returncode})")
+        raise _malformed(path, f"failed with status {done.returncode}")
     result, warnings = pickle.loads(done.stdout)  # noqa: S301 - from our own process
     if isinstance(result, TakeError):
         raise result

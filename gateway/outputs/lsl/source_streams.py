@@ -314,5 +314,5 @@ def _event_delay_us(item: Any, timestamp_us: int) -> int:
 
 
 def _event_marker(parameters: Parameters, item: Any) -> str:
-    label, description = event_text(parameters, item)
-    return printable(f"{label}: {description}" if description else label)
+    text = event_text(parameters, item)
+    return printable(f"{text.label}: {text.description}" if text.values else text.label)

@@ -150,8 +150,14 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
             wait_until(lambda: take.exists() and take.read_bytes().count(channel) == count, 60)  # noqa: B023
         record.send_signal(signal.SIGINT)
         assert record.wait(30) == 0
-    assert run_in_process("export", take, copy).stderr == ""
+    [note] = run_in_process("export", take, copy).stderr.splitlines()
+    assert "time 0 is its first frame" in note
     expected, found = (read_ezc3d(path) for path in (original, copy))
+    events = [content["parameters"]["EVENT"] for content in (expected, found)]
+    assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]
+    starts_s = [content["header"]["points"]["first_frame"] / 200 for content in (expected, found)]
+    times_s = [event["TIMES"]["value"][1] - start_s for event, start_s in zip(events, starts_s, strict=True)]
+    assert times_s[0] == pytest.approx(times_s[1], abs=1e-4)
     for group in ("POINT", "ANALOG"):
         for name in ("LABELS", "RATE"):
             values = (each["parameters"][group][name]["value"] for each in (found, expected))

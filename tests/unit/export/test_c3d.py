@@ -133,6 +133,31 @@ def test_events_have_their_labels_and_times(tmp_path: Path) -> None:
     assert found("EVENT", "TIMES").tolist() == [[0, 0], [0.25, pytest.approx(0.4)]]
 
 
+def test_events_have_their_side_as_context(tmp_path: Path) -> None:
+    """Programs for gait analysis find the steps by label and context."""
+
+    def choice(number: str, name: str, *labels: str) -> EventParameter:
+        values = (ExpectedValue(str(n), str(n), label) for n, label in enumerate(labels))
+        return EventParameter(number, "int", name, tuple(values))
+
+    foot = choice("1", "Foot", "LEFT", "RIGHT")
+    definitions = (
+        EventDefinition("1", "Foot strike", parameters=(foot,)),
+        EventDefinition("2", "Right foot off"),
+        EventDefinition("3", "Left turn", parameters=(choice("1", "Context", "Invalid"),)),
+        EventDefinition("4", "Button", parameters=(choice("1", "Subject", "Anna"),)),
+    )
+    described = replace(SCENE.parameters, events=ParametersEvents(definitions))
+    items = [(1, 0, 0, -1, -1), (1, 0, 1, -1, -1), (2, 0, -1, -1, -1), (3, 0, 0, -1, -1), (4, 0, 0, -1, -1)]
+    events = [
+        frame(ComponentType.EVENT, [item], n, timestamp_us=5_000_000, utime=START_UTIME + 3000)
+        for n, item in enumerate(items)
+    ]
+    found, _ = export_c3d(tmp_path, [parameters(described), *scene_messages(SCENE, 100), *events])
+    assert found("EVENT", "CONTEXTS") == ["Left", "Right", "Right", "Invalid", "General"]
+    assert found("EVENT", "SUBJECTS") == ["", "", "", "", "Anna"]
+
+
 def test_labels_that_c3d_cannot_hold_are_changed_and_reported(tmp_path: Path) -> None:
     labels = ["a\nb", "Ä" * 90, "x" * 150 + "1", "x" * 150 + "2"]
     messages = points(*[[(1, 2, 3, 0)] * 4] * 3)

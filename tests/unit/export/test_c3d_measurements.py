@@ -90,7 +90,7 @@ def test_each_measurement_is_a_file(tmp_path: Path) -> None:
     ]
     job, files = export_all(tmp_path, messages)
     assert [path.name for path in job.files.paths] == ["walk-1.c3d", "walk-2.c3d", "walk-3.c3d"]
-    assert job.notes == ["there are 3 measurements, so there are 3 files"]
+    assert job.notes[0] == "there are 3 measurements, so there are 3 files"
     for found, count in zip(files, (20, 30, 10), strict=True):
         assert found.points.shape[2] == count
         assert np.array_equal(found.analog[:3], samples(0, 10 * count))

@@ -266,13 +266,22 @@ def test_a_file_cut_short_before_its_data_is_refused_and_one_cut_in_it_plays_up_
 
 def test_a_file_with_an_impossible_size_is_refused_before_it_is_read(path: Path) -> None:
     """ezc3d would allocate what the file states."""
-    whole = bytearray(path.read_bytes())
+    whole = path.read_bytes()
     at = whole.index(b"LABELS", 512) + len("LABELS") + 2  # behind the offset: type, number of sizes, sizes
-    whole[at : at + 5] = b"\xff\x03\xff\xff\xff"
-    path.write_bytes(whole)
-    with pytest.raises(TakeError, match="its parameter POINT:LABELS would have 16581375 bytes") as raised:
-        C3dScene(path)
-    assert str(path) in str(raised.value)
+    for damaged, problem in (
+        (
+            whole[:at] + b"\xff\3\xff\xff\xff" + whole[at + 5 :],
+            "its parameter POINT:LABELS would have 16581375",
+        ),
+        (
+            whole.replace(struct.pack("<f", 1000.0), struct.pack("<f", 1e6)),
+            "each of its frames would have at least",
+        ),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(TakeError, match=problem) as raised:
+            C3dScene(path)
+        assert str(path) in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -293,9 +302,11 @@ def test_a_file_that_takes_too_much_is_refused(
     assert str(path) in str(raised.value)
 
 
-def test_a_file_that_makes_ezc3d_crash_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_whose_process_fails_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(TakeError, match=r"take\.c3d cannot be read as a C3D file: reading it crashed"):
+    with pytest.raises(
+        TakeError, match=r"take\.c3d cannot be read as a C3D file: reading it failed with status 1"
+    ):
         C3dScene(path)
 
 
