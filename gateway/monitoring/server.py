@@ -27,7 +27,8 @@ class MonitoringServer:
         self._look_up: asyncio.Task[None] | None = None
         registry = metrics_registry(gateway, self._loop_delay)
         self._pages = HttpPages(
-            {"/metrics": lambda: metrics_page(registry), "/healthz": lambda: health_page(gateway)}
+            {"/metrics": lambda: metrics_page(registry), "/healthz": lambda: health_page(gateway)},
+            settings.address,
         )
 
     async def start(self) -> None:
