@@ -88,15 +88,22 @@ def _live_data(
     """Subscribe, and provide a viewer of what arrives."""
     from gateway.live.live_data import LiveData
     from gateway.subscriber.subscribe import close_in_time, subscribe_all
+    from gateway.view.running_takes import RunningTakes
     from gateway.view.viewer import Viewer
 
     live = LiveData()
     subscriber = subscribe_all(transport, sources, None, live)
+    takes = RunningTakes(live, subscriber, server.get_clients)
+
+    def tick() -> None:
+        subscriber.tick()
+        takes.tick()
+
     silence = threading.Timer(_SILENCE_S, _explain_silence, (live, subscriber))
     silence.daemon = True
     silence.start()
     try:
-        yield Viewer(server, live), subscriber.tick
+        yield Viewer(server, live), tick
     finally:
         close_in_time(subscriber)
 
@@ -113,7 +120,6 @@ def _take(
     live = LiveData()
     playback = Playback(path, sources, live)
     viewer = Viewer(server, live, playback)
-    playback.start()
     try:
         yield viewer, lambda: None
     finally:

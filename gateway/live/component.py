@@ -59,6 +59,7 @@ class LiveComponent:
         self._rate = MessageRate()
         self._rate_before_stop_hz = 0.0
         self._num_messages = 0
+        self._updated_s = time.monotonic()
         self._waiting: deque[tuple[bytes, int]] = deque()  # messages, and when they arrived
         self._waiting_bytes = 0
         self._described: tuple[Parameters | None, int] | None = None
@@ -80,9 +81,18 @@ class LiveComponent:
 
     # In the thread that reads.
 
+    def hold(self) -> None:
+        """Count no time since the last ``update``."""
+        pause_s = time.monotonic() - self._updated_s
+        self._updated_s += pause_s
+        if self.arrived_s is not None:
+            self.arrived_s += pause_s
+        self._rate.shift(pause_s)
+        self._visibility.shift(pause_s)
+
     def update(self, arrived: list[tuple[bytes, int]], parameters: Parameters | None) -> None:
         """Decode messages that have arrived, and describe their items by the source's parameters."""
-        now_s = time.monotonic()
+        now_s = self._updated_s = time.monotonic()
         self.batch = rows = decode_rows(self.type, [message for message, _ in arrived])
         self._num_messages += len(arrived)
         self.num_malformed += rows.malformed

@@ -157,12 +157,10 @@ class LiveData(Reception[LiveSource, Series]):
             self.receive(series, message)
 
     def hold(self) -> None:
-        """Count no time until now as a stop: a recording pauses. Call it before each ``update``."""
-        now_s = time.monotonic()
+        """Count no time since the last ``update``: a recording pauses. Call it before each ``update``."""
         for source in self.sources_now:
             for component in [*source.components.values()]:
-                if component.arrived_s is not None:
-                    component.arrived_s = now_s
+                component.hold()
 
     def begin_again(self) -> None:
         """Forget everything, because a recording continues at another place."""

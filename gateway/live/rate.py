@@ -18,6 +18,10 @@ class MessageRate:
         while len(self._counts) > 2 and now_s - self._counts[1][0] >= _WINDOW_S:
             self._counts.popleft()
 
+    def shift(self, seconds: float) -> None:
+        """Let everything so far have happened later: a pause does not count."""
+        self._counts = deque((time_s + seconds, number) for time_s, number in self._counts)
+
     @property
     def rate_hz(self) -> float:
         """Messages per second; 0 before there are two counts."""

@@ -38,6 +38,10 @@ class Visibility:
         else:
             self._steps.append((now_s, num_frames, counts))
 
+    def shift(self, seconds: float) -> None:
+        """Let everything so far have happened later: a pause does not count."""
+        self._steps = deque((begin_s + seconds, frames, counts) for begin_s, frames, counts in self._steps)
+
     def shares(self, now_s: float) -> Array:
         """Return for each item the share of frames in which it was visible, from 0 to 1, shape (items,).
 

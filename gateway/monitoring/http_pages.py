@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 from gateway.errors import NO_FILES
 from gateway.log import DefectLog
 from gateway.monitoring.process_limits import ReservedFiles
+from gateway.outputs.listen_address import foreign_request
 
 logger = logging.getLogger(__name__)
 
@@ -54,12 +55,17 @@ class Page(NamedTuple):
 
 
 class HttpPages:
-    """Serves ``pages``: a function for each path, called for each request."""
+    """Serves ``pages``: a function for each path, called for each request.
 
-    def __init__(self, pages: Mapping[str, Callable[[], Page]]) -> None:
+    ``host`` is the name or address to listen on, as configured: requests for other names are refused.
+    """
+
+    def __init__(self, pages: Mapping[str, Callable[[], Page]], host: str = "127.0.0.1") -> None:
         self._pages = pages
         self._listening: list[socket.socket] = []
         self._reserve = ReservedFiles(_RESERVED_FILES)
+        self._host = host
+        self._has_refused = False
         self._built: dict[str, tuple[float, Page]] = {}
         """The newest page of each path, and when it was built, on the monotonic clock in s."""
         self._defects = DefectLog(logger, "metrics")
@@ -169,6 +175,10 @@ class HttpPages:
         request = head.split(b"\r\n", 1)[0].decode("latin-1").split(" ")
         if len(request) != 3 or not request[2].startswith("HTTP/1."):
             return _error_page(HTTPStatus.BAD_REQUEST)
+        refusal = foreign_request(self._host, _header(head, b"host"), _header(head, b"origin"))
+        if refusal:
+            self._log_refusal(refusal)
+            return _error_page(HTTPStatus.FORBIDDEN, refusal)
         method, target, _ = request
         path = target.partition("?")[0]
         if path not in self._pages:
@@ -177,6 +187,11 @@ class HttpPages:
         if method not in {"GET", "HEAD"}:
             return _error_page(HTTPStatus.METHOD_NOT_ALLOWED)
         return self._page(path)
+
+    def _log_refusal(self, refusal: str) -> None:
+        if not self._has_refused:
+            self._has_refused = True
+            logger.warning("metrics: a request was refused: %s", refusal)
 
     def _page(self, path: str) -> Page:
         """Return the page, built at most MAX_PAGE_AGE_S ago."""
@@ -199,6 +214,12 @@ def _listen(address: str, port: int) -> socket.socket:
     listening = socket.create_server((address, port), family=family, backlog=_BACKLOG)
     listening.setblocking(False)
     return listening
+
+
+def _header(head: bytes, name: bytes) -> list[str]:
+    """Return the values of a header, whose name is in lower case."""
+    fields = (line.partition(b":") for line in head.split(b"\r\n")[1:])
+    return [value.strip().decode("latin-1") for key, _, value in fields if key.strip().lower() == name]
 
 
 def _error_page(status: HTTPStatus, reason: str = "only GET and HEAD are served") -> Page:

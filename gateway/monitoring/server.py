@@ -35,7 +35,8 @@ class MonitoringServer:
             {
                 "/metrics": lambda: metrics_page(registry),
                 "/healthz": lambda: health_page(gateway, limits.problems()),
-            }
+            },
+            settings.address,
         )
 
     async def start(self) -> None:

@@ -49,6 +49,9 @@ class LcmGatewaySubscriber:
         self._series: dict[str, Series | None] = {}  # by channel; None: left out
         self._requester = f"rtc3d-gateway {uuid.uuid4()}"
         self._by_request_id: dict[int, Source] = {}
+        self._take_queries: dict[str, int] = {}
+        """The newest request for the takes of each source, by the beginning of its channels."""
+        self._num_take_queries = 0
         self._subscribers = [
             LcmSubscriber(
                 open_lcm(receiving_url(url)), _pattern(prefix, [*self._names], components), self._receive
@@ -59,7 +62,7 @@ class LcmGatewaySubscriber:
         except OutputError:
             self._subscribers[0].close()
             raise
-        replies = f"{re.escape(prefix)}_.+_PARAMETERS_REPLY"
+        replies = f"{re.escape(prefix)}_.+_(PARAMETERS|COMMAND)_REPLY"
         self._subscribers.append(LcmSubscriber(self._queries, replies, self._receive_reply))
 
     # In the threads that receive.
@@ -127,7 +130,11 @@ class LcmGatewaySubscriber:
             reply = decode(data)
         except ProtocolError:
             return
-        if not isinstance(reply, rtc3d.parameters_reply_t) or reply.requester != self._requester:
+        replies = (rtc3d.parameters_reply_t, rtc3d.command_reply_t)
+        if not isinstance(reply, replies) or reply.requester != self._requester:
+            return
+        if isinstance(reply, rtc3d.command_reply_t):
+            self._receive_takes(reply)
             return
         source = self._by_request_id.get(reply.request_id)
         if source is None or reply.error_code in {"busy", "rate"}:
@@ -138,6 +145,11 @@ class LcmGatewaySubscriber:
                 source, xml_bytes(reply.xml), None, reply.parameters_version, min(max(0.0, reply.age_s), 1e9)
             )
         self._reception.answered(source, parameters)
+
+    def _receive_takes(self, reply: rtc3d.command_reply_t) -> None:
+        for source in self._reception.sources_now:
+            if not reply.error and self._take_queries.get(source.channels) == reply.request_id:
+                self._reception.answered_takes(source, reply.content.encode())
 
     # In the thread of the command.
 
@@ -156,6 +168,17 @@ class LcmGatewaySubscriber:
             self._queries.publish(f"{source.channels}_PARAMETERS_REQUEST", request.encode())
         except OSError as error:
             logger.debug("asking for the parameters of %s: %s", source.name, error)
+
+    def query_takes(self, source: Source) -> None:
+        """See GatewaySubscriber."""
+        request = rtc3d.command_request_t()
+        request.requester, request.command = self._requester, "take"
+        request.request_id = self._take_queries[source.channels] = self._num_take_queries
+        self._num_take_queries += 1
+        try:
+            self._queries.publish(f"{source.channels}_COMMAND_REQUEST", request.encode())
+        except OSError as error:
+            logger.debug("asking for the takes of %s: %s", source.name, error)
 
     def silence(self) -> str:
         """See GatewaySubscriber."""

@@ -1,5 +1,6 @@
 """What is received from gateways: by source and key, bounded, with everything that is left out counted."""
 
+import json
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -156,6 +157,17 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         """Take the answer to a query for the status."""
         with self._lock:
             source.status = source.status or message
+
+    def answered_takes(self, source: SourceT, content: bytes) -> None:
+        """Take the answer to a query for the takes, as JSON."""
+        try:
+            answer = json.loads(content)
+            running = [
+                take["name"] for take in (answer["running"] or {}, *answer["takes"]) if take.get("is_running")
+            ]
+        except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
+            return  # of another program
+        source.running_take = str(running[0]) if running else ""
 
     def _hear(self, source: Source) -> None:
         source.heard_s = time.monotonic()

@@ -85,6 +85,8 @@ class Source:
         """The newest ``parameters_t``."""
         self.num_parameters = 0
         """How many ``parameters_t`` were made of the parameters from Zenoh."""
+        self.running_take: str | None = None
+        """The name of the take that its gateway records; "" if none, None if it is not known."""
         self.has_answer = False
         """Whether a gateway has answered the query for the parameters, or published them."""
         self.series_by_key: dict[str, Any] = {}

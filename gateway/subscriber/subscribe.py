@@ -21,6 +21,9 @@ class GatewaySubscriber(Protocol):
     def tick(self) -> None:
         """Query what is not known yet of new sources. Called often, in one thread."""
 
+    def query_takes(self, source: Any) -> None:
+        """Query which take the gateway of a source records; see Source.running_take."""
+
     def silence(self) -> str:
         """Return that no gateway is found, or none with these sources; "" if one is. It may take 1 s."""
 

@@ -153,6 +153,15 @@ class ZenohGatewaySubscriber:
                 f"{key}/status", lambda reply: self._answered_status(source, reply), timeout=_QUERY_S
             )
 
+    def query_takes(self, source: Source) -> None:
+        """See GatewaySubscriber."""
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None and len(reply.ok.payload) <= MAX_XML_BYTES:
+                self._reception.answered_takes(source, reply.ok.payload.to_bytes())
+
+        self._session.get(f"{zenoh_key(self._prefix, source.name)}/take", take, timeout=_QUERY_S)
+
     def silence(self) -> str:
         """See GatewaySubscriber."""
         return no_gateway(self._prefix, self._sources, served_sources(self._session, self._prefix))

@@ -36,13 +36,16 @@ def banner_html(
 
 def _live_line(source: LiveSource, now_s: float) -> str:
     state, age_s = data_state(source), source.age_s
+    take = ""
+    if source.running_take and not source.is_silent:
+        take = f"<p><span class=bad>● recording</span> {html_text(source.running_take, _MAX_CHARACTERS)}</p>"
     last = "" if age_s is None else f"last data {clock_text(now_s - age_s)}"
     if state.level is not Level.BAD:
-        return _line(source, state, last)
+        return _line(source, state, last) + take
     reasons = ", ".join(each.text for each in gateway_states(source) if each.level is not Level.GOOD)
     details = html_text(" · ".join(filter(None, (last, reasons))), _MAX_CHARACTERS)
     name, text = html_text(source.name), html_text(state.text, _MAX_CHARACTERS)
-    return f"<div class=stopped><b>{name}: {text}</b>. The picture is old.<br>{details}</div>"
+    return f"<div class=stopped><b>{name}: {text}</b>. The picture is old.<br>{details}</div>{take}"
 
 
 def _take_line(source: LiveSource, *, is_paused: bool) -> str:

@@ -31,21 +31,25 @@ class Labels:
         self._nodes: list[viser.LabelHandle] = []
         self._positions = np.empty((0, 3), np.float32)  # as they are shown; NaN is hidden
         self._texts: Sequence[str] = ()
+        self._prefix = ""
         self._next = 0
         self._moved_s = 0.0
 
-    def update(self, positions: Array, texts: Sequence[str], now_s: float) -> None:
-        """Show the labels at ``positions``, shape (items, 3), not all at a time; NaN hides one."""
+    def update(self, positions: Array, texts: Sequence[str], now_s: float, prefix: str = "") -> None:
+        """Show the labels at ``positions``, shape (items, 3), not all at a time; NaN hides one.
+
+        ``prefix`` precedes each text.
+        """
         if now_s - self._moved_s < _PERIOD_S:
             return
         self._moved_s = now_s
         self._parent.visible = True
         count = min(MAX_LABELS, len(positions), len(texts))
         self._add_nodes(count)
-        if texts is not self._texts:
-            self._texts = texts
-            for node, text in zip(self._nodes, texts, strict=False):
-                node.text = safe_text(text, _MAX_CHARACTERS)
+        if texts is not self._texts or prefix != self._prefix:
+            self._texts, self._prefix = texts, prefix
+            for index, node in enumerate(self._nodes[: len(texts)]):
+                node.text = self._text(index)
         wanted = np.full_like(self._positions, np.nan)
         wanted[:count] = positions[: len(wanted)][:count]
         differs = is_shown(wanted) != is_shown(self._positions)
@@ -62,13 +66,16 @@ class Labels:
     def _add_nodes(self, count: int) -> None:
         first = len(self._nodes)
         for index in range(first, min(count, first + _PER_PERIOD)):
-            text = safe_text(self._texts[index], _MAX_CHARACTERS) if index < len(self._texts) else ""
+            text = self._text(index) if index < len(self._texts) else ""
             name = f"{self._parent.name}/{index}"
             self._nodes.append(
                 self._scene.add_label(name, text, visible=False, font_screen_scale=0.8, anchor="bottom-left")
             )
         added = np.full((len(self._nodes) - first, 3), np.nan, np.float32)
         self._positions = np.concatenate([self._positions, added])
+
+    def _text(self, index: int) -> str:
+        return safe_text(self._prefix + self._texts[index], _MAX_CHARACTERS)
 
     def _move(self, index: int, position: Array) -> None:
         node = self._nodes[index]

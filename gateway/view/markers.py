@@ -38,15 +38,17 @@ class Markers:
         self.positions: Array = _NOTHING
         """The positions in the newest frame, shape (markers, 3), in metres; NaN is missing."""
 
-    def update(self, component: LiveComponent, now_s: float, *, labels: bool, trails: bool) -> None:
-        """Show the newest frame."""
+    def update(
+        self, component: LiveComponent, now_s: float, prefix: str, *, labels: bool, trails: bool
+    ) -> None:
+        """Show the newest frame. ``prefix`` precedes each label."""
         if component.newest_head is not self._head:
             self._head = component.newest_head
             self._take(component, now_s)
         self._show_stopped(component.is_stopped)
         self._show_ghosts(now_s)
         if labels:
-            self._labels.update(self.positions, self._names, now_s)
+            self._labels.update(self.positions, self._names, now_s, prefix)
         else:
             self._labels.hide()
         if trails and not self._is_stopped:

@@ -88,7 +88,12 @@ class Panel:
 
     def _show_sources(self, sources: Sequence[LiveSource]) -> None:
         texts = [
-            source_html(source, self._shown_latency.percentiles(source.name), is_take=self._is_take)
+            source_html(
+                source,
+                self._shown_latency.percentiles(source.name),
+                is_take=self._is_take,
+                is_paused=self._is_paused,
+            )
             for source in sources[:MAX_SOURCES]
         ]
         self._sources.content = _block(*texts, ignored_html(self._live))

@@ -35,10 +35,12 @@ _NOTHING: Final = np.empty((0, 2, 3), np.float32)
 class Plates:
     """The outlines and names of plates, and arrows of the forces on them. ``path`` is the node above them.
 
-    Plates whose place is not known stand side by side at the origin.
+    Plates whose place is not known stand side by side at the origin. Several sources may have the same
+    plates, so the labels of the first source, ``number`` 0, are at the centres, others towards corners.
     """
 
-    def __init__(self, scene: viser.SceneApi, path: str) -> None:
+    def __init__(self, scene: viser.SceneApi, path: str, number: int) -> None:
+        self._number = number
         self._outlines = scene.add_line_segments(
             f"{path}/plates", _NOTHING, _OUTLINE_COLOR, thickness=2.5, thickness_units="screen"
         )
@@ -54,21 +56,21 @@ class Plates:
         self._known: tuple[Parameters, int, UpAxis] | None = None
         self._plates: list[PlacedPlate] = []
         self._names: tuple[str, ...] = ()
-        self._centres = np.empty((0, 3), np.float32)
+        self._label_places: Array = np.empty((0, 3), np.float32)
         self._head: Any = None
         self.corners: Array = np.empty((0, 3), np.float32)
         """The corners of all plates, shape (corners, 3), in metres."""
 
     def update(
-        self, component: LiveComponent | None, parameters: Parameters, up: UpAxis, now_s: float
+        self, component: LiveComponent | None, parameters: Parameters, up: UpAxis, now_s: float, prefix: str
     ) -> None:
-        """Show the plates, and the forces of the newest frame."""
+        """Show the plates, and the forces of the newest frame. ``prefix`` precedes each label."""
         num_items = 0 if component is None else len(component.newest_items)
         known = self._known
         if known is None or known[0] is not parameters or known[1:] != (num_items, up):
             self._known = (parameters, num_items, up)
             self._place(parameters, component, up)
-        self._labels.update(self._centres, self._names, now_s)
+        self._labels.update(self._label_places, self._names, now_s, prefix)
         if component is None or component.is_stopped:
             self._head = None
             self._arrows.points = _NOTHING
@@ -91,8 +93,10 @@ class Plates:
             else:
                 self._plates.append(plate)
         self._names = tuple(plate.label for plate in self._plates)
-        self._centres = np.array([plate.centre for plate in self._plates], np.float32).reshape(-1, 3)
+        centres = np.array([plate.centre for plate in self._plates], np.float32).reshape(-1, 3)
         corners = np.array([plate.corners for plate in self._plates], np.float32).reshape(-1, 4, 3)
+        towards = corners[:, self._number % 4] if self._number else centres
+        self._label_places = (centres + towards) / 2
         self.corners = corners.reshape(-1, 3)
         self._outlines.points = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3)
 

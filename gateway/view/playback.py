@@ -38,16 +38,18 @@ class Playback:
 
     def __init__(self, path: Path, sources: Collection[str], live: LiveData) -> None:
         self._reader = TakeReader(path)
-        _check_sources(self._reader, sources)
+        selection = Selection(sources=frozenset(sources) or None)
+        _check_messages(self._reader, selection)
         self._live = live
         self._length_us = take_length_us(self._reader) or _length_by_reading_us(self._reader)
         self._player = Player(
             self._reader,
-            Selection(sources=frozenset(sources) or None),
+            selection,
             live,
             rate=1.0,
             is_watched=True,
         )
+        self._has_begun = False
         self._shown_s = 0.0
         self._moved_s = 0.0
 
@@ -70,8 +72,10 @@ class Playback:
         self._loop.on_update(lambda _event: self._repeat(self._loop.value))
 
     def start(self) -> None:
-        """Begin to play."""
-        self._player.start()
+        """Begin to play, unless it has begun."""
+        if not self._has_begun:
+            self._has_begun = True
+            self._player.start()
 
     def update(self) -> None:
         """Show the time and the state. Call it often; raises what ended the player."""
@@ -88,8 +92,9 @@ class Playback:
 
     def close(self) -> None:
         """Stop playing."""
-        self._player.stop()
-        self._player.join(_STOP_S)
+        if self._has_begun:
+            self._player.stop()
+            self._player.join(_STOP_S)
 
     def _state_text(self) -> str:
         player = self._player
@@ -120,12 +125,13 @@ class Playback:
         self._player.is_repeated = is_repeated
 
 
-def _check_sources(reader: TakeReader, sources: Collection[str]) -> None:
-    """Raise TakeError if the take has no message of these sources. This reads up to their first message."""
-    if sources and not any(message.source in sources for message in reader.messages()):
-        shown = ", ".join(map(quoted, sources))
-        existing = ", ".join(reader.source_names)
-        raise TakeError(f"{reader.path} has no messages of {shown}; sources of the take: {existing}")
+def _check_messages(reader: TakeReader, selection: Selection) -> None:
+    """Raise TakeError if nothing of the take is selected. This reads up to the first such message."""
+    if any(selection.has(message.source, message.key) for message in reader.messages()):
+        return
+    existing = ", ".join(reader.source_names)
+    shown = f" of {', '.join(map(quoted, selection.sources))}" if selection.sources else ""
+    raise TakeError(f"{reader.path} has no messages{shown}; sources of the take: {existing}")
 
 
 def _length_by_reading_us(reader: TakeReader) -> int:

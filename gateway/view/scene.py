@@ -29,6 +29,8 @@ class Scene:
         self._parameters: list[Parameters] = []
         self._first_s: float | None = None
         """When the first data were shown."""
+        self._has_subject = False
+        """Whether markers or tools have been shown, and not only plates."""
         self._fitted: set[int] = set()
         """The browsers whose view has been fitted."""
         self._switches = Switches(
@@ -40,12 +42,14 @@ class Scene:
         now_s = time.monotonic()
         for source in sources:
             if source.channels not in self._sources:
-                color = color_of(len(self._sources))
-                switch = self._switches.add_source(source.name, color)
-                self._sources[source.channels] = SourceScene(self._server, source, color, switch)
+                number = len(self._sources)
+                switch = self._switches.add_source(source.name, color_of(number))
+                self._sources[source.channels] = SourceScene(self._server, source, number, switch)
         self._turn(sources)
         for source in sources:
-            self._sources[source.channels].update(source, self._world.up, self._switches, now_s)
+            self._sources[source.channels].update(
+                source, self._world.up, self._switches, now_s, is_alone=len(sources) == 1
+            )
         self._world.show_scale(forces=any(scene.has_plates for scene in self._sources.values()))
         self._fit(clients, now_s)
 
@@ -68,7 +72,11 @@ class Scene:
         self._world.show_floor(visible=self._switches.floor)
 
     def _fit(self, clients: dict[int, viser.ClientHandle], now_s: float) -> None:
-        """Fit the view of browsers that are new, or that want it."""
+        """Fit the view of browsers that are new, or want it; of all when the first markers or tools come."""
+        if not self._has_subject and any(scene.has_subject for scene in self._sources.values()):
+            self._has_subject = True
+            self._first_s = now_s
+            self._fitted.clear()
         self._fitted &= clients.keys()
         waiting = [client for number, client in clients.items() if number not in self._fitted]
         if not waiting:

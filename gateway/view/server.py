@@ -4,11 +4,17 @@ import errno
 import logging
 import socket
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from typing import Any
 
 import rich
 import viser
+import websockets.asyncio.server
 
 from gateway.errors import ViewError
+from gateway.outputs.listen_address import foreign_request
 
 
 class ViewServer(viser.ViserServer):
@@ -25,13 +31,36 @@ def open_server(host: str, port: int) -> ViewServer:
     # It would log a traceback for each connection that is no browser's, as of a port scan.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "Queued a ")  # to a browser that has left a moment ago
-    server = ViewServer(host, port, label="rtc3d-gateway", verbose=False)
+    with _refusing_foreign_sites(host):
+        server = ViewServer(host, port, label="rtc3d-gateway", verbose=False)
     if port not in {0, server.get_port()}:  # taken since; viser chose another port
         server.stop()
         raise ViewError(_in_use(host, port))
     set_theme(server.gui, dark=True)
     server.gui.main_panel.dock_right()  # a floating one would cover the picture
     return server
+
+
+@contextmanager
+def _refusing_foreign_sites(host: str) -> Iterator[None]:
+    """Let a server that viser opens meanwhile refuse what browsers send for other sites; viser would not."""
+    serve: Any = websockets.asyncio.server.serve
+
+    def guarded_serve(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            refusal = foreign_request(host, headers.get_all("Host"), headers.get_all("Origin"))
+            if refusal:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n")
+            return process_request(connection, request)
+
+        return serve(*arguments, process_request=process, **options)
+
+    websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
 def address_of(host: str, port: int) -> str:

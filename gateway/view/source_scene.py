@@ -9,9 +9,9 @@ import viser
 
 from gateway.live.component import LiveComponent
 from gateway.live.live_data import LiveSource
-from gateway.view.axes import UpAxis
+from gateway.view.axes import UpAxis, on_floor
 from gateway.view.camera import Sphere, sphere_around
-from gateway.view.colors import SourceColor
+from gateway.view.colors import color_of
 from gateway.view.markers import Markers
 from gateway.view.plates import Plates
 from gateway.view.switches import Switches
@@ -19,17 +19,25 @@ from gateway.view.tools import Tools
 
 _NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
 
+_GAP_M: Final = 0.2
+"""How much higher the label of each further source is that says that its data have stopped."""
+
 
 class SourceScene:
-    """The markers, tools, plates and forces of a source, in a group of their own."""
+    """The markers, tools, plates and forces of a source, in a group of their own.
+
+    ``number`` is the source's: it has a colour of its own, and its labels are not where others have theirs.
+    """
 
     def __init__(
         self,
         server: viser.ViserServer,
         source: LiveSource,
-        color: SourceColor,
+        number: int,
         switch: viser.GuiCheckboxHandle,
     ) -> None:
+        self._number = number
+        color = color_of(number)
         self._name = source.name
         self._switch = switch
         scene = server.scene
@@ -37,13 +45,15 @@ class SourceScene:
         self._group = scene.add_frame(path, show_axes=False)
         self._markers = Markers(scene, path, color)
         self._tools = Tools(scene, path)
-        self._plates = Plates(scene, path)
+        self._plates = Plates(scene, path, number)
         self._stopped = scene.add_label(
-            f"{path}/stopped", "", visible=False, font_screen_scale=1.6, anchor="center-center"
+            f"{path}/stopped", "", visible=False, font_screen_scale=1.6, anchor="bottom-center"
         )
 
-    def update(self, source: LiveSource, up: UpAxis, switches: Switches, now_s: float) -> None:
-        """Show the newest data of the source."""
+    def update(
+        self, source: LiveSource, up: UpAxis, switches: Switches, now_s: float, *, is_alone: bool
+    ) -> None:
+        """Show the newest data of the source. If it is not alone, its labels begin with its name."""
         if source.name != self._name:  # on LCM, a status says the name
             self._name = source.name
             self._switch.label = source.name
@@ -51,14 +61,15 @@ class SourceScene:
         if not self._group.visible:
             return
         components = {**source.components}
+        prefix = "" if is_alone else f"{source.name}: "
         if "3d" in components:
             self._markers.update(
-                components["3d"], now_s, labels=switches.marker_labels, trails=switches.trails
+                components["3d"], now_s, prefix, labels=switches.marker_labels, trails=switches.trails
             )
         if "6d" in components:
-            self._tools.update(components["6d"], now_s, labels=switches.tool_labels)
-        self._plates.update(components.get("force"), source.newest_parameters, up, now_s)
-        self._say_stopped(source.name, components)
+            self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels)
+        self._plates.update(components.get("force"), source.newest_parameters, up, now_s, prefix)
+        self._say_stopped(source.name, components, up)
 
     def hide(self) -> None:
         """Hide everything until the next update."""
@@ -70,6 +81,11 @@ class SourceScene:
         return bool(self._group.visible)
 
     @property
+    def has_subject(self) -> bool:
+        """Whether markers or tools are in the picture."""
+        return sphere_around([self._markers.positions, self._tools.positions]) is not None
+
+    @property
     def has_plates(self) -> bool:
         """Whether force plates are shown."""
         return self.is_visible and len(self._plates.corners) > 0
@@ -79,15 +95,19 @@ class SourceScene:
         """The positions of everything, each of shape (points, 3), in metres; NaN is missing."""
         return [self._markers.positions, self._tools.positions, self._plates.corners]
 
-    def _say_stopped(self, name: str, components: dict[str, LiveComponent]) -> None:
+    def _say_stopped(self, name: str, components: dict[str, LiveComponent], up: UpAxis) -> None:
         stopped = {key: each for key, each in components.items() if each.is_stopped}
         self._stopped.visible = bool(stopped)
         if not stopped:
             return
         age_s = max(each.age_s or 0.0 for each in stopped.values())
         self._stopped.text = f"{name}: no {_what(stopped, components)} for {_duration(age_s)}"
-        sphere = sphere_around(self.points)
-        self._stopped.position = (sphere or Sphere((0.0, 0.0, 0.0), 1.0)).centre
+        # Above its own subject: between that and its plates, another source's subject may be.
+        sphere = sphere_around([self._markers.positions, self._tools.positions])
+        sphere = sphere or sphere_around([self._plates.corners]) or Sphere((0.0, 0.0, 0.0), 0.0)
+        above = on_floor(up, 0.0, 0.0, sphere.radius + _GAP_M * self._number)
+        x, y, z = np.add(sphere.centre, above).tolist()
+        self._stopped.position = (x, y, z)
 
 
 def _what(stopped: Iterable[str], components: dict[str, LiveComponent]) -> str:

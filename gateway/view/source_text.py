@@ -23,19 +23,21 @@ _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
 """A median latency between computers outside of these says that their clocks differ."""
 
 
-def source_html(source: LiveSource, shown: Mapping[str, Percentiles], *, is_take: bool) -> str:
+def source_html(
+    source: LiveSource, shown: Mapping[str, Percentiles], *, is_take: bool, is_paused: bool = False
+) -> str:
     """Return everything about a source but its markers, tools and events.
 
     ``shown`` is the latency from the arrival here to the browsers, by component. A take has no gateway now,
-    so its latency to here is left out.
+    so its latency to here is left out, and if it ``is_paused``, it has no rate.
     """
     parts = [f"<h3>{html_text(source.name)}</h3>"]
-    if not (is_take and source.is_silent):
+    if not (is_take and (source.is_silent or is_paused)):
         parts.append(states_html(gateway_states(source)))
     parts += [f"<p class=dim>{line}</p>" for line in _origin(source)]
     components = _components(source)
     if components:
-        parts.append(_rates_table(source, components, is_take=is_take))
+        parts.append(_rates_table(source, components, is_take=is_take, is_paused=is_paused))
         parts.append(_latency_table(components, shown, is_take=is_take))
         parts += [f"<p class=waiting>{text}</p>" for text in clock_warning(components) if not is_take]
     parts.append(losses_html(source, components))
@@ -77,32 +79,42 @@ def _components(source: LiveSource) -> dict[str, LiveComponent]:
 
 
 def _origin(source: LiveSource) -> Iterator[str]:
-    """Say where the data come from: server, gateway, clock."""
+    """Say where the data come from, and whether the gateway records them."""
     status = source.newest_status
     if status is None:
         return
     on_host = f" on {html_text(status.host)}" if status.host else ""
     yield f"server {html_text(status.server)} · gateway {html_text(status.gateway_version)}{on_host}"
+    if source.running_take is not None and not source.is_silent:
+        yield (
+            f"recording the take {html_text(source.running_take)}"
+            if source.running_take
+            else "recording no take"
+        )
 
 
-def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent], *, is_take: bool) -> str:
+def _rates_table(
+    source: LiveSource, components: Mapping[str, LiveComponent], *, is_take: bool, is_paused: bool
+) -> str:
     rows = []
     for key, component in components.items():
         rows.append(
             (
                 key,
                 count_text(len(component.newest_items)) if key != "event" else "",
-                _rate(component, is_take=is_take) if key != "event" else "",
+                _rate(component, is_take=is_take, is_paused=is_paused) if key != "event" else "",
                 count_text(source.series_by_key[key].num_messages),
             )
         )
     return table(("", "items", "Hz", "messages"), rows)
 
 
-def _rate(component: LiveComponent, *, is_take: bool) -> str:
+def _rate(component: LiveComponent, *, is_take: bool, is_paused: bool) -> str:
     """Return the rate, and the announced one if there is one. That of a take depends on its speed."""
     if component.is_stopped:
         return f"<span class=bad>stopped {age_text(component.age_s or 0.0)} ago</span>"
+    if is_paused:
+        return "paused"
     announced_hz = component.announced_rate_hz
     text = rate_text(component.rate_hz)
     if announced_hz is None:

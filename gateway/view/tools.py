@@ -33,14 +33,14 @@ class Tools:
         self.positions: Array = _NOTHING
         """The positions in the newest frame, shape (tools, 3), in metres; NaN is missing."""
 
-    def update(self, component: LiveComponent, now_s: float, *, labels: bool) -> None:
-        """Show the newest frame."""
+    def update(self, component: LiveComponent, now_s: float, prefix: str, *, labels: bool) -> None:
+        """Show the newest frame. ``prefix`` precedes each label."""
         if component.newest_head is not self._head:
             self._head = component.newest_head
             self._take(component)
         self._show_sizes(_STOPPED_SIZE if component.is_stopped else 1.0)
         if labels:
-            self._labels.update(self.positions, self._names, now_s)
+            self._labels.update(self.positions, self._names, now_s, prefix)
         else:
             self._labels.hide()
 

@@ -58,11 +58,13 @@ class Viewer:
 
     def update(self) -> None:
         """Decode what has arrived, and show it. Raises what ended the playback of a take."""
+        clients = self._server.get_clients()
+        if clients and self._playback is not None:
+            self._playback.start()  # not before: a short take would be over
         is_paused = self._playback is not None and self._playback.is_paused
         if is_paused:
             self._live.hold()
         sources = self._live.update()
-        clients = self._server.get_clients()
         if clients:
             with self._server.atomic():
                 self.scene.update(sources, clients)

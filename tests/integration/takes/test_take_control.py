@@ -13,11 +13,14 @@ from typing import Any, NamedTuple
 import pytest
 
 from gateway.gateway import Gateway
+from gateway.live.live_data import LiveData
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES
+from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
+from gateway.view.running_takes import RunningTakes
 from tests.networks import free_endpoint, lcm_url
 from tests.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
 from tests.servers import ScriptedServer, markers_frame
@@ -93,6 +96,27 @@ async def lab(folder: Path, *, remote_control: bool = True, **takes: Any) -> Asy
 def markers(path: Path) -> int:
     """Return how many frames with markers a take has."""
     return sum(message.key == "3d" for message in TakeReader(path).messages())
+
+
+@pytest.mark.parametrize("side", ["zenoh", "lcm"])
+async def test_the_view_learns_which_take_is_running_while_a_page_is_open(tmp_path: Path, side: str) -> None:
+    async with lab(tmp_path / "takes") as at:
+        live, pages = LiveData(), [1]
+        transport = Transport(True, url=at.url) if side == "lcm" else Transport(connect=at.endpoint)
+        subscriber = await asyncio.to_thread(subscribe_all, transport, (), None, live)
+        takes = RunningTakes(live, subscriber, lambda: pages, period_s=0.05)
+
+        def shown() -> str | None:
+            live.update()
+            takes.tick()
+            return live.sources_now[0].running_take if live.sources_now else None
+
+        await wait_until_async(lambda: shown() == "")
+        await take("start", NAME, *at.options(side))
+        await wait_until_async(lambda: shown() == NAME)
+        await take("stop", *at.options(side))
+        await wait_until_async(lambda: shown() == "")
+        subscriber.close()
 
 
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])

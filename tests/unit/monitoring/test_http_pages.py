@@ -170,3 +170,21 @@ async def test_closing_disconnects_clients_and_frees_the_port(site: Site) -> Non
     writer.close()
     await again.start(["127.0.0.1"], site.port)
     await again.close()
+
+
+async def test_requests_of_foreign_sites_are_refused_and_logged_once(
+    site: Site, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A web page could read the metrics otherwise, by DNS rebinding or from another origin."""
+    for field in (
+        b"Host: evil.example",
+        b"host:evil.example:9464",
+        b"Host: localhost\r\nOrigin: http://evil.example",
+    ):
+        answer = await site.send(b"GET /page HTTP/1.1\r\n" + field + b"\r\n\r\n")
+        assert status_of(answer) == 403
+        assert b"evil.example" in answer
+    assert site.served == 0
+    assert len(caplog.records) == 1
+    for field in (b"Host: 127.0.0.1:9464", b"Host: localhost\r\nOrigin: http://localhost"):
+        assert status_of(await site.send(b"GET /page HTTP/1.1\r\n" + field + b"\r\n\r\n")) == 200

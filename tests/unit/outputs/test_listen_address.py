@@ -1,8 +1,17 @@
 import socket
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from gateway.outputs.listen_address import from_this_computer, host_in_url, is_loopback, listen_problem
+from gateway.outputs import listen_address
+from gateway.outputs.listen_address import (
+    foreign_request,
+    from_this_computer,
+    host_in_url,
+    is_loopback,
+    listen_problem,
+)
 from tests.networks import free_port
 
 ALL_IPV4 = "0.0.0.0"  # noqa: S104 - not bound
@@ -48,3 +57,64 @@ def test_a_name_of_an_ipv6_address_can_be_used(monkeypatch: pytest.MonkeyPatch) 
 def test_why_no_server_can_listen() -> None:
     assert listen_problem("192.0.2.1", free_port()) == "Cannot assign requested address"
     assert listen_problem("no-such-name.invalid", free_port()) not in {"", "Unknown error -2"}
+
+
+@pytest.fixture
+def _lab_pc(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """Let this computer be lab-pc in the domain example.org."""
+    (tmp_path / "resolv.conf").write_text("# by hand\nnameserver 192.0.2.53\n\nsearch Example.org\n")
+    monkeypatch.setattr(listen_address, "_RESOLVER", tmp_path / "resolv.conf")
+    monkeypatch.setattr(socket, "gethostname", lambda: "Lab-PC")
+    listen_address._own_names.cache_clear()
+    yield
+    listen_address._own_names.cache_clear()
+
+
+LOOPBACK = ("localhost", "LOCALHOST:8080", "view.localhost", "127.0.0.1:8080", "[::1]:8080", "localhost.:1")
+OWN_NAMES = ("lab-pc:8080", "Lab-PC.example.org", "lab-pc.local.")
+ADDRESSES = ("192.0.2.5:8080", "[2001:db8::5]")
+FOREIGN = (
+    *("evil.example", "localhost.evil.example:8080", "127.0.0.1.evil.example", "lab-pc.evil.example"),
+    *("user@localhost", "localhost:8080:1", "[::1", "[localhost]", "evil.example/localhost", ""),
+)
+
+
+@pytest.mark.usefixtures("_lab_pc")
+@pytest.mark.parametrize(
+    ("listens_on", "own", "foreign"),
+    [
+        ("127.0.0.1", LOOPBACK, (*OWN_NAMES, *ADDRESSES, *FOREIGN)),
+        ("localhost", LOOPBACK, (*OWN_NAMES, *ADDRESSES, *FOREIGN)),
+        (ALL_IPV4, (*LOOPBACK, *OWN_NAMES, *ADDRESSES), FOREIGN),
+        ("::", (*LOOPBACK, *OWN_NAMES, *ADDRESSES), FOREIGN),
+        ("192.0.2.5", (*LOOPBACK, *OWN_NAMES, *ADDRESSES), FOREIGN),
+        ("view.example.net", ("view.example.net", *OWN_NAMES, *ADDRESSES), FOREIGN),
+    ],
+)
+def test_which_hosts_a_request_may_name(
+    listens_on: str, own: tuple[str, ...], foreign: tuple[str, ...]
+) -> None:
+    """A foreign site's name that leads to this computer (DNS rebinding) is refused, with the reason."""
+    assert [host for host in own if foreign_request(listens_on, [host], [])] == []
+    for host in foreign:
+        assert f"'{host}' is not a name or address of this server" in foreign_request(listens_on, [host], [])
+
+
+@pytest.mark.parametrize(
+    ("hosts", "origins", "is_foreign"),
+    [
+        ([], [], False),  # HTTP/1.0; no browser
+        (["127.0.0.1:8080"], ["http://127.0.0.1:8080"], False),
+        (["127.0.0.1:8080"], ["http://localhost:8080"], False),
+        (["localhost"], ["https://localhost"], False),
+        (["127.0.0.1:8080"], ["http://127.0.0.1:9000"], True),
+        (["127.0.0.1:8080"], ["http://evil.example:8080"], True),
+        ([], ["http://evil.example"], True),
+        (["127.0.0.1:8080"], ["null"], True),
+        (["127.0.0.1:8080"], ["file://"], True),
+        (["127.0.0.1:8080", "evil.example"], [], True),
+        (["127.0.0.1:8080"], ["http://127.0.0.1:8080", "http://evil.example"], True),
+    ],
+)
+def test_pages_of_other_sites_are_refused(hosts: list[str], origins: list[str], is_foreign: bool) -> None:
+    assert bool(foreign_request("127.0.0.1", hosts, origins)) == is_foreign

@@ -9,6 +9,7 @@ import viser
 import zstandard
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
+from websockets.typing import Origin
 
 _CAMERA: Final = {
     "type": "ViewerCameraMessage",
@@ -53,9 +54,11 @@ class PageClient:
 
 
 @contextmanager
-def page_client(server: viser.ViserServer, **camera: Any) -> Iterator[PageClient]:
+def page_client(
+    server: viser.ViserServer, origin: Origin | None = None, **camera: Any
+) -> Iterator[PageClient]:
     """Connect a page, and provide it. ``camera`` replaces fields of its camera message."""
     url = f"ws://127.0.0.1:{server.get_port()}"
     protocol: Any = f"viser-v{viser.__version__}"
-    with connect(url, subprotocols=[protocol], max_size=None, close_timeout=0.1) as connection:
+    with connect(url, subprotocols=[protocol], origin=origin, max_size=None, close_timeout=0.1) as connection:
         yield PageClient(connection, camera)

@@ -12,6 +12,7 @@ from gateway.errors import TakeError
 from gateway.live.live_data import LiveData
 from gateway.view.labels import Labels
 from gateway.view.playback import Playback
+from gateway.view.viewer import Viewer
 from tests.takes import description, markers, parameters, write_take
 from tests.waiting import wait_until
 
@@ -65,6 +66,27 @@ def test_the_take_plays_and_the_slider_follows(played: Played) -> None:
     assert "of 0:00:29.9, playing" in played.playback._state.content
 
 
+def test_a_take_begins_when_the_first_page_is_open(
+    tmp_path: Path, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short take would be over before anybody sees it."""
+    pages: dict[int, object] = {}
+    monkeypatch.setattr(server, "get_clients", lambda: pages)
+    live = LiveData()
+    path = write_take(tmp_path / "walk.lcmlog", [description(), parameters(XML), markers(1, 0)])
+    playback = Playback(path, (), live)
+    viewer = Viewer(server, live, playback)
+    viewer.update()
+    assert not playback._player.is_alive
+    playback.close()
+    monkeypatch.setattr(viewer.scene, "update", lambda *_: None)
+    pages[1] = None
+    viewer.update()
+    wait_until(lambda: playback._player.is_at_end)
+    viewer.update()
+    playback.close()
+
+
 def test_a_pause_stands_still_and_shows_where_the_slider_goes(played: Played) -> None:
     wait_until(lambda: played.newest >= 0)
     played.playback._toggle(USER)
@@ -110,6 +132,9 @@ def test_a_take_with_a_damaged_end_has_a_length(tmp_path: Path) -> None:
 def test_no_take_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(TakeError):
         Playback(tmp_path / "missing.lcmlog", (), LiveData())
+    path = write_take(tmp_path / "empty.lcmlog", [description()])
+    with pytest.raises(TakeError, match="has no messages"):
+        Playback(path, (), LiveData())
 
 
 def test_labels_from_the_network_are_one_line_of_limited_length() -> None:

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -67,8 +68,8 @@ class Picture:
         switch = getattr(self.scene._switches, f"_{name}")
         switch.value = value
 
-    def shown_labels(self, path: str) -> dict[str, list[float]]:
-        nodes = [self.node(f"{path}/{index}") for index in range(MAX_LABELS + 1)]
+    def shown_labels(self, path: str, source: str = "MOCAP_LAB") -> dict[str, list[float]]:
+        nodes = [self.node(f"{path}/{index}", source) for index in range(MAX_LABELS + 1)]
         return {
             node.text: [round(float(value), 4) for value in node.position]
             for node in nodes
@@ -242,6 +243,46 @@ def test_the_mark_for_1_m_says_how_long_arrows_are_only_where_there_are_plates(p
     assert picture.scene._world._unit.text == "1 m"
     picture.show_parameters(lab, PLATE)
     assert picture.scene._world._unit.text == "1 m = 1000 N"
+
+
+def test_two_sources_with_the_same_plates_have_labels_that_differ(picture: Picture) -> None:
+    for name in ("gym", "lab"):
+        picture.show_parameters(picture.lab(name), PLATE)
+    picture.show(0.1)
+    picture.show(0.1)
+    assert picture.shown_labels("plate labels", "MOCAP_GYM") == {"gym: Left": [0.2, 0.3, 0]}
+    assert picture.shown_labels("plate labels") == {"lab: Left": [0.1, 0.45, 0]}
+
+
+def test_the_label_of_a_stop_is_above_what_has_stopped_not_in_the_middle_of_everything(
+    picture: Picture,
+) -> None:
+    """Another source's subject may stand between the markers and the plates."""
+    lab = picture.lab()
+    picture.show_parameters(lab, PLATE)
+    lab.send(MARKERS, [(5000, 0, 0, 0), (5000, 0, 1800, 0)])
+    picture.show()
+    picture.show(3.0)
+    assert picture.node("stopped").position == pytest.approx((5.0, 0.0, 1.8))
+
+
+def test_the_view_is_fitted_to_plates_and_again_when_somebody_comes(
+    picture: Picture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A take, or a measurement, may begin after the page was opened."""
+    fitted: list[float] = []
+    monkeypatch.setattr("gateway.view.scene.fit", lambda _client, sphere, _up: fitted.append(sphere.radius))
+    clients: Any = {1: SimpleNamespace(client_id=1)}
+    lab = picture.lab()
+    picture.show_parameters(lab, PLATE)
+    for _ in range(3):
+        picture.now_s += 0.3
+        picture.scene.update([lab.source], clients)
+    lab.send(MARKERS, [(5000, 0, 0, 0), (5000, 0, 1800, 0)])
+    for _ in range(3):
+        picture.now_s += 0.3
+        picture.scene.update([lab.source], clients)
+    assert [radius > 1 for radius in fitted] == [False, True]
 
 
 def test_the_up_axis_is_that_of_the_plates_until_somebody_chooses(picture: Picture) -> None:

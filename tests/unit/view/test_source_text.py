@@ -109,6 +109,22 @@ def test_losses_have_one_figure_for_each_component_and_place(lab: Lab) -> None:
     assert "|here|all|3d|400|91|2|493|6d|400|91|0|491|event|0|0|0|0|Server and gateway: since" in text
 
 
+def test_a_take_that_is_recorded_is_in_the_banner_with_its_source(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.send_status(stream())
+    lab.send_markers(True)
+    source = lab.source
+    assert "record" not in shown_text(lab) + banner_html([source], NOW_S)
+    source.running_take = ""
+    assert "|recording no take|" in shown_text(lab)
+    assert "record" not in banner_html([source], NOW_S)
+    source.running_take = HOSTILE
+    assert "● recording|&lt;img" in text_of(banner_html([source], NOW_S))
+    wait(monkeypatch, 5)
+    assert "record" not in banner_html([source], NOW_S)  # the gateway is not heard any more
+
+
 def test_what_an_output_drops_is_beside_the_components(lab: Lab) -> None:
     lab.send_status(stream(), outputs=[output("zenoh", drops=[loss("not open", 982, 196)]), output("lcm")])
     text = shown_text(lab)
@@ -234,6 +250,30 @@ def test_a_take_that_is_paused_is_not_a_failure(lab: Lab, monkeypatch: pytest.Mo
     wait(monkeypatch, 3)
     assert "● no data for 3.0 s|lab" in text_of(banner_html([source], NOW_S, is_take=True))
     assert "● paused|lab" in text_of(banner_html([source], NOW_S, is_take=True, is_paused=True))
+
+
+def test_a_take_that_is_paused_has_no_rate_and_goes_on_as_before(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pause is not among the last seconds: of the rate, the visibility, and a stop."""
+    lab.send_status(stream())
+    lab.send_parameters("<The_3D><Markers>2</Markers><Frequency>200</Frequency></The_3D>")
+    lab.send_markers(True, False)
+    source = lab.source
+    for _ in range(4):
+        wait(monkeypatch, 0.1)
+        lab.send_markers(True, False)
+        lab.live.update()
+    component = source.components["3d"]
+    before = [component.rate_hz, *component.visible_shares, component.age_s]
+    for _ in range(3):
+        wait(monkeypatch, 20)
+        lab.live.hold()
+        assert lab.source is source
+    assert [component.rate_hz, *component.visible_shares, component.age_s] == pytest.approx(before)
+    text = text_of(source_html(source, {}, is_take=True, is_paused=True))
+    assert "|3d|2|paused|5|" in text
+    assert "streaming" not in text
 
 
 def test_many_sources_with_hostile_names() -> None:

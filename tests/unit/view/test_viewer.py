@@ -208,3 +208,22 @@ def test_the_address_can_be_opened_on_this_computer() -> None:
     hosts = ("127.0.0.1", "0.0.0.0", "::1", "lab-pc")  # noqa: S104
     addresses = ["http://127.0.0.1:8080", "http://localhost:8080", "http://[::1]:8080", "http://lab-pc:8080"]
     assert [address_of(host, 8080) for host in hosts] == addresses
+
+
+@pytest.mark.parametrize("field", ["Host: evil.example", "Host: localhost\r\nOrigin: http://evil.example"])
+@pytest.mark.parametrize("upgrade", ["", "Connection: Upgrade\r\nUpgrade: websocket\r\n"])
+def test_pages_of_foreign_sites_are_refused(server: ViewServer, field: str, upgrade: str) -> None:
+    """A web page could watch otherwise, by DNS rebinding or by a WebSocket from another origin."""
+    with socket.create_connection(("127.0.0.1", server.get_port())) as connection:
+        connection.sendall(f"GET / HTTP/1.1\r\n{field}\r\n{upgrade}\r\n".encode())
+        answer = connection.recv(1000)
+    assert answer.startswith(b"HTTP/1.1 403 ")
+
+
+def test_the_page_of_this_server_is_not_refused(server: ViewServer) -> None:
+    origin: Any = f"http://localhost:{server.get_port()}"
+    with page_client(server, origin=origin):
+        wait_until(lambda: bool(server.get_clients()))
+    with socket.create_connection(("127.0.0.1", server.get_port())) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert connection.recv(1000).startswith(b"HTTP/1.1 200 ")
