@@ -24,6 +24,9 @@ LONG_RUNNING: Final = (
 )
 """Commands that run until Ctrl-C."""
 
+LISTS: Final = ("rtc3d-gateway list", "rtc3d-gateway params", "rtc3d-gateway take list")
+"""Commands that print another text where stdout is not a terminal; the pages show that of a terminal."""
+
 TIMEOUT_S: Final = 60
 
 _NUMBER: Final = r"-?\d+(?:,\d{3})*(?:\.\d+)?"
@@ -59,10 +62,11 @@ class Terminal:
         """Start a command in the activated virtual environment."""
         assert self._process is None, "the previous command is still running"
         self.text = ""
+        is_list = {"TTY_COMPATIBLE": "1", "TERM": "dumb"} if command.startswith(LISTS) else {}
         self._process = subprocess.Popen(
             ["bash", "-c", f"source .venv/bin/activate && exec {command}"],
             cwd=self._folder,
-            env=os.environ | self._environ,
+            env=os.environ | self._environ | is_list,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
         )

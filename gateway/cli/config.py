@@ -1,5 +1,7 @@
 """``rtc3d-gateway config``: check or show a configuration, or print the JSON schema."""
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -7,6 +9,8 @@ import typer
 
 from gateway.cli.options import ConfigOption, ServerOption
 from gateway.config.files import DEFAULT_CONFIG
+from gateway.errors import ConfigError
+from gateway.safe_text import safe_json
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
 
@@ -21,6 +25,7 @@ def check(
         Path | None, typer.Option("--config", "-c", metavar="FILE", help="The same as FILE.")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing if the file is valid.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Check a configuration file and print every mistake with its line. Starts nothing."""
     from gateway.cli.configuration import chosen_file
@@ -30,10 +35,28 @@ def check(
     if file is not None and config is not None:
         raise typer.BadParameter("give the file once, as FILE or as --config FILE")
     path = chosen_file(file or config, None, wanted="FILE")
-    names = [source.name for source in read(path, settings_type()).settings.sources]
-    if not quiet:
+    try:
+        names = [source.name for source in read(path, settings_type()).settings.sources]
+    except ConfigError as error:
+        if not as_json:
+            raise
+        _print_json(path, mistakes=str(error).splitlines())
+        raise typer.Exit(2) from None
+    if as_json:
+        _print_json(path, sources=names)
+    elif not quiet:
         sources = f"{len(names)} source{'' if len(names) == 1 else 's'}: {', '.join(names)}"
         print(f"{path or 'environment'}: valid; {sources}")
+
+
+def _print_json(path: Path | None, *, sources: Sequence[str] = (), mistakes: Sequence[str] = ()) -> None:
+    content = {
+        "file": None if path is None else str(path),
+        "is_valid": not mistakes,
+        "sources": sources,
+        "mistakes": mistakes,
+    }
+    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
 
 
 @app.command()

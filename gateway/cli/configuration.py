@@ -51,6 +51,8 @@ def _host_and_port(server: str) -> tuple[str, int]:
         host, _, port = server.partition(":")
     else:
         host, port = server, ""
+    if not host:
+        raise typer.BadParameter(f"{server!r}: the host is missing; give HOST or HOST:PORT")
     if not port:
         return host, FIRST_PRINCIPLES_PORT
     if not (port.isdecimal() and 0 < int(port) < 65536):

@@ -14,6 +14,7 @@ from gateway.cli.options import (
     PlatesOption,
     RateOption,
     ToolsOption,
+    check_exists,
 )
 from gateway.service.log_format import LogLevel, set_up_log
 
@@ -48,6 +49,7 @@ def demo(
 
     If the extra `view` is installed, the demo can be watched in a browser while it runs.
     """
+    check_exists("--c3d", c3d)
     import uvloop
 
     from gateway.cli.demo_view import view_is_installed, view_process

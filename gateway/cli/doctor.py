@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption
+from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption, check_exists
 from gateway.errors import ConfigError
 from gateway.safe_text import safe_lines
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
@@ -41,6 +41,7 @@ def doctor(
 
     Without options, it uses the configuration of the installed service.
     """
+    check_exists("--zenoh-config", zenoh_config)
     import uvloop
     from rich.console import Console
 

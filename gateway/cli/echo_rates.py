@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.echo_messages import POLL_S, Limits, Subscribe
@@ -23,6 +22,7 @@ from gateway.cli.silence import Silence
 from gateway.messages.host_time import now_utime
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.safe_text import safe_json, safe_text
+from gateway.terminal.lists import list_table, write_records
 
 WINDOW_S: Final = 10.0
 MIN_WINDOW: Final = 10
@@ -157,7 +157,7 @@ def _run(rates: Rates, limits: Limits, silence: Silence, show: Callable[[list[Ra
 
 
 def _refresh(live: Live, rows: Sequence[Rate]) -> None:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = list_table()
     table.add_column(_HEADINGS[0], overflow="fold")
     for heading in _HEADINGS[1:]:
         table.add_column(heading, justify="right", no_wrap=True)
@@ -168,15 +168,12 @@ def _refresh(live: Live, rows: Sequence[Rate]) -> None:
 
 
 def _print_block(out: TextIO, rows: Sequence[Rate], *, as_json: bool) -> None:
-    utime = now_utime()
     if as_json:
+        utime = now_utime()
         for row in rows:
             print(safe_json(json.dumps({"utime": utime} | _rounded(row), ensure_ascii=False)), file=out)
     else:
-        width = max(len(_HEADINGS[0]), *(len(_cells(row)[0]) for row in rows))
-        for key, *cells in (_HEADINGS, *map(_cells, rows)):
-            print(f"{key:{width}}", *(f"{cell:>12}" for cell in cells), file=out)
-        print(file=out)
+        write_records(out, [_cells(row) for row in rows])
     out.flush()
 
 

@@ -32,6 +32,8 @@ def export(
     quiet: NoProgressOption = False,
 ) -> None:
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
+    if from_s is not None and to_s is not None and from_s >= to_s:
+        raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
     from gateway.cli.export_progress import ExportProgress
     from gateway.export.formats import export_take
     from gateway.export.job import ExportJob

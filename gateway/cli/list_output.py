@@ -13,6 +13,7 @@ from rich.text import Text
 from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
 from gateway.safe_text import safe_json
 from gateway.stream.status_text import Level, source_text, stream_level
+from gateway.terminal.lists import list_table, write_records
 
 _COLOURS: Final = {Level.GOOD: "green", Level.WAITING: "yellow", Level.BAD: "red"}
 _NARROW: Final = range(80, 110)
@@ -25,8 +26,7 @@ def write_sources(found: FoundSources, console: Console) -> None:
     if console.is_terminal:
         console.print(_table(found.sources, is_narrow=console.width in _NARROW))
         return
-    for source in found.sources:
-        print(_line(source), file=console.file)  # rich would expand the tabs
+    write_records(console.file, [_record(source) for source in found.sources])
 
 
 def sources_json(found: FoundSources) -> str:
@@ -53,7 +53,7 @@ def notes(found: FoundSources) -> list[str]:
 
 
 def _table(sources: Sequence[FoundSource], *, is_narrow: bool) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = list_table()
     for heading in ("source", "state", "components", "server", "host", "version"):
         width = _NARROW_WIDTHS.get(heading) if is_narrow else None
         table.add_column(heading, overflow="fold", width=width)
@@ -73,11 +73,11 @@ def _state(stream: FoundStream) -> Text:
     return Text(stream.text, _COLOURS[stream_level(stream.state, stream.problem)])
 
 
-def _line(source: FoundSource) -> str:
+def _record(source: FoundSource) -> tuple[str, ...]:
     components = ", ".join(stream.components for stream in source.streams)
     state = source_text([(stream.components, stream.text) for stream in source.streams])
     texts = ", ".join(filter(None, (state, source.problem)))
-    return "\t".join((source.name, texts, components, source.server, source.host, source.version))
+    return source.name, texts, components, source.server, source.host, source.version
 
 
 def _source_json(source: FoundSource) -> dict[str, Any]:

@@ -157,6 +157,12 @@ def _checked_each(
     return check_each
 
 
+def check_exists(option: str, path: Path | None) -> None:
+    """Raise BadParameter if there is no file of this name. Not a callback: parsing must not read the disk."""
+    if path is not None and not path.exists():
+        raise typer.BadParameter(f"{option}: {path} does not exist")
+
+
 def _checked_endpoint(text: str | None) -> str | None:
     if text is not None and not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
         raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")

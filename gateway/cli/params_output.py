@@ -1,4 +1,4 @@
-"""The output of ``params``: tables, JSON, or the server's XML unchanged."""
+"""The output of ``params``: lists, JSON, or the server's XML unchanged."""
 
 import json
 from collections.abc import Sequence
@@ -9,12 +9,13 @@ from rich.console import Console
 from rich.text import Text
 
 from gateway.cli.params_query import ParametersReply
-from gateway.cli.params_tables import tables
+from gateway.cli.params_tables import section_lists
 from gateway.errors import ParametersError, QueryError
 from gateway.queries.answers import parameters_json
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.safe_text import safe_json, safe_text
+from gateway.terminal.lists import print_list, write_records
 
 OutputFormat = Literal["table", "json", "xml"]
 
@@ -31,7 +32,7 @@ def write_replies(
 ) -> list[QueryError]:
     """Write the parameters of all sources to ``out``; return the problems in them.
 
-    "table" means one table per section, "json" one object with the sources as keys, and "xml" the XML
+    "table" means one list per section, "json" one object with the sources as keys, and "xml" the XML
     unchanged; if there are several replies, a comment with the source and its sections precedes each.
     """
     if output_format == "xml":
@@ -88,7 +89,19 @@ def _write_json(by_source: dict[str, _SourceParameters], out: BinaryIO) -> None:
 def _write_tables(by_source: dict[str, _SourceParameters], out: TextIO) -> None:
     console = Console(file=out)
     for source, merged in by_source.items():
-        for table in tables(source, merged.parameters):
-            console.print(table)
+        for section in section_lists(merged.parameters):
+            records = [[_text(value, console) for value in row] for row in section.rows]
+            if console.is_terminal:
+                print_list(console, section.headings, records, title=f"{source}: {section.title}")
+            else:
+                write_records(out, [(source, section.key, *record) for record in records])
         if merged.age_s is not None:
-            console.print(Text(safe_text(f"{source}: parameters are {merged.age_s:.1f} s old")))
+            notes = console if console.is_terminal else Console(stderr=True)
+            notes.print(Text(safe_text(f"{source}: parameters are {merged.age_s:.1f} s old")))
+
+
+def _text(value: object, console: Console) -> str:
+    """Return a value as text: "" for None; one line per item of a tuple on a terminal."""
+    if isinstance(value, tuple):
+        return ("\n" if console.is_terminal else ", ").join(_text(item, console) for item in value)
+    return safe_text(f"{value:g}" if isinstance(value, float) else "" if value is None else str(value))

@@ -1,12 +1,10 @@
-"""Tables of a server's parameters (§6), one per section."""
+"""Lists of a server's parameters (§6), one per section."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
-
-from rich.table import Table
-from rich.text import Text
+from typing import Any, Final, NamedTuple
 
 from gateway.rtc3d.parameters import (
+    SECTIONS,
     EventParameter,
     General,
     Parameters,
@@ -18,42 +16,33 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
-from gateway.safe_text import safe_text
 
 _Rows = Sequence[Sequence[object]]
 
 
-def tables(source: str, parameters: Parameters) -> Iterator[Table]:
-    """Yield one table for each section in ``parameters``, with ``source`` in its title."""
-    sections: tuple[tuple[Any, Callable[[Any], tuple[str, Sequence[str], _Rows]]], ...] = (
-        (parameters.general, _general),
-        (parameters.markers, _markers),
-        (parameters.tools, _tools),
-        (parameters.analog, _channels),
-        (parameters.force, _plates),
-        (parameters.events, _events),
-    )
-    for section, describe in sections:
-        if section is not None:
-            title, headings, rows = describe(section)
-            yield _table(f"{source}: {title}", headings, rows)
+class SectionList(NamedTuple):
+    """A section of the parameters: its key, such as "3d", and its items. A value may be a tuple."""
+
+    key: str
+    title: str
+    headings: Sequence[str]
+    rows: _Rows
 
 
-def _cell(value: object) -> str:
-    """Return a value as text for a table: "" for None, one line per item of a tuple."""
-    if isinstance(value, tuple):
-        return "\n".join(map(_cell, value))
-    return safe_text(f"{value:g}" if isinstance(value, float) else "" if value is None else str(value))
-
-
-def _table(title: str, headings: Sequence[str], rows: _Rows) -> Table:
-    table = Table(title=Text(_cell(title)), title_justify="left")
-    for heading in headings:
-        table.add_column(heading, overflow="fold")
-    for row in rows:
-        # Text objects, because rich would read square brackets in a string as markup.
-        table.add_row(*(Text(_cell(value)) for value in row))
-    return table
+def section_lists(parameters: Parameters) -> Iterator[SectionList]:
+    """Yield a list for each section in ``parameters``."""
+    describe: dict[str, Callable[[Any], tuple[str, Sequence[str], _Rows]]] = {
+        "general": _general,
+        "3d": _markers,
+        "6d": _tools,
+        "analog": _channels,
+        "force": _plates,
+        "events": _events,
+    }
+    for key, section in SECTIONS.items():
+        content = section.of(parameters)
+        if content is not None:
+            yield SectionList(key, *describe[key](content))
 
 
 def _general(general: General) -> tuple[str, Sequence[str], _Rows]:

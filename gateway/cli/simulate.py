@@ -22,6 +22,7 @@ from gateway.cli.options import (
     RateOption,
     ToolsOption,
     VerboseOption,
+    check_exists,
     checked_host,
     chosen_log_level,
 )
@@ -62,7 +63,7 @@ def simulate(
     take: Annotated[
         Path | None,
         typer.Option(
-            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it."
+            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it.",
         ),
     ] = None,
     source: Annotated[
@@ -110,6 +111,8 @@ def simulate(
         raise typer.BadParameter("--source, --from and --to need --take")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise typer.BadParameter(f"--to {to_s:g} is not after --from {from_s:g}")
+    check_exists("--c3d", c3d)
+    check_exists("--take", take)
     level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
     import uvloop
 

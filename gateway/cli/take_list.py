@@ -5,10 +5,10 @@ from datetime import datetime
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from gateway.safe_text import safe_text
+from gateway.terminal.lists import print_list
 
 
 class ListedTake:
@@ -61,27 +61,20 @@ def size_text(num_bytes: float) -> str:
 
 
 def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> None:
-    """Write a table of the takes of all sources, and a line for each source about what is not in it."""
-    table = Table()
-    table.add_column("source", no_wrap=True)
-    table.add_column("name", overflow="fold")
-    table.add_column("begin", no_wrap=True)
-    for heading in ("duration", "size"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("state")
+    """Write the list of the takes of all sources, and below it or on stderr what is not in it."""
+    headings = ("source", "name", "begin", "duration", "size", "state")
+    records = []
     for source, content in replies.items():
         for take in listed_takes(content):
             state = "running" if take.is_running else ""
             lost = take.lost_text.removeprefix(", ")
-            table.add_row(
-                *map(_cell, (source, take.name, take.begin_text, take.duration_text, take.size_text)),
-                _cell(", ".join(filter(None, (state, lost)))),
-            )
-    if table.row_count:
-        console.print(table)
+            states = ", ".join(filter(None, (state, lost)))
+            records.append((source, take.name, take.begin_text, take.duration_text, take.size_text, states))
+    print_list(console, headings, records, numbers=("duration", "size"))
+    notes = console if console.is_terminal else Console(stderr=True)
     for source, content in replies.items():
         for line in _notes(source, content):
-            console.print(_cell(line))
+            notes.print(Text(safe_text(line)), soft_wrap=True)
 
 
 def listed_takes(content: Mapping[str, Any]) -> list[ListedTake]:
@@ -106,7 +99,3 @@ def _notes(source: str, content: Mapping[str, Any]) -> list[str]:
 def _number(fields: Mapping[str, Any], name: str) -> float:
     value = fields.get(name)
     return value if isinstance(value, int | float) and abs(value) < 1e300 else 0
-
-
-def _cell(text: str) -> Text:
-    return Text(safe_text(text))

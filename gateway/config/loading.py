@@ -1,6 +1,7 @@
 """Read settings from YAML files and environment variables. Every mistake is reported with its position."""
 
 import json
+import logging
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,11 @@ from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import OutputSettings, Settings
 from gateway.config.yaml_document import Document, Location, Position, line_and_column_after, read_yaml
 from gateway.errors import ConfigError
+
+logger = logging.getLogger(__name__)
+
+_RENAMED: Final = {("metrics", "address"): "host"}
+"""The sections and keys of earlier versions that are accepted, with their new names."""
 
 AnySection = TypeVar("AnySection", bound=Section)
 
@@ -69,6 +75,8 @@ def _configuration(
     document: Document, model: type[Settings], folder: Path, environ: Mapping[str, str]
 ) -> Configuration:
     apply_overrides(document, environ)
+    for (section, old), new in _RENAMED.items():
+        _rename(document, section, old, new)
     mistakes = [
         mistake
         for name, field in model.model_fields.items()
@@ -83,6 +91,21 @@ def _configuration(
     if mistakes:
         raise _in_order(mistakes)
     return Configuration(settings, document.positions)
+
+
+def _rename(document: Document, section: str, old: str, new: str) -> None:
+    """Give a value its new key, and log that. A variable with the old name overrides the file, as others."""
+    values = document.values.get(section) if isinstance(document.values, dict) else None
+    if not isinstance(values, dict) or old not in values:
+        return
+    position = document.positions[section, old]
+    if new in values and (position.line or not document.positions[section, new].line):
+        return  # validation reports the old key as unknown
+    logger.warning("%s: %s.%s is now called %s.%s; use the new name", position, section, old, section, new)
+    values[new] = values.pop(old)
+    document.positions[section, new] = document.positions.pop((section, old))
+    if (section, old) in document.key_positions:
+        document.key_positions[section, new] = document.key_positions.pop((section, old))
 
 
 def _read_file(path: Path, section: type[Section], example: str) -> Document:

@@ -311,7 +311,7 @@ class MetricsSettings(Section):
     enabled: Switch = True
     """Whether to serve HTTP."""
 
-    address: Host = "127.0.0.1"
+    host: Host = "127.0.0.1"
     """The address to listen on: one of this host, or 0.0.0.0 or "::" for all."""
 
     port: Port = 9464
@@ -320,7 +320,7 @@ class MetricsSettings(Section):
     @property
     def listens_on(self) -> Sequence[ListenAddress]:
         """See OutputSettings."""
-        return [ListenAddress(("port",), self.address, self.port)]
+        return [ListenAddress(("port",), self.host, self.port)]
 
 
 class Settings(Section):

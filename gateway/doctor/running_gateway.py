@@ -93,7 +93,7 @@ class NoReport(NamedTuple):
 
 def address_text(metrics: MetricsSettings) -> str:
     """Return where a gateway with these settings serves its health page, for example "127.0.0.1:9464"."""
-    return f"{host_in_url(from_this_computer(metrics.address))}:{metrics.port}"
+    return f"{host_in_url(from_this_computer(metrics.host))}:{metrics.port}"
 
 
 async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
@@ -104,7 +104,7 @@ async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
     try:
         async with asyncio.timeout(2 * _TIMEOUT_S):  # includes looking up a host name
             page = await WorkerThread("health page").run(
-                lambda: _get(from_this_computer(metrics.address), metrics.port)
+                lambda: _get(from_this_computer(metrics.host), metrics.port)
             )
     except ConnectionRefusedError:
         return NoReport(f"no gateway runs here: nothing listens on {where}", False)

@@ -36,7 +36,7 @@ class MonitoringServer:
                 "/metrics": lambda: metrics_page(registry),
                 "/healthz": lambda: health_page(gateway, limits.problems()),
             },
-            settings.address,
+            settings.host,
         )
 
     async def start(self) -> None:
@@ -47,7 +47,7 @@ class MonitoringServer:
         if not self._settings.enabled:
             return
         self._loop_delay.start()
-        address = self._settings.address
+        address = self._settings.host
         if is_address(address):
             await self._listen([address])
         else:
@@ -60,20 +60,20 @@ class MonitoringServer:
         except OSError as error:  # TimeoutError has no text
             logger.warning(
                 "metrics: the host name %s cannot be resolved: %s; continuing without /metrics and /healthz: "
-                "check the name server (DNS), or set metrics.address to an IP address, and restart",
+                "check the name server (DNS), or set metrics.host to an IP address, and restart",
                 *(name, error.strerror or f"no answer within {_LOOK_UP_TIMEOUT_S:g} s"),
             )
         else:
             await self._listen(addresses)
 
     async def _listen(self, addresses: Sequence[str]) -> None:
-        address, port = self._settings.address, self._settings.port
+        address, port = self._settings.host, self._settings.port
         try:
             await self._pages.start(addresses, port)
         except OSError as error:
             logger.warning(
                 "metrics: cannot listen on %s, port %d: %s; continuing without /metrics and /healthz: "
-                "stop the program that uses the port, or set metrics.address and metrics.port, and restart "
+                "stop the program that uses the port, or set metrics.host and metrics.port, and restart "
                 "the gateway",
                 *(address, port, system_reason(error)),
             )

@@ -137,6 +137,8 @@ class Display:
     def _tabs(self, width: int) -> Line:
         """Return the names of the pages; if they do not fit, the numbers of those that are not shown."""
         names = [f" {number} {page.name} " for number, page in enumerate(PAGES, start=1)]
+        if sum(map(len, names)) > width:  # 80 columns are enough without the second space
+            names = [name.rstrip() for name in names]
         if sum(map(len, names)) > width:
             names = [name if number == self._page else f" {number + 1} " for number, name in enumerate(names)]
         return [

@@ -38,13 +38,13 @@ def overview(sources: Sequence[LiveSource]) -> Table:
         Column("Hz", is_number=True, width=6),
         Column("announced", is_number=True, rank=1),
         Column("lost", is_number=True),
-        Column("gaps", is_number=True, rank=4),
+        Column("gaps", is_number=True, rank=6),
         Column("restarts", is_number=True, rank=7),
-        Column("→gateway p50/p99 ms", is_number=True, rank=5),
-        Column("→here p50/p99 ms", is_number=True, rank=6),
-        Column("items", is_number=True, rank=3),
+        Column("→gateway ms", is_number=True, rank=2),
+        Column("→here ms", is_number=True, rank=2),
+        Column("items", is_number=True, rank=5),
         Column("visible", is_number=True, rank=3),
-        Column("age s", is_number=True, rank=2),
+        Column("age s", is_number=True, rank=4),
         Column("note"),
     )
     return Table(columns, [_overview_of(source) for source in sources], "no source so far")

@@ -151,7 +151,7 @@ def num_threads(gateway: RunningGateway) -> int:
 async def test_eight_dead_names_and_a_dead_name_server(
     gateway_under_attack: GatewayUnderAttack, tmp_path: Path
 ) -> None:
-    settings = {"metrics": {"address": "dead.example.org"}}
+    settings = {"metrics": {"host": "dead.example.org"}}
     with dead_name_server(tmp_path) as before_command:
         async with gateway_under_attack(_DEAD, settings, before_command=before_command) as gateway:
             await wait_until_async(lambda: "was not resolved within 1 s" in gateway.log)

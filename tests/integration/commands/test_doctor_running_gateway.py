@@ -130,7 +130,7 @@ async def command(metrics: MetricsSettings, *arguments: str) -> tuple[int, Findi
         environ={
             "RTC3D_GATEWAY__ZENOH__ENABLED": "false",
             "RTC3D_GATEWAY__LCM__URL": "memq://",
-            "RTC3D_GATEWAY__METRICS__ADDRESS": "0.0.0.0",  # noqa: S104
+            "RTC3D_GATEWAY__METRICS__HOST": "0.0.0.0",  # noqa: S104
             "RTC3D_GATEWAY__METRICS__PORT": str(metrics.port),
         },
     )

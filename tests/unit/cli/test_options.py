@@ -1,4 +1,5 @@
 import gc
+import json
 import logging
 import signal
 import sys
@@ -142,6 +143,31 @@ def test_check_takes_the_file_as_argument_or_option_and_can_be_quiet(tmp_path: P
     (tmp_path / "lab.yaml").write_text("sources: []")
     with pytest.raises(ConfigError, match=r"lab\.yaml:1:10"):
         printed("config", "check", "--quiet", str(tmp_path / "lab.yaml"))
+
+
+def test_check_can_print_json(tmp_path: Path) -> None:
+    content = json.loads(printed("config", "check", "--json", str(DEMO)))
+    assert content == {"file": str(DEMO), "is_valid": True, "sources": ["lab"], "mistakes": []}
+    (tmp_path / "lab.yaml").write_text("sources: [{name: lab}, {host: a}]")
+    result = CliRunner().invoke(app, ["config", "check", "--json", str(tmp_path / "lab.yaml")])
+    content = json.loads(result.output)
+    assert (result.exit_code, content["is_valid"], len(content["mistakes"])) == (2, False, 2)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "export examples/walk.lcmlog out.c3d --from 5 --to 2",
+        "doctor --server :",
+        "doctor --server 127.0.0.1:99999",
+        "doctor --zenoh-config /nowhere",
+        "simulate --take /nowhere.lcmlog",
+        "simulate --c3d /nowhere.c3d",
+        "demo --c3d /nowhere.c3d",
+    ],
+)
+def test_a_wrong_value_of_an_option_has_the_status_2(command: str) -> None:
+    assert CliRunner().invoke(app, command.split(), catch_exceptions=False).exit_code == 2
 
 
 @pytest.mark.parametrize("command", ["run -c /nowhere", "simulate --scenario /nowhere"])

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 
 import pytest
 
@@ -23,36 +24,37 @@ def written(output_format: OutputFormat, *replies: ParametersReply) -> tuple[str
     buffer = io.BytesIO()
     out = io.TextIOWrapper(buffer, encoding="utf-8", write_through=True)
     problems = write_replies(replies, output_format, out)
-    return buffer.getvalue().decode(), [(problem.code, str(problem)) for problem in problems]
+    text = re.sub(r"\x1b\[[\d;]*m", "", buffer.getvalue().decode())  # bold and italic
+    return text, [(problem.code, str(problem)) for problem in problems]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "240")
+    for name, value in (("COLUMNS", "240"), ("TTY_COMPATIBLE", "1"), ("TERM", "xterm")):
+        monkeypatch.setenv(name, value)
 
 
 def cells(text: str) -> list[list[str]]:
-    """Return the cells of the tables' rows."""
-    lines = [line for line in text.splitlines() if line.startswith("│")]
-    return [[cell.strip() for cell in line.strip("│").split("│")] for line in lines]
+    """Return the cells of the tables' rows that are not empty."""
+    return [re.split("  +", line.strip()) for line in text.splitlines()]
 
 
 @pytest.mark.parametrize(
     ("section", "title", "rows"),
     [
         ("general", "lab: general", [["version", "1.02.03"], ["port", "12345"], ["frames per s", "33.12"]]),
-        ("3d", "lab: 3D, 1 marker, 60 Hz, mm", [["1", "1", "marker 1", ""]]),
-        ("6d", "lab: 6D, 1 tool, 60 Hz", [["1", "1", "", "", "12 14 20"]]),
-        ("analog", "lab: analog, 1 channel", [["1", "1", "EMG1", "", "mV", "2400"]]),
+        ("3d", "lab: 3D, 1 marker, 60 Hz, mm", [["1", "1", "marker 1"]]),
+        ("6d", "lab: 6D, 1 tool, 60 Hz", [["1", "1", "12 14 20"]]),
+        ("analog", "lab: analog, 1 channel", [["1", "1", "EMG1", "mV", "2400"]]),
         (
             "force",
             "lab: force, 1 plate",
             [
                 ["1", "1", "First force plate", "2400", "1000 0 0 mm", "-4 5 -40 mm", "Force X N",
                  "analog channel id 6 7 8 8 10", "1 × 6 microV"],
-                ["", "", "", "", "1600 0 0 mm", "", "Force Y N", "", "gain 4000"],
-                ["", "", "", "", "1600 400 0 mm", "", "Moment Z Nm", "", "5 V"],
-                ["", "", "", "", "1000 400 0 mm", "", "", "", ""],
+                ["1600 0 0 mm", "Force Y N", "gain 4000"],
+                ["1600 400 0 mm", "Moment Z Nm", "5 V"],
+                ["1000 400 0 mm"],
             ],
         ),
         (
@@ -60,11 +62,12 @@ def cells(text: str) -> list[list[str]]:
             "lab: events, 1 type",
             [
                 ["0x123456", "Button", "Button action", "1 int Button id number"],
-                ["", "", "", "2 int ON/OFF state (1 ON, 0 OFF)"],
+                ["2 int ON/OFF state (1 ON, 0 OFF)"],
             ],
         ),
     ],
 )  # fmt: skip
+@pytest.mark.usefixtures("wide_terminal")
 def test_each_section_is_a_table(section: str, title: str, rows: list[list[str]]) -> None:
     text, problems = written("table", reply("lab", (section,), spec_xml(section), 0.44))
     assert problems == []
@@ -81,18 +84,33 @@ def test_each_section_is_a_table(section: str, title: str, rows: list[list[str]]
     ],
     ids=["those requested", "all that exist"],
 )
+@pytest.mark.usefixtures("wide_terminal")
 def test_only_requested_sections_are_written(sections: Sections, titles: list[str]) -> None:
     text, problems = written("table", reply("lab", sections, EVERYTHING, None))
     found = [line.rstrip() for line in text.splitlines() if line.startswith("lab:")]
     assert (found, problems) == ([f"lab: {title}" for title in titles], [])
 
 
+@pytest.mark.usefixtures("wide_terminal")
 def test_labels_cannot_control_the_terminal_and_are_not_markup() -> None:
     marker = "<Markers><Marker id='1'><Label>[bold]L</Label></Marker></Markers>"
     xml = in_root(f"<The_3D><Unit>[red]\u202emm</Unit>{marker}</The_3D>")
     text, _ = written("table", reply("lab", ("3d",), xml))
     assert r"[red]\u202emm" in text
-    assert ["1", "1", "[bold]L", ""] in cells(text)
+    assert ["1", "1", "[bold]L"] in cells(text)
+
+
+def test_without_a_terminal_there_is_one_line_for_each_item(capsys: pytest.CaptureFixture[str]) -> None:
+    """So that grep and awk find whole records, whatever the width of the terminal."""
+    text, _ = written("table", reply("lab", ("6d",), EVERYTHING), reply("lab", ("force",), spec_xml("force")))
+    corners = "1000 0 0 mm, 1600 0 0 mm, 1600 400 0 mm, 1000 400 0 mm"
+    channels = "Force X N, Force Y N, Moment Z Nm"
+    plate = f"1\t1\tFirst force plate\t2400\t{corners}\t-4 5 -40 mm\t{channels}\t"
+    assert text.splitlines() == [
+        "lab\t6d\t1\t1\t\t\t12 14 20",
+        f"lab\tforce\t{plate}analog channel id 6 7 8 8 10\t1 × 6 microV, gain 4000, 5 V",
+    ]
+    assert capsys.readouterr().err == "lab: parameters are 0.0 s old\n"
 
 
 def test_json_has_sections_and_age_of_every_source() -> None:
@@ -124,4 +142,4 @@ def test_unreadable_xml_is_a_problem_and_other_sources_are_written() -> None:
     text, [(code, problem)] = written("table", reply("lab", (), b"3 o'clock"), reply("hall", (), EVERYTHING))
     assert (code, problem.partition(":")[0]) == ("unreadable", "source 'lab'")
     assert problem.endswith("use --xml to see it")
-    assert "hall: 3D, 1 marker" in text
+    assert "hall\t3d\t1\t" in text

@@ -21,7 +21,7 @@ TAKE = {"name": "walk-1", "bytes": 3_456_789, "begin_utime": 1_700_000_000_000_0
 
 def written(**content: Any) -> str:
     out = io.StringIO()
-    write_list({"lab": content}, Console(file=out, width=120))
+    write_list({"lab": content}, Console(file=out, width=120, force_terminal=True, color_system=None))
     return out.getvalue()
 
 
@@ -30,6 +30,16 @@ def test_a_row_has_what_matters() -> None:
     for part in ("lab", "walk-1", "1 min 23.2 s", "3.5 MB", "running, 3 messages lost"):
         assert part in text
     assert "lab: the last 60 s are kept, to be saved with: take save" in text
+
+
+def test_without_a_terminal_there_is_one_line_for_each_take(capsys: pytest.CaptureFixture[str]) -> None:
+    """It was a table of 80 columns, with names on two lines."""
+    out = io.StringIO()
+    take = TAKE | {"name": "x" * 70 + "\t\n", "is_running": True}
+    write_list({"lab": {"takes": [take], "num_takes": 2}}, Console(file=out, width=80))
+    begin = ListedTake(TAKE).begin_text
+    assert out.getvalue() == f"lab\t{'x' * 70}\\t\\n\t{begin}\t1 min 23.2 s\t3.5 MB\trunning\n"
+    assert capsys.readouterr().err == "lab: the newest 1 of 2 takes\n"
 
 
 def test_no_takes_are_no_table_and_a_list_with_a_limit_says_so() -> None:

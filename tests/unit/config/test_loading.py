@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from gateway.config.files import MAX_FILE_BYTES, read_file
+from gateway.config.loading import read
 from gateway.config.section import Section
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import ConfigError
@@ -160,6 +161,20 @@ MISTAKES = [
 def test_a_mistake_is_told_with_its_place(file: Path, line: str, error: str) -> None:
     [found] = refused(file, f"{SERVER}{line}\n")
     assert found.startswith(error)
+
+
+def test_the_old_name_of_a_key_is_accepted_with_a_note(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """metrics.address became metrics.host, as in all other sections."""
+    file.write_text(f"{SERVER}metrics: {{address: 0.0.0.0}}\n")
+    configuration = read(file, MODEL, {})
+    assert configuration.settings.metrics.host == "0.0.0.0"  # noqa: S104
+    assert ("metrics", "host") in configuration.positions
+    assert "metrics.address is now called metrics.host; use the new name" in caplog.text
+    variable = {"RTC3D_GATEWAY__METRICS__ADDRESS": "127.0.0.2"}
+    file.write_text(f"{SERVER}metrics: {{host: 0.0.0.0}}\n")
+    assert read(file, MODEL, variable).settings.metrics.host == "127.0.0.2"
+    [both] = refused(file, f"{SERVER}metrics: {{host: a, address: b}}\n")
+    assert "metrics.address: unknown key" in both
 
 
 def test_all_mistakes_are_told_in_the_files_order(file: Path) -> None:

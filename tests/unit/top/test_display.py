@@ -136,6 +136,11 @@ def test_keys_switch_the_page() -> None:
     assert shown.press("9", "0", "x")[2].startswith("component")
 
 
+def test_80_columns_show_the_names_of_all_pages() -> None:
+    tabs = "".join(text for text, _ in Display("zenoh", has_keys=True).lines([], [], 80, 24)[1])
+    assert tabs.split() == [word for number, page in enumerate(PAGES, 1) for word in (str(number), page.name)]
+
+
 def test_keys_scroll_and_stop_at_the_ends() -> None:
     shown = Shown()
     shown.press("2")

@@ -33,6 +33,15 @@ def test_the_overview_has_a_line_per_source_and_one_per_component() -> None:
     assert event == "event 0.0 0 0 0 none so far"
 
 
+def test_80_columns_show_the_latencies() -> None:
+    """Latency is what many run ``top`` for, and 80 columns are what a terminal has."""
+    lab = LiveLab()
+    lab.status(stream("3d 6d"))
+    lab.frame("3d", 0, 24)
+    titles = laid_out(PAGES[0].table([lab.source()]), 80).titles
+    assert {"announced", "lost", "→gateway ms", "→here ms", "visible"} <= {text.strip() for text, _ in titles}
+
+
 def test_the_overview_says_that_two_gateways_have_one_name() -> None:
     lab = LiveLab()
     for number in range(12):
