@@ -1,6 +1,6 @@
 """The table that ``record`` prints at the end, and whether the recording is complete."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple, TextIO
 
@@ -32,13 +32,13 @@ class SeriesCounts(NamedTuple):
     num_unwritten: int
 
 
-def counts_of(series: Sequence[RecordedSeries], lost_on_disk: Counter[bytes]) -> SeriesCounts:
+def counts_of(series: Sequence[RecordedSeries], sink: FileSink) -> SeriesCounts:
     """Return the counts of some series together."""
-    num_unwritten = sum(each.num_refused + lost_on_disk[each.channel] for each in series)
+    num_unwritten = sum(each.num_refused + sink.lost[each.channel] for each in series)
     num_messages = sum(each.num_messages for each in series)
     return SeriesCounts(
         num_messages - num_unwritten,
-        sum(each.num_bytes for each in series),
+        sum(each.num_bytes - each.num_refused_bytes - sink.lost_bytes[each.channel] for each in series),
         sum(_rate_hz(each) for each in series),
         sum(each.check.num_gaps for each in series),
         sum(each.check.num_lost for each in series),
@@ -66,7 +66,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
         table.add_column(column, justify="right")
     for source in recording.sources_now:
         for row, series in _rows(source):
-            counts = counts_of(series, sink.lost)
+            counts = counts_of(series, sink)
             table.add_row(
                 Text(safe_text(source.name)),
                 row,

@@ -26,7 +26,8 @@ def info(
 ) -> None:
     """Show what a recording contains, and what is missing: gaps, restarts, damage.
 
-    The exit status is 1 only if there is no recording that can be read.
+    The exit status is 1 if there is no recording that can be read, if it was cut off, or if it lacks messages
+    that found no room on the disk.
     """
     from rich.console import Console
 
@@ -41,3 +42,5 @@ def info(
         print(safe_json(json.dumps(statistics_json(statistics), indent=2, ensure_ascii=False)))
     else:
         write_report(statistics, Console(file=sys.stdout))
+    if statistics.was_cut_short:
+        raise typer.Exit(1)

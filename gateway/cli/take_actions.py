@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import typer
 from rich.console import Console
 
 from gateway.cli.gateway_queries import exit_with
@@ -116,10 +117,12 @@ def _control(
         for source, content in replies.received.items():
             print(safe_text(f"{source}: {text(ListedTake(content))}"))
     exit_with(replies.problems)
+    if any(ListedTake(content).problem for content in replies.received.values()):
+        raise typer.Exit(1)
 
 
 def _facts(take: ListedTake) -> str:
-    return f"{take.duration_text}, {take.size_text}{take.lost_text}"
+    return ", ".join(filter(None, (take.duration_text, take.size_text, take.problem)))
 
 
 def _print_json(replies: Mapping[str, Any]) -> None:

@@ -59,7 +59,7 @@ def stop(
 ) -> None:
     """Stop the running take.
 
-    Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
+    Exit status 3: no gateway found; 5: no reply in time; 1: anything else, also a take that lacks messages.
     """
     from gateway.cli.take_actions import gateway_address, stop_take
 

@@ -61,6 +61,8 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
             {"at_s": statistics.seconds_at(step.utime), "step_s": step.step_us / 1e6}
             for step in source.clock_steps.steps
         ],
+        "lost": source.num_lost,
+        "is_cut_off": source.is_cut_off,
         "lost_by_gateway": [
             {"where": place, "cause": cause, "messages": number}
             for (place, cause), number in source.drops.items()

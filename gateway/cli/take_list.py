@@ -21,6 +21,7 @@ class ListedTake:
         self.seconds = _number(fields, "seconds")
         self.num_lost = round(_number(fields, "lost"))
         self.is_running = fields.get("is_running") is True
+        self.is_cut_off = fields.get("is_cut_off") is True
 
     @property
     def size_text(self) -> str:
@@ -47,9 +48,10 @@ class ListedTake:
         return begin.strftime("%Y-%m-%d %H:%M:%S") if self.begin_utime else "?"
 
     @property
-    def lost_text(self) -> str:
-        """What the disk did not accept; "" if nothing."""
-        return f", {self.num_lost} messages lost" if self.num_lost else ""
+    def problem(self) -> str:
+        """What is missing; "" if nothing."""
+        lost = f"{self.num_lost} messages lost" if self.num_lost else ""
+        return ", ".join(filter(None, ("cut off" if self.is_cut_off else "", lost)))
 
 
 def size_text(num_bytes: float) -> str:
@@ -67,8 +69,7 @@ def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> No
     for source, content in replies.items():
         for take in listed_takes(content):
             state = "running" if take.is_running else ""
-            lost = take.lost_text.removeprefix(", ")
-            states = ", ".join(filter(None, (state, lost)))
+            states = ", ".join(filter(None, (state, take.problem)))
             records.append((source, take.name, take.begin_text, take.duration_text, take.size_text, states))
     print_list(console, headings, records, numbers=("duration", "size"))
     notes = console if console.is_terminal else Console(stderr=True)

@@ -80,7 +80,7 @@ def _components_table(statistics: TakeStatistics, source: SourceStatistics) -> T
     rows = [
         _row(statistics, source, key, [part])
         for key, part in parts.items()
-        if "/" not in key and key != "take"
+        if "/" not in key and key not in ("take", "end")
     ]
     if poses:
         rows.insert(len(source.components), _row(statistics, source, _count(len(poses), "pose"), poses))
@@ -168,6 +168,10 @@ def _problems(statistics: TakeStatistics) -> Iterator[str]:
 
 
 def _source_problems(source: SourceStatistics) -> Iterator[str]:
+    if source.is_cut_off:
+        yield "the recording was cut off: its end is missing"
+    if source.num_lost:
+        yield f"the recording lacks {_count(source.num_lost, 'message')} that found no room on the disk"
     for (place, cause), number in source.drops.items():
         yield f"the gateway lost {_count(number, 'message')} ({place}: {cause})"
     parts: dict[str, MessageStatistics] = {**source.components, **source.others}

@@ -37,6 +37,8 @@ def summarise(message: Any) -> str:
             text = f"command {message.request_id} from {message.requester!r}: {command}"
         case rtc3d.command_reply_t():
             text = f"reply {message.request_id} to {message.requester!r}: {message.error or message.content}"
+        case rtc3d.take_end_t():
+            text = f"end of {message.source}, {message.messages_lost} messages lost"
         case rtc3d.take_t():
             text = f"take {message.name!r} of {message.source}, recorded on {message.host}"
         case _:

@@ -1,8 +1,9 @@
 """The file of a recording: written again until the disk accepts it."""
 
+import contextlib
 import threading
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -25,6 +26,7 @@ class FileSink:
         """What is wrong with the disk now; "" if it accepts messages."""
         self.lost: Counter[bytes] = Counter()
         """How many messages the disk has not accepted in the end, by channel."""
+        self.lost_bytes: Counter[bytes] = Counter()
         self.num_errors = 0
         """How often the disk stopped accepting messages."""
         self.is_unsafe = False
@@ -61,7 +63,9 @@ class FileSink:
             except OSError as error:
                 self._failed(error)
                 if gives_up:
-                    self.lost.update(channel for channel, _ in rest)
+                    for channel, message in rest:
+                        self.lost[channel] += 1
+                        self.lost_bytes[channel] += len(message)
                     return
                 self._gives_up.wait(RETRY_S)
             else:
@@ -79,6 +83,24 @@ class FileSink:
         except OSError as error:
             self.is_unsafe = True
             self._failed(error)
+
+    def end(self, ends: Callable[[int], Messages]) -> None:
+        """Write the last messages of the file, after the thread that writes has ended.
+
+        On a full disk, they take the place of the newest message. ``ends`` returns them; it takes how many
+        messages were removed.
+        """
+        try:
+            self._append(ends(0))
+        except OSError as error:
+            self._failed(error)
+            with contextlib.suppress(OSError):  # the file looks as if it were cut off, which is true
+                self._log.remove_newest()
+                self._append(ends(1))
+
+    def _append(self, messages: Messages) -> None:
+        while messages:
+            messages = messages[self._log.append(messages) :]
 
     def close(self) -> None:
         """Close the file, after the thread that writes has ended."""

@@ -21,6 +21,12 @@ class RecordedSeries(Series):
         """Whether its messages are recorded. Those of others only describe the source."""
         self.num_refused = 0
         """How many of them were not written, because too many waited for the disk."""
+        self.num_refused_bytes = 0
+
+    def refuse(self, message: bytes) -> None:
+        """Count a message that is not written."""
+        self.num_refused += 1
+        self.num_refused_bytes += len(message)
 
 
 class RecordedSource(Source):

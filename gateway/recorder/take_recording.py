@@ -10,7 +10,7 @@ from gateway.outputs.parameters_message import published_again
 from gateway.recorder.file_sink import FileSink
 from gateway.recorder.series import RecordedSeries, RecordedSource
 from gateway.subscriber.reception import Reception
-from gateway.takes.description import encode_take
+from gateway.takes.description import encode_take, encode_take_end
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 
 
@@ -93,12 +93,12 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
     def _put(self, series: RecordedSeries, message: bytes) -> None:
         if self._is_starting or not series.source.is_described:
             if self._held_bytes + len(message) > MAX_QUEUED_BYTES:
-                series.num_refused += 1
+                series.refuse(message)
                 return
             self._held.append((series, message))
             self._held_bytes += len(message)
         elif self.sink is None or not self._recorder.record(self.sink, series.channel, message):
-            series.num_refused += 1
+            series.refuse(message)
 
     # Descriptions. One thread.
 
@@ -177,5 +177,19 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
             return False
         if self.sink is not None:
             self.is_moved = not self.sink.is_in_place
+            self.sink.end(functools.partial(self._ends, self.sink))
             self.sink.close()
         return True
+
+    def _ends(self, sink: FileSink, num_removed: int) -> list[tuple[bytes, bytes]]:
+        """Return the end of each source; ``num_removed`` further losses are counted with the first."""
+        utime = now_utime()
+        ends: list[tuple[bytes, bytes]] = []
+        for source in self.sources.values():
+            if source.is_described:
+                recorded = [series for series in source.series if series.is_recorded]
+                num_lost = sum(series.num_refused + sink.lost[series.channel] for series in recorded)
+                num_lost += 0 if ends else num_removed
+                end = encode_take_end(utime=utime, source=source.name, messages_lost=num_lost)
+                ends.append((f"{source.channels}_END".encode(), end))
+        return ends

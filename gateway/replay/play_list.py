@@ -10,7 +10,7 @@ from gateway.replay.timeline import ReplayTimeline
 from gateway.takes.reader import FIRST_PLACE, TakeReader
 
 _PARAMETERS: Final = "parameters"
-_DESCRIPTION: Final = "take"
+_DESCRIPTIONS: Final = frozenset({"take", "end"})
 _MAX_CACHED: Final = 10_000
 
 
@@ -37,7 +37,7 @@ class Selection:
 
     def has(self, source: str, key: str) -> bool:
         """Return whether messages of this source and key are selected, wherever they are in the take."""
-        if key == _DESCRIPTION or (self.sources is not None and source not in self.sources):
+        if key in _DESCRIPTIONS or (self.sources is not None and source not in self.sources):
             return False
         return self.components is None or key == _PARAMETERS or key.partition("/")[0] in self.components
 

@@ -48,6 +48,7 @@ class LogFile:
         self.path = path
         self.num_messages = 0
         self.num_bytes = 0
+        self._newest_bytes = 0  # the size of the newest event
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
 
     def append(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
@@ -81,7 +82,17 @@ class LogFile:
             num_messages = len(messages)
         self.num_messages += num_messages
         self.num_bytes += num_bytes
+        channel, message = messages[num_messages - 1]
+        self._newest_bytes = _HEADER.size + len(channel) + len(message)
         return num_messages
+
+    def remove_newest(self) -> None:
+        """Remove the newest event, so that a smaller one finds room on a full disk. Raises OSError."""
+        self.num_messages -= 1
+        self.num_bytes -= self._newest_bytes
+        self._newest_bytes = 0
+        os.ftruncate(self._descriptor, self.num_bytes)
+        os.lseek(self._descriptor, self.num_bytes, os.SEEK_SET)
 
     def sync(self) -> None:
         """Store on the disk what was appended. Raises OSError."""

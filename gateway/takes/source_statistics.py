@@ -17,6 +17,7 @@ from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.clock_steps import ClockSteps
 from gateway.takes.component_rows import decode_rows
 from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
+from gateway.takes.description import has_end
 
 MAX_LISTED_CHANGES: Final = 100
 """How many changes of the parameters are listed; all are counted."""
@@ -25,6 +26,7 @@ _MAX_VERSIONS: Final = 32
 """How many versions of the parameters are kept to label what follows."""
 _MAX_TEXTS: Final = 20
 _MAX_KEYS: Final = 1000
+_DESCRIPTIONS: Final = frozenset({"take", "end"})
 _HEAD_BYTES: Final = FINGERPRINT_BYTES + PREFIX.size
 
 
@@ -56,11 +58,19 @@ class SourceStatistics:
         """The labels of events by id (§6.6)."""
         self.drops: dict[tuple[str, str], int] = {}
         """Messages that the gateway lost during the take, by stream or output and by cause."""
+        self.num_lost = 0
+        """Messages that the recorder lost, according to the ends of the files."""
         self.clock_steps = ClockSteps()
+        self._num_open = 0  # files that should have an end, and have none so far
         self._drops: dict[tuple[str, str], int] | None = None  # in the newest status
         self._parameters: dict[int, Parameters] = {}  # by version
         self._newest: tuple[int, bytes, Parameters] | None = None  # version, XML, content
         self._clock_key = ""
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether a file was not ended in order; files of earlier versions have no end."""
+        return self._num_open > 0
 
     @property
     def sessions(self) -> int:
@@ -120,14 +130,14 @@ class SourceStatistics:
     def _add_others(self, key: str, messages: list[bytes]) -> None:
         statistics = self.others.setdefault(key, MessageStatistics())
         statistics.num_bytes += sum(map(len, messages))
-        whole = [message for message in messages if len(message) >= _HEAD_BYTES or key == "take"]
+        whole = [message for message in messages if len(message) >= _HEAD_BYTES or key in _DESCRIPTIONS]
         statistics.malformed += len(messages) - len(whole)
         for message in whole if "/" not in key and key != "clock" else ():
             try:
                 self._describe(key, decode(message))
             except ProtocolError:
                 statistics.malformed += 1
-        if key in ("take", "parameters"):  # they are repeated in each file, or have no numbers
+        if key in _DESCRIPTIONS or key == "parameters":  # repeated in each file, or without numbers
             statistics.num_messages += len(whole)
         else:
             heads = np.frombuffer(b"".join([message[8:32] for message in whole]), ">i8").reshape(-1, 3)
@@ -137,12 +147,17 @@ class SourceStatistics:
         if key == "parameters":
             self._set_parameters(message)
             return
+        if key == "end":
+            self.num_lost += message.messages_lost
+            self._num_open -= 1
+            return
         if message.server:
             _note(self.servers, message.server)
         if message.gateway_version:
             _note(self.gateway_versions, message.gateway_version)
         if key == "take":
             self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
+            self._num_open += has_end(message)
         else:
             self._count_drops(message)
 

@@ -54,13 +54,22 @@ class TakeStatistics:
 
     @property
     def is_complete(self) -> bool:
-        """Whether there is no damage, no gap, and no malformed message."""
+        """Whether there is no damage, no gap, no malformed message, and the recorder lost nothing."""
         parts = [
             part
             for source in self.sources.values()
             for part in (*source.components.values(), *source.others.values())
         ]
-        return not self.num_damaged and not any(part.gaps.missing or part.malformed for part in parts)
+        return (
+            not self.num_damaged
+            and not any(part.gaps.missing or part.malformed for part in parts)
+            and not self.was_cut_short
+        )
+
+    @property
+    def was_cut_short(self) -> bool:
+        """Whether the recorder was cut off, or lost messages."""
+        return any(source.is_cut_off or source.num_lost for source in self.sources.values())
 
 
 def take_statistics(path: Path, progress: Callable[[int, int], object] | None = None) -> TakeStatistics:

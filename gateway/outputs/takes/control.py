@@ -95,6 +95,7 @@ def _fields(take: StoredTake) -> dict[str, Any]:
         "seconds": round(take.seconds, 3),
         "is_running": take.is_running,
         "lost": take.num_lost,
+        "is_cut_off": take.is_cut_off,
     }
 
 

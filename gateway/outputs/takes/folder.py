@@ -12,11 +12,15 @@ import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
-from gateway.errors import QueryError, TakeError
+import rtc3d
+
+from gateway.errors import ProtocolError, QueryError, TakeError
+from gateway.messages.decode import decode
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake, TakePiece
+from gateway.takes.description import has_end
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.names import by_number, check_name, default_name, numbered
 from gateway.takes.new_file import NewFiles
@@ -32,6 +36,7 @@ _FURTHER_C3D: Final = re.compile(r" \(\d+\)$|-\d+$")
 
 _LOCK: Final = ".rtc3d-gateway.lock"
 _TAIL_BYTES: Final = 256 * 1024
+_END_BYTES: Final = 4096
 _COPIED_BYTES: Final = 1024 * 1024
 _MAX_REMEMBERED: Final = 10_000
 
@@ -75,6 +80,15 @@ class TakeEntry:
         return {(status.st_dev, status.st_ino): status.st_size for _, status in files}
 
 
+class _Facts(NamedTuple):
+    """What the files of a take say; see StoredTake."""
+
+    begin_utime: int
+    seconds: float
+    num_lost: int
+    is_cut_off: bool
+
+
 class TakesFolder:
     """The folder of the takes of all sources: DIRECTORY/SOURCE/NAME.lcmlog, or a folder NAME of saved logs.
 
@@ -87,7 +101,7 @@ class TakesFolder:
         self._lock: int | None = None
         self._is_closed = False
         self._opening = threading.Lock()
-        self._times: dict[tuple[Path, int, int], tuple[int, float]] = {}  # of takes, by path, size and time
+        self._facts: dict[tuple[Path, int, int], _Facts] = {}  # of takes, by path, size and time
         self._monotonic = monotonic
         # Of each take: when it was written last, and when that was noticed; None if it was there before.
         self._noticed: dict[Path, tuple[float, float | None]] | None = None
@@ -189,18 +203,19 @@ class TakesFolder:
         raise QueryError(f"there is no take {path} any more; somebody has removed it")
 
     def _stored(self, entry: TakeEntry, is_running: bool) -> StoredTake:
-        begin_utime, seconds = self._times_of(entry)
-        return StoredTake(entry.path.name, entry.num_bytes, begin_utime, seconds, is_running)
+        facts = self._facts_of(entry)
+        if is_running:
+            facts = facts._replace(is_cut_off=False)
+        return StoredTake(entry.path.name, entry.num_bytes, is_running=is_running, **facts._asdict())
 
-    def _times_of(self, entry: TakeEntry) -> tuple[int, float]:
-        """Return when a take begins, in µs since the Unix epoch, and how many seconds it lasts."""
+    def _facts_of(self, entry: TakeEntry) -> _Facts:
         newest_ns = max(status.st_mtime_ns for _, status in entry.logs)
         identity = (entry.path, entry.num_bytes, newest_ns)
-        if identity not in self._times:
-            if len(self._times) > _MAX_REMEMBERED:
-                self._times.clear()
-            self._times[identity] = _times(entry)
-        return self._times[identity]
+        if identity not in self._facts:
+            if len(self._facts) > _MAX_REMEMBERED:
+                self._facts.clear()
+            self._facts[identity] = _facts(entry)
+        return self._facts[identity]
 
     def read(self, source: str, name: str, offset: int) -> TakePiece:
         """Return a part of a take; its files are read as one. Raises OSError, QueryError."""
@@ -353,17 +368,36 @@ def _files(folder: Path) -> list[tuple[Path, os.stat_result]]:
     return sorted(files, key=lambda file: by_number(file[0]))
 
 
-def _times(entry: TakeEntry) -> tuple[int, float]:
-    """Read when a take begins, and how long it is; 0, 0.0 if it has no messages."""
+def _facts(entry: TakeEntry) -> _Facts:
+    """Read the beginning and the end of a take; all zero if it has no messages."""
+    begin_utime = end_utime = num_lost = 0
+    is_cut_off = False
+    for path, status in entry.logs:
+        try:
+            first = newest = next(EventLogReader(path).events())
+            tail_bytes = _TAIL_BYTES if path == entry.logs[-1][0] else _END_BYTES
+            for event in EventLogReader(path).events(max(0, status.st_size - tail_bytes)):
+                newest = event
+        except TakeError:
+            is_cut_off = True
+            continue
+        begin_utime, end_utime = begin_utime or first.utime, newest.utime
+        end = _decoded(newest.message, rtc3d.take_end_t)
+        if end is not None:
+            num_lost += end.messages_lost
+        else:
+            take = _decoded(first.message, rtc3d.take_t)
+            is_cut_off = is_cut_off or (take is not None and has_end(take))
+    return _Facts(begin_utime, max(0.0, (end_utime - begin_utime) / 1e6), num_lost, is_cut_off)
+
+
+def _decoded(message: bytes, message_type: type[Any]) -> Any | None:
+    """Return a message, None if it is of another type."""
     try:
-        first = next(EventLogReader(entry.logs[0][0]).events())
-        path, status = entry.logs[-1]
-        newest = first
-        for event in EventLogReader(path).events(max(0, status.st_size - _TAIL_BYTES)):
-            newest = event
-    except TakeError:
-        return 0, 0.0
-    return first.utime, max(0.0, (newest.utime - first.utime) / 1e6)
+        decoded = decode(message)
+    except ProtocolError:
+        return None
+    return decoded if isinstance(decoded, message_type) else None
 
 
 def _delete(entry: TakeEntry) -> None:

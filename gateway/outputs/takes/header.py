@@ -1,12 +1,13 @@
-"""What each file of a take begins with: its description, and the newest parameters of the source."""
+"""What each file of a take begins and ends with: its description, the newest parameters, what was lost."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from gateway import __version__
+from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.parameters_message import published_again
-from gateway.takes.description import encode_take
+from gateway.takes.description import encode_take, encode_take_end
 from gateway.takes.recording import LogFile
 
 
@@ -34,6 +35,10 @@ class SourceDescription:
             recorder="rtc3d-gateway",
         )
 
+    def end_message(self, utime: int, num_lost: int) -> bytes:
+        """Return the ``take_end_t`` of a file that ends at ``utime`` and lacks ``num_lost`` messages."""
+        return encode_take_end(utime=utime, source=self.source, messages_lost=num_lost)
+
 
 class FileHeader:
     """The beginning of the files of one source.
@@ -47,6 +52,7 @@ class FileHeader:
         self.parameters = parameters
         self.parameters_channel: bytes = description.channel("parameters")
         self._take_channel = description.channel("take")
+        self._end_channel = description.channel("end")
 
     def messages(self, name: str, utime: int) -> list[tuple[bytes, bytes]]:
         """Return the first messages of a file, each with its channel."""
@@ -67,3 +73,17 @@ class FileHeader:
             path.unlink(missing_ok=True)
             raise
         return log
+
+    def end_log(self, log: LogFile, num_lost: int) -> int:
+        """Write the last message of a file; on a full disk, in place of the newest one.
+
+        Returns how many messages the file lacks then. Raises OSError.
+        """
+        utime = now_utime()
+        try:
+            log.append([(self._end_channel, self.description.end_message(utime, num_lost))])
+        except OSError:
+            log.remove_newest()
+            num_lost += 1
+            log.append([(self._end_channel, self.description.end_message(utime, num_lost))])
+        return num_lost

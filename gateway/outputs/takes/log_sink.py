@@ -29,13 +29,20 @@ class LogSink(ABC):
     def __init__(self, header: FileHeader, disk: Disk, losses: Losses) -> None:
         self.header = header
         self.disk = disk
-        self.num_lost = 0
-        """How many messages the disk did not accept."""
+        self.num_refused = 0
+        """How many messages the queue before the disk did not accept. Changed in the event loop only."""
+        self._num_unwritten = 0  # how many messages the disk did not accept
+        self._num_lost_before = 0  # before the present log
         self._losses = losses
         self._log: LogFile | None = None  # the present one
         self._is_in_place = True
         """Whether the present log had its path when this was checked last."""
         self._gives_up = threading.Event()
+
+    @property
+    def num_lost(self) -> int:
+        """How many messages were published, but are in no log."""
+        return self.num_refused + self._num_unwritten
 
     @property
     @abstractmethod
@@ -83,9 +90,16 @@ class LogSink(ABC):
             self._is_in_place = self._log.is_in_place()
 
     def _close_log(self) -> LogFile | None:
-        """Store everything, close the present log and return it."""
+        """End the present log with what is missing in it, store everything, close it and return it."""
         log, self._log = self._log, None
         if log is not None:
+            num_lost = self.num_lost - self._num_lost_before
+            try:
+                self._count_lost(self.header.end_log(log, num_lost) - num_lost)
+            except OSError as error:
+                self.disk.failed(self.path, error)
+                self._count_lost(1)  # the newest message, which has made room in vain
+            self._num_lost_before = self.num_lost
             try:
                 log.close()
             except OSError as error:
@@ -94,6 +108,10 @@ class LogSink(ABC):
 
     def lose(self, messages: Messages) -> None:
         """Count messages that are not written."""
-        self.num_lost += len(messages)
-        num_frames = max(Counter(channel for channel, _ in messages).values())
-        self._losses.lost("not written", self.disk.problem, messages=len(messages), frames=num_frames)
+        self._count_lost(len(messages), max(Counter(channel for channel, _ in messages).values()))
+
+    def _count_lost(self, num_messages: int, num_frames: int = 1) -> None:
+        if num_messages:
+            self._num_unwritten += num_messages
+            text = self.disk.problem or f"the disk of {self.path} is full"
+            self._losses.lost("not written", text, messages=num_messages, frames=num_frames)

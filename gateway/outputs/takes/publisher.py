@@ -48,9 +48,13 @@ class TakesPublisher:
         if recorder is None or not self._targets:
             self._check_open()
             return
+        is_refused = False
         for sink, channel in self._targets:
             if not recorder.record(sink, channel, message):
-                raise self._full()
+                sink.num_refused += 1
+                is_refused = True
+        if is_refused:
+            raise self._full()
 
     def _check_open(self) -> None:
         if self._is_closed:

@@ -125,7 +125,10 @@ class RecordedTakes:
         await disk_result(ended, take.path, self.disk)
         stored = await self._reader.read(partial(self._folder.take_at, take.stem), take.path)
         size = f"{stored.seconds:.1f} s, {stored.num_bytes / 1e6:.1f} MB"
-        logger.info("takes: %s is complete: %s, %d messages lost", take.path, size, take.num_lost)
+        if take.num_lost or stored.is_cut_off:
+            logger.warning("takes: %s is not complete: %s, %d messages lost", take.path, size, take.num_lost)
+        else:
+            logger.info("takes: %s is complete: %s", take.path, size)
         return stored._replace(num_lost=take.num_lost)
 
     async def save(

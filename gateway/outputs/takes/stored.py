@@ -11,8 +11,9 @@ class StoredTake(NamedTuple):
     """A take in the folder.
 
     ``begin_utime`` is the time of its first message in µs since the Unix epoch, ``seconds`` how long it
-    lasts, ``num_lost`` how many messages the disk did not accept, as far as this process knows. A take is
-    running until everything of it is in its files.
+    lasts, ``num_lost`` how many messages found no room on the disk. A take is running until everything of it
+    is in its files. It is cut off if one of its files was not ended in order, because the gateway was killed
+    or the disk failed.
     """
 
     name: str
@@ -21,6 +22,7 @@ class StoredTake(NamedTuple):
     seconds: float
     is_running: bool = False
     num_lost: int = 0
+    is_cut_off: bool = False
 
 
 class SourceTakes(NamedTuple):

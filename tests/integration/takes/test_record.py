@@ -26,6 +26,7 @@ from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
+from gateway.takes.statistics import take_statistics
 from tests.gateway_process import PROGRAM, program, simulator
 from tests.networks import free_endpoint, lcm_url, open_zenoh, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
@@ -221,6 +222,7 @@ def test_kill_9_costs_at_most_the_last_second(tmp_path: Path) -> None:
     assert all(damage.offset + damage.num_bytes == size(path) for damage in reader.damage)
     sequences = [prefix_of(event.message).sequence for event in found]
     assert sequences == [*range(sequences[0], sequences[0] + len(sequences))]
+    assert take_statistics(path).sources["Lab-1"].is_cut_off
 
 
 def test_a_full_disk_costs_nothing_if_it_has_room_again_and_is_counted_otherwise(tmp_path: Path) -> None:
@@ -236,6 +238,7 @@ def test_a_full_disk_costs_nothing_if_it_has_room_again_and_is_counted_otherwise
         ended = record.end()
         assert_same_bytes(path, gateway.published)
     assert ended.status == 1
+    assert take_statistics(path).sources["Lab-1"].is_cut_off
     assert re.search(r"^\d+ messages were not written: .*: File too large$", ended.stdout, re.MULTILINE)
     assert re.search(r"^Lab-1 +3d .* Hz +- +- +[1-9]\d*$", ended.stdout, re.MULTILINE)
 
@@ -248,7 +251,7 @@ def test_the_first_messages_are_recorded_with_the_seconds_given(tmp_path: Path) 
     [path] = folder.iterdir()
     assert re.fullmatch(r"Lab-1-\d{8}-\d{6}\.lcmlog", path.name)
     recorded = by_channel(path)
-    assert recorded.keys() == {"MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_PARAMETERS", "MOCAP_LAB_1_3D"}
+    assert recorded.keys() == {f"MOCAP_LAB_1_{end}" for end in ("TAKE", "PARAMETERS", "3D", "END")}
     utimes = [prefix_of(message).utime for message in recorded["MOCAP_LAB_1_3D"]]
     assert 0.5e6 < utimes[-1] - utimes[0] < 30e6  # on a busy computer, the end comes late
 

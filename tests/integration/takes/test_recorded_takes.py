@@ -16,6 +16,7 @@ from gateway.config.settings import MetricsSettings, ReconnectSettings, Settings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
@@ -187,6 +188,7 @@ def test_a_kill_costs_less_than_a_second(tmp_path: Path) -> None:
             wait_until(lambda: [*(tmp_path / "takes" / "lab").glob("*/*.lcmlog")])
             [take] = (tmp_path / "takes" / "lab").iterdir()
             assert [message.sequence for message in markers(take)] == sequences
+            assert TakesFolder(tmp_path / "takes").take_at(take).is_cut_off
             process.send_signal(signal.SIGTERM)
             assert process.wait(30) == 0
     log = (tmp_path / "gateway.log").read_text()

@@ -90,3 +90,11 @@ def take_message() -> bytes:
     message.recorder, message.host = "rtc3d-gateway 1.0.0", "analysis-pc"
     encoded: bytes = message.encode()
     return encoded
+
+
+def take_end_message() -> bytes:
+    """Return the end of a take."""
+    message = rtc3d.take_end_t()
+    message.utime, message.source, message.messages_lost = 1_700_000_000_000_000, "lab", 505
+    encoded: bytes = message.encode()
+    return encoded

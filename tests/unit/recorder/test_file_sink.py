@@ -81,6 +81,20 @@ def test_what_the_disk_does_not_accept_at_the_end_is_counted(sink: FileSink) -> 
     assert sink.problem
 
 
+@pytest.mark.parametrize(("room_bytes", "num_kept"), [(100_000, 3), (3200, 2), (0, 2)])
+def test_the_end_of_the_file_takes_the_place_of_a_message_on_a_full_disk(
+    sink: FileSink, room_bytes: int, num_kept: int
+) -> None:
+    """So that a file that lacks messages says so; without room for an end, it counts as cut off."""
+    sent = messages(3)
+    sink.write(sent)
+    with disk_of(room_bytes):
+        sink.end(lambda num_removed: [(b"MOCAP_LAB_END", bytes(300) + bytes([num_removed]))])
+    found = written(sink)
+    assert found[:num_kept] == sent[:num_kept]
+    assert [message[-1] for _, message in found[num_kept:]] == {100_000: [0], 3200: [1], 0: []}[room_bytes]
+
+
 def test_no_end_of_an_event_is_left_behind_if_the_disk_is_full(sink: FileSink) -> None:
     sink.give_up()
     with disk_of(100_500):  # not at the end of an event

@@ -88,10 +88,12 @@ class Recorded:
         self.recording.tick()
 
     def events(self) -> list[tuple[str, bytes]]:
-        """End the recording and return what is in the file."""
+        """End the recording and return what is in the file, without the ends of the sources."""
         self.recording.stop()
         assert self.recording.close(10)
-        return [(event.channel, event.message) for event in EventLogReader(self.path).events()]
+        events = [(event.channel, event.message) for event in EventLogReader(self.path).events()]
+        self.ends = [decode(message) for channel, message in events if channel.endswith("_END")]
+        return [event for event in events if not event[0].endswith("_END")]
 
     def channels(self) -> list[str]:
         return [channel for channel, _ in self.events()]
@@ -213,6 +215,7 @@ def test_what_waits_for_descriptions_is_bounded(recorded: Recorded, monkeypatch:
     recorded.describe("lab")
     recorded.receive("robot", "3d", *map(markers, range(5)))
     assert recorded.series("robot", "3d").num_refused == 2
+    assert recorded.series("robot", "3d").num_refused_bytes == 2 * len(markers(0))
     recorded.describe("robot")
     channels = recorded.channels()
     assert (channels.count("MOCAP_LAB_3D"), channels.count("MOCAP_ROBOT_3D")) == (3, 3)

@@ -19,6 +19,7 @@ WALK_FIELDS = {
     "seconds": 12.346,
     "is_running": True,
     "lost": 2,
+    "is_cut_off": False,
 }
 
 

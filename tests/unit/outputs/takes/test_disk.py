@@ -21,7 +21,7 @@ from gateway.outputs.parameters_message import encode_parameters
 from gateway.outputs.takes import disk as disk_module
 from gateway.outputs.takes import disk_calls
 from gateway.outputs.takes.disk import RETRY_S, Disk
-from gateway.outputs.takes.folder import ROLLING
+from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.log_sink import LogSink
 from gateway.outputs.takes.segments import RollingSegments, Save
@@ -118,8 +118,10 @@ async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take
             assert causes == {"disk too slow"}
         await wait_until_async(lambda: lab.output.health().connected)
         accepted.append(lab.publish())
-        await lab.takes.stop("lab")
+        stopped = await lab.takes.stop("lab")
+        [listed] = (await lab.takes.list("lab")).takes
     assert frames(lab.path("walk.lcmlog")) == accepted
+    assert stopped.num_lost == listed.num_lost == 12 - len(accepted) > 0
 
 
 async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: Path) -> None:
@@ -143,6 +145,9 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
     found = frames(lab.path("walk.lcmlog"))
     assert found == published[: len(found)]
     assert stopped.num_lost == len(published) - len(found) > 0
+    # The end of the file has taken the place of the newest message that had found room.
+    [listed] = (take for take in TakesFolder(tmp_path).takes("lab", ()) if take.name == "walk")
+    assert (listed.num_lost, listed.is_cut_off) == (stopped.num_lost, False)
     assert amounts(losses.report()) == {"not written": (stopped.num_lost, stopped.num_lost)}
 
 

@@ -154,7 +154,7 @@ def test_a_list_has_the_newest_take_first_with_its_time_and_length(takes: TakesF
     stored(lab / "empty.lcmlog", b"", 70)
     assert takes.takes("lab", {"walk"}) == [
         StoredTake("walk", len(log(1, 2)), 1_000_000, 2.5, is_running=True),
-        StoredTake("empty", 0, 0, 0.0),
+        StoredTake("empty", 0, 0, 0.0, is_cut_off=True),
         StoredTake("fall", 3 * len(log(1, 2)), 10_000_000, 20.000005),
     ]
     assert takes.take_at(lab / "fall").seconds == 20.000005

@@ -11,6 +11,7 @@ from gateway.errors import QueryError
 from gateway.losses import Losses
 from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
+from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.takes.event_log import EventLogReader
@@ -103,6 +104,27 @@ def test_a_saved_take_begins_with_the_segment_of_its_time(
     rolling.write(35)
     rolling.save(last_s)
     assert numbers(rolling.takes / "fall") == list(range(first, 35))
+
+
+def test_a_saved_take_has_lost_what_its_segments_have_lost_and_is_cut_off_without_their_ends(
+    rolling: Rolling,
+) -> None:
+    folder = TakesFolder(rolling.takes.parent)
+    for num_lost in (5, 3, 1):
+        rolling.write(1)
+        rolling.segments.num_refused += num_lost
+        rolling.write(9)
+    rolling.save(5)
+    fall = folder.take_at(rolling.takes / "fall")
+    assert (fall.num_lost, fall.is_cut_off) == (1, False)
+    rolling.write(1)
+    save = rolling.save(1e9, "all", goes_on=True)
+    [cut_off] = (take for take in folder.takes("lab", ()) if take.name == "all")
+    assert (cut_off.num_lost, cut_off.is_cut_off) == (9, True)
+    [running] = (take for take in folder.takes("lab", {"all"}) if take.name == "all")
+    assert not running.is_cut_off
+    rolling.segments.end_save(save)
+    assert not folder.take_at(rolling.takes / "all").is_cut_off
 
 
 def test_a_saved_take_ends_at_once_and_its_segments_are_shared(rolling: Rolling) -> None:

@@ -160,6 +160,7 @@ async def test_running_takes_are_not_deleted_however_old_they_are(tmp_path: Path
         assert lab.path("walk.lcmlog").exists()
         assert [*lab.path("fall").iterdir()]
         await lab.takes.stop("lab")
+        lab.output.maintain()
         clock.now_s += 3 * 86_400
         lab.output.maintain()
         assert not lab.path("walk.lcmlog").exists()
