@@ -161,6 +161,16 @@ class FailureLog:
             self._logger.info("%s: %s", self._subject, text)
 
 
+class DefectTotal:
+    """How often there was a defect since the program started, wherever it was logged."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+
+defect_total: Final = DefectTotal()
+
+
 class DefectLog:
     """Logs each defect in this program once as ERROR, with its traceback, and repeats as DEBUG.
 
@@ -185,6 +195,7 @@ class DefectLog:
         text = text or f"{defect_text(defect)}; report this with the log"
         place = _place(single(defect))
         repeats = self._counts.get(place, 0)
+        defect_total.count += 1
         self._counts[place] = repeats + 1
         if repeats:
             self._logger.debug("%s: %s (again)", self._subject, text)

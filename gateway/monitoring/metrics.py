@@ -22,6 +22,7 @@ from prometheus_client.registry import Collector
 
 from gateway import __version__
 from gateway.gateway import Gateway
+from gateway.log import defect_total
 from gateway.losses import Loss
 from gateway.messages.host_time import host_clock
 from gateway.monitoring.http_pages import Page
@@ -297,6 +298,12 @@ class GatewayCollector(Collector):
             "How often the wall clock of this computer was set by 1 ms or more since the gateway started.",
             (),
             [((), host_clock.steps)],
+        )
+        yield _counter(
+            "defects",
+            "Defects of the gateway, repeats included; the log has each with its traceback.",
+            (),
+            [((), defect_total.count)],
         )
         yield InfoMetricFamily(f"{METRIC_PREFIX}build", "Versions; always 1.", self._build)
         # prometheus_client's own collector reads /proc/stat, which the service's sandbox hides.

@@ -1,7 +1,7 @@
 """Lists: a table on a terminal; otherwise a line for each record, with tabs between its fields."""
 
 from collections.abc import Collection, Sequence
-from typing import TextIO
+from typing import IO
 
 from rich.console import Console
 from rich.table import Table
@@ -43,7 +43,7 @@ def list_table(title: str = "") -> Table:
     )
 
 
-def write_records(out: TextIO, records: Sequence[Sequence[str]]) -> None:
+def write_records(out: IO[str], records: Sequence[Sequence[str]]) -> None:
     """Write a line for each record. Tabs and line ends in its fields are escaped."""
     for record in records:
         print(*map(safe_text, record), sep="\t", file=out)  # rich would expand the tabs
