@@ -144,10 +144,10 @@ class FailureLog:
             return
         now_s = monotonic()
         if now_s - self._last_s >= self._hold_s:
-            count = "1 failure" if self._failures == 1 else f"{self._failures} failures"
+            count = "" if self._failures == 1 else f" and {self._failures} failures"
             self._logger.log(
                 logging.DEBUG if self._is_hidden else logging.INFO,
-                "%s: %s, after %.1f s and %s",
+                "%s: %s, after %.1f s%s",
                 *(self._subject, text, now_s - self._first_s, count),
             )
             self._failures = 0

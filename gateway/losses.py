@@ -134,7 +134,7 @@ class Losses:
     def check(self) -> None:
         """Log the end of a period of loss if nothing has been lost for long enough. Call it every second."""
         if self._began_s is not None and self._monotonic() - self._newest_s >= self._hold_s:
-            self._end(f"; nothing lost for {self._hold_s:g} s")
+            self._end(f"; no more in the {self._hold_s:g} s since then")
 
     def close(self) -> None:
         """Log the end of a period of loss now, because the route ends. It may be used again."""

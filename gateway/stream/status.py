@@ -26,6 +26,9 @@ MAX_UNKNOWN_TYPES: Final = 8
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
 
+_LATE_BEFORE_A_GAP_S: Final = 0.5
+"""A server that nobody reads from leaves out frames only when buffers are full: after this long at least."""
+
 _MAX_REPAIRS: Final = 3
 """How many repairs of the parameters are logged; the others are counted."""
 
@@ -255,11 +258,25 @@ class StreamStatus:
         )
 
     def frames_unsent(self, num_frames: int, num_messages: int) -> None:
-        """Count frames that the server numbered and did not send."""
+        """Count frames that the server numbered and did not send.
+
+        If nobody took its frames, those before the gap waited in buffers, and arrived late.
+        """
+        if not self.clock.has_clock:
+            reason = "check the load of the server's computer and of this one"
+        elif self.lag_s >= _LATE_BEFORE_A_GAP_S:
+            reason = (
+                f"those before arrived {self.lag_s:.1f} s late, because this gateway or the network was held "
+                "up; check the load of this computer, then the network"
+            )
+        else:
+            reason = (
+                "those before arrived in time, so this gateway read them; "
+                "check the load of the server's computer"
+            )
         self.losses.lost(
             "not sent by the server",
-            f"the server did not send {num_frames} of the frames that it numbered; "
-            "is it too busy, or did this gateway not read for too long?",
+            f"the server did not send {num_frames} of the frames that it numbered; {reason}",
             messages=num_messages,
             frames=num_frames,
         )

@@ -76,7 +76,7 @@ def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
     losses.check()
     losses.check()
     assert logged(caplog) == [
-        "INFO lab: lost within 2.5 s: 1250 messages of 250 frames (no router); nothing lost for 5 s"
+        "INFO lab: lost within 2.5 s: 1250 messages of 250 frames (no router); no more in the 5 s since then"
     ]
 
 
@@ -91,7 +91,7 @@ def test_the_next_period_has_a_total_of_its_own(
         if number == 1:
             losses.check()
     losses.lost("no router", "start zenohd", frames=0)
-    begin, end = "WARNING lab: start zenohd", "(no router); nothing lost for 5 s"
+    begin, end = "WARNING lab: start zenohd", "(no router); no more in the 5 s since then"
     first, second = (f"INFO lab: lost within 0.0 s: {number} {end}" for number in ("1 message", "2 messages"))
     assert logged(caplog) == [begin, first, begin, second, begin]
     assert amounts(losses.report()) == {"no router": (4, 0)}
