@@ -179,6 +179,15 @@ class GatewayCollector(Collector):
         """Yield every metric with its current samples."""
         yield from self._streams()
         yield self._component_frames()
+        yield _gauge(
+            "source_subscribed",
+            "1 if somebody may subscribe to the source's data, else 0; always 1 with LCM, which cannot know.",
+            ("source",),
+            [
+                ((source.name,), source.fan_out.has_subscribers(source.queries.components))
+                for source in self._gateway.sources
+            ],
+        )
         yield from self._routes()
         yield from self._outputs()
         yield from self._process()

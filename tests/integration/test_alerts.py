@@ -43,6 +43,7 @@ CASES: Final[list[tuple[str, str, str, str, bool]]] = [
     ("FramesLate", f"rtc3d_gateway_lag_seconds{{{_SOURCE}}}", "0.1+0x30", "0.01+0x30", True),
     ("NoClock", f"rtc3d_gateway_clock_valid{{{_SOURCE}}}", "0+0x30", "1+0x30", True),
     ("EventLoopSlow", 'rtc3d_gateway_loop_delay_max_seconds{instance="a"}', "0.2+0x30", "0.01+0x30", False),
+    ("NoSubscriber", 'rtc3d_gateway_source_subscribed{instance="a",source="lab"}', "0+0x30", "1+0x30", True),
     ("Defect", 'rtc3d_gateway_defects_total{instance="a"}', "0+1x30", "3+0x30", False),
     ("HostClockSet", 'rtc3d_gateway_host_clock_steps_total{instance="a"}', "0+1x30", "1+0x30", False),
 ]
