@@ -82,8 +82,9 @@ class StreamStatus:
     output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
     components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the first
     of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
-    ``known_defects`` has the defects that are logged already. ``events`` logs what the server can cause again
-    and again, ``lateness`` late frames.
+    ``known_defects`` has the defects that are logged already, and ``newest_losses_s`` when the streams of the
+    source last lost something, by cause: they log one warning together. ``events`` logs what the server can
+    cause again and again, ``lateness`` late frames.
     """
 
     components: str
@@ -114,6 +115,7 @@ class StreamStatus:
     last_error_utime: int = 0
     last_error_s: float = -math.inf
     known_defects: DefectLog | None = None
+    newest_losses_s: dict[str, float] | None = None
     _phase: Phase = field(default=Phase.WAITING, init=False)
     events: EventLog = field(init=False)
     lateness: FailureLog = field(init=False)
@@ -130,7 +132,7 @@ class StreamStatus:
         self.lateness = FailureLog(logger, self)
         self._failures = FailureLog(logger, self, HOLD_S)
         self._defects = DefectLog(logger, self, self.known_defects)
-        self.losses = Losses(logger, self)
+        self.losses = Losses(logger, self, newest_by_cause_s=self.newest_losses_s)
         self._logged_request = ""  # here, because mypyc ignores the default of a field that __init__ lacks
 
     def __str__(self) -> str:

@@ -23,6 +23,23 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
     return lines
 
 
+def test_streams_of_one_source_warn_together_of_one_cause(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A busy computer makes all streams lose frames; one line says so, and the sums stay separate."""
+    shared: dict[str, float] = {}
+    first, second = (Losses(LOGGER, name, clock, shared) for name in ("lab (3d)", "lab (analog)"))
+    with caplog.at_level(logging.INFO):
+        first.lost("skipped", "frames are late")
+        clock.now_s += 1
+        second.lost("skipped", "frames are late")
+        assert caplog.messages == ["lab (3d): frames are late"]
+        clock.now_s += 60
+        first.check()
+        second.check()
+    assert [message.partition(":")[0] for message in caplog.messages[1:]] == ["lab (3d)", "lab (analog)"]
+
+
 def test_messages_and_frames_are_counted_by_cause(losses: Losses) -> None:
     losses.lost("skipped", "late", messages=2)
     losses.lost("skipped", "late", messages=3)
