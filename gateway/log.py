@@ -146,10 +146,10 @@ class FailureLog:
             return
         now_s = monotonic()
         if now_s - self._last_s >= self._hold_s:
-            count = "1 failure" if self._failures == 1 else f"{self._failures} failures"
+            count = "" if self._failures == 1 else f" and {self._failures} failures"
             self._logger.log(
                 logging.DEBUG if self._is_hidden else logging.INFO,
-                "%s: %s, after %.1f s and %s",
+                "%s: %s, after %.1f s%s",
                 *(self._subject, text, now_s - self._first_s, count),
             )
             self._failures = 0
@@ -161,6 +161,16 @@ class FailureLog:
             self.recovered(text)
         else:
             self._logger.info("%s: %s", self._subject, text)
+
+
+class DefectTotal:
+    """How often there was a defect since the program started, wherever it was logged."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+
+defect_total: Final = DefectTotal()
 
 
 class DefectLog:
@@ -195,6 +205,7 @@ class DefectLog:
         text = text or f"{defect_text(defect)}; report this with the log"
         place = _place(single(defect))
         repeats = self._counts.get(place, 0)
+        defect_total.count += 1
         self._counts[place] = repeats + 1
         if repeats:
             self._logger.debug("%s: %s (again)", self._subject, text)

@@ -82,8 +82,14 @@ class Losses:
     """
 
     def __init__(
-        self, logger: logging.Logger, subject: object, monotonic: Callable[[], float] = time.monotonic
+        self,
+        logger: logging.Logger,
+        subject: object,
+        monotonic: Callable[[], float] = time.monotonic,
+        newest_by_cause_s: dict[str, float] | None = None,
     ) -> None:
+        # When something was lost last on any of the routes that share this, which log one warning together.
+        self._newest_by_cause_s = newest_by_cause_s
         self._logger = logger
         self._subject = subject
         self._monotonic = monotonic
@@ -116,8 +122,13 @@ class Losses:
             self._newest_s = now_s
             if self._began_s is None:
                 self._begin(now_s)
+        is_known = False
+        if self._newest_by_cause_s is not None:
+            is_known = now_s - self._newest_by_cause_s.get(cause, float("-inf")) < MIN_HOLD_S
+            self._newest_by_cause_s[cause] = now_s
         if is_news:
-            self._logger.log(level, "%s: %s", self._subject, text)
+            is_repeat = is_known and level == logging.WARNING
+            self._logger.log(logging.DEBUG if is_repeat else level, "%s: %s", self._subject, text)
 
     def message_lost(
         self, cause: str, text: str, frame: object | None, *, level: int = logging.WARNING
@@ -134,7 +145,7 @@ class Losses:
     def check(self) -> None:
         """Log the end of a period of loss if nothing has been lost for long enough. Call it every second."""
         if self._began_s is not None and self._monotonic() - self._newest_s >= self._hold_s:
-            self._end(f"; nothing lost for {self._hold_s:g} s")
+            self._end(f"; no more in the {self._hold_s:g} s since then")
 
     def close(self) -> None:
         """Log the end of a period of loss now, because the route ends. It may be used again."""

@@ -56,6 +56,7 @@ class Source:
         before: "Source | None" = None,
     ) -> None:
         self.settings = settings
+        self._newest_losses_s: dict[str, float] = {}  # by cause, of all streams
         self.defects: DefectLog = DefectLog(logger, settings.name, None if before is None else before.defects)
         """The log of defects in handling this source."""
         self.spool = spool
@@ -237,6 +238,7 @@ class Source:
             sessions=self.sessions,
             parameters_version=self.parameters_version,
             known_defects=self.defects,
+            newest_losses_s=self._newest_losses_s,
         )
         return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
 

@@ -22,6 +22,7 @@ from prometheus_client.registry import Collector
 
 from gateway import __version__
 from gateway.gateway import Gateway
+from gateway.log import defect_total
 from gateway.losses import Loss
 from gateway.messages.host_time import host_clock
 from gateway.monitoring.http_pages import Page
@@ -177,6 +178,15 @@ class GatewayCollector(Collector):
         """Yield every metric with its current samples."""
         yield from self._streams()
         yield self._component_frames()
+        yield _gauge(
+            "source_subscribed",
+            "1 if somebody may subscribe to the source's data, else 0; always 1 with LCM, which cannot know.",
+            ("source",),
+            [
+                ((source.name,), source.fan_out.has_subscribers(source.queries.components))
+                for source in self._gateway.sources
+            ],
+        )
         yield from self._routes()
         yield from self._outputs()
         yield from self._process()
@@ -296,6 +306,12 @@ class GatewayCollector(Collector):
             "How often the wall clock of this computer was set by 1 ms or more since the gateway started.",
             (),
             [((), host_clock.steps)],
+        )
+        yield _counter(
+            "defects",
+            "Defects of the gateway, repeats included; the log has each with its traceback.",
+            (),
+            [((), defect_total.count)],
         )
         yield InfoMetricFamily(f"{METRIC_PREFIX}build", "Versions; always 1.", self._build)
         # prometheus_client's own collector reads /proc/stat, which the service's sandbox hides.

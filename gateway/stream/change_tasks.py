@@ -74,7 +74,7 @@ class ChangeTasks:
         elif halvings:
             self._status.lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
         else:
-            self._status.lateness.recovered("frames arrive in time")
+            self._status.lateness.recovered("frames arrive in time again")
 
     def request_components(self, components: Sequence[ComponentType]) -> None:
         """Start to request these components instead of the former ones; return at once."""
@@ -164,7 +164,7 @@ class ChangeTasks:
         elif self._halvings:
             logger.debug("%s: frames arrive in time; %s", self._status.name, request)
         else:
-            self._status.lateness.recovered(f"frames arrive in time; {request}")
+            self._status.lateness.recovered(f"frames arrive in time again; {request}")
 
     async def _follow_demand(self) -> None:
         """Want no frames while there are no subscribers, and frames within DEMAND_POLL_S of the first one."""

@@ -26,6 +26,9 @@ MAX_UNKNOWN_TYPES: Final = 8
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
 
+_LATE_BEFORE_A_GAP_S: Final = 0.5
+"""A server that nobody reads from leaves out frames only when buffers are full: after this long at least."""
+
 _MAX_REPAIRS: Final = 3
 """How many repairs of the parameters are logged; the others are counted."""
 
@@ -82,8 +85,9 @@ class StreamStatus:
     output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
     components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the first
     of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
-    ``known_defects`` has the defects that are logged already. ``events`` logs what the server can cause again
-    and again, ``lateness`` late frames.
+    ``known_defects`` has the defects that are logged already, and ``newest_losses_s`` when the streams of the
+    source last lost something, by cause: they log one warning together. ``events`` logs what the server can
+    cause again and again, ``lateness`` late frames.
     """
 
     components: str
@@ -114,6 +118,7 @@ class StreamStatus:
     last_error_utime: int = 0
     last_error_s: float = -math.inf
     known_defects: DefectLog | None = None
+    newest_losses_s: dict[str, float] | None = None
     _phase: Phase = field(default=Phase.WAITING, init=False)
     events: EventLog = field(init=False)
     lateness: FailureLog = field(init=False)
@@ -130,7 +135,7 @@ class StreamStatus:
         self.lateness = FailureLog(logger, self)
         self._failures = FailureLog(logger, self, HOLD_S)
         self._defects = DefectLog(logger, self, self.known_defects)
-        self.losses = Losses(logger, self)
+        self.losses = Losses(logger, self, newest_by_cause_s=self.newest_losses_s)
         self._logged_request = ""  # here, because mypyc ignores the default of a field that __init__ lacks
 
     def __str__(self) -> str:
@@ -258,11 +263,25 @@ class StreamStatus:
         )
 
     def frames_unsent(self, num_frames: int, num_messages: int) -> None:
-        """Count frames that the server numbered and did not send."""
+        """Count frames that the server numbered and did not send.
+
+        If nobody took its frames, those before the gap waited in buffers, and arrived late.
+        """
+        if not self.clock.has_clock:
+            reason = "check the load of the server's computer and of this one"
+        elif self.lag_s >= _LATE_BEFORE_A_GAP_S:
+            reason = (
+                f"those before arrived {self.lag_s:.1f} s late, because this gateway or the network was held "
+                "up; check the load of this computer, then the network"
+            )
+        else:
+            reason = (
+                "those before arrived in time, so this gateway read them; "
+                "check the load of the server's computer"
+            )
         self.losses.lost(
             NOT_SENT,
-            f"the server did not send {num_frames} of the frames that it numbered; "
-            "is it too busy, or did this gateway not read for too long?",
+            f"the server did not send {num_frames} of the frames that it numbered; {reason}",
             messages=num_messages,
             frames=num_frames,
         )

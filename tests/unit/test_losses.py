@@ -23,6 +23,23 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
     return lines
 
 
+def test_streams_of_one_source_warn_together_of_one_cause(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A busy computer makes all streams lose frames; one line says so, and the sums stay separate."""
+    shared: dict[str, float] = {}
+    first, second = (Losses(LOGGER, name, clock, shared) for name in ("lab (3d)", "lab (analog)"))
+    with caplog.at_level(logging.INFO):
+        first.lost("skipped", "frames are late")
+        clock.now_s += 1
+        second.lost("skipped", "frames are late")
+        assert caplog.messages == ["lab (3d): frames are late"]
+        clock.now_s += 60
+        first.check()
+        second.check()
+    assert [message.partition(":")[0] for message in caplog.messages[1:]] == ["lab (3d)", "lab (analog)"]
+
+
 def test_messages_and_frames_are_counted_by_cause(losses: Losses) -> None:
     losses.lost("skipped", "late", messages=2)
     losses.lost("skipped", "late", messages=3)
@@ -76,7 +93,7 @@ def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
     losses.check()
     losses.check()
     assert logged(caplog) == [
-        "INFO lab: lost within 2.5 s: 1250 messages of 250 frames (no router); nothing lost for 5 s"
+        "INFO lab: lost within 2.5 s: 1250 messages of 250 frames (no router); no more in the 5 s since then"
     ]
 
 
@@ -91,7 +108,7 @@ def test_the_next_period_has_a_total_of_its_own(
         if number == 1:
             losses.check()
     losses.lost("no router", "start zenohd", frames=0)
-    begin, end = "WARNING lab: start zenohd", "(no router); nothing lost for 5 s"
+    begin, end = "WARNING lab: start zenohd", "(no router); no more in the 5 s since then"
     first, second = (f"INFO lab: lost within 0.0 s: {number} {end}" for number in ("1 message", "2 messages"))
     assert logged(caplog) == [begin, first, begin, second, begin]
     assert amounts(losses.report()) == {"no router": (4, 0)}

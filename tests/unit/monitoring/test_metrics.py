@@ -1,5 +1,6 @@
 """Metrics of counters with known values, parsed by Prometheus' own parser."""
 
+import logging
 import math
 from collections.abc import Iterator
 
@@ -12,6 +13,7 @@ from gateway import __version__
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
+from gateway.log import DefectLog
 from gateway.messages.host_time import HostClock, host_clock
 from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
@@ -97,6 +99,18 @@ async def test_every_stream_has_its_counters(lab: Lab) -> None:
     assert lab.value("frames_received_total", **ANALOG) == 70
     assert lab.value("lag_seconds", **MARKERS) == 0.125
     assert list(lab.samples("last_frame_timestamp_seconds")) == [(MARKERS, 1_700_000_000.25)]
+
+
+async def test_alerts_learn_of_defects_and_of_nobody_who_subscribes(lab: Lab) -> None:
+    before = lab.value("defects_total")
+    for _ in range(2):
+        DefectLog(logging.getLogger(), "lab").log(KeyError("x"))
+    assert lab.value("defects_total") == before + 2
+    assert lab.value("source_subscribed", source="lab") == 0
+    output, _ = lab.source.fan_out.outputs[0]
+    assert isinstance(output, ToyOutput)
+    output.wanted.add("3d")
+    assert lab.value("source_subscribed", source="lab") == 1
 
 
 async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:

@@ -110,7 +110,7 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
     assert first == "lab (3d): frames arrive 300 ms late; asked the server for FrequencyDivisor:2"
     assert second.endswith("asked the server for FrequencyDivisor:4 (failure 2 in a row)")
     assert third == "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2"
-    assert last.startswith("lab (3d): frames arrive in time; asked the server for AllFrames, after ")
+    assert last.startswith("lab (3d): frames arrive in time again; asked the server for AllFrames, after ")
 
 
 async def test_a_reduced_rate_is_requested_again_with_other_components() -> None:
@@ -137,7 +137,7 @@ async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCapt
     assert [record.levelname for record in records(caplog)] == ["WARNING", "INFO"]
     late, in_time = [record.getMessage() for record in records(caplog)]
     assert late == "lab (3d): frames arrive 300 ms late"
-    assert in_time.startswith("lab (3d): frames arrive in time, after ")
+    assert in_time.startswith("lab (3d): frames arrive in time again, after ")
 
 
 async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:

@@ -7,6 +7,7 @@ import pytest
 from gateway.errors import ClosedError, LinkError, PacketError
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
 from tests.losses import amounts
 from tests.servers import error, markers_frame, packet
 from tests.unit.stream.scripted_server import obliging, refusing
@@ -130,3 +131,24 @@ async def test_a_server_that_refuses_every_form_ends_the_handshake_with_what_to_
     text = "refuses StreamFrames in every form that the protocol has; check its real-time output settings"
     assert str(caught.value) == f"{SERVER} {text}"
     assert (lab.status.state, lab.status.tries) == (StreamState.HANDSHAKING, 1)
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "reason"),
+    [
+        (None, "check the load of the server's computer and of this one"),
+        (0.02, "those before arrived in time, so this gateway read them"),
+        (3.2, "those before arrived 3.2 s late, because this gateway or the network was held up"),
+    ],
+)
+def test_a_gap_says_whether_anybody_read_the_frames_before_it(
+    lag_s: float | None, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The log asked the reader whether the server was too busy or the gateway did not read."""
+    status = StreamStatus("3d", name="lab (3d)")
+    for number in range(1000 if lag_s is not None else 0):
+        status.clock.observe(10_000 * number, number, 10_000 * number)
+    status.lag_measured(lag_s or 0.0)
+    status.frames_unsent(100, 100)
+    [text] = [message for message in caplog.messages if "did not send" in message]
+    assert text.startswith(f"lab (3d): the server did not send 100 of the frames that it numbered; {reason}")
