@@ -21,6 +21,9 @@ _TEXT_INTERVAL_S: Final = 1.0
 _WIDTH_PX: Final = 410
 """The tables need it."""
 
+_MIN_WINDOW_PX: Final = 720
+"""In a narrower window, the panel is closed at first. On phones, viser has a sheet instead: see style.py."""
+
 
 class Panel:
     """The tabs of the panel, and above them a banner that says whether the picture is live.
@@ -43,6 +46,7 @@ class Panel:
         self._shown_latency = ShownLatency()
         self._stopped: tuple[bool, ...] = ()
         server.gui.main_panel.set_width(_WIDTH_PX)
+        server.on_client_connect(_close_in_narrow_window)
         server.gui.add_html(STYLE, order=-2)
         self._banner = server.gui.add_html("", order=-1)
         with tabs.add_tab("Sources"):
@@ -127,6 +131,11 @@ class _Turn:
         if self._due_s <= now_s:  # nobody looked, or the computer was busy
             self._due_s = now_s + self._interval_s
         self._show(sources)
+
+
+def _close_in_narrow_window(client: viser.ClientHandle) -> None:
+    if client.camera.image_width < _MIN_WINDOW_PX:
+        client.gui.main_panel.minimize()
 
 
 def _block(*parts: str) -> str:

@@ -29,6 +29,7 @@ class Scene:
         self._parameters: list[Parameters] = []
         self._first_s: float | None = None
         """When the first data were shown."""
+        self._has_plates = False
         self._has_subject = False
         """Whether markers or tools have been shown, and not only plates."""
         self._fitted: set[int] = set()
@@ -50,7 +51,8 @@ class Scene:
             self._sources[source.channels].update(
                 source, self._world.up, self._switches, now_s, is_alone=len(sources) == 1
             )
-        self._world.show_scale(forces=any(scene.has_plates for scene in self._sources.values()))
+        self._has_plates = any(scene.has_plates for scene in self._sources.values())
+        self._world.show_scale(forces=self._has_plates)
         self._fit(clients, now_s)
 
     def pause(self) -> None:
@@ -82,6 +84,8 @@ class Scene:
         if not waiting:
             return
         points = [part for scene in self._sources.values() if scene.is_visible for part in scene.points]
+        if points and self._has_plates:
+            points.append(self._world.mark)  # it says the scale of the arrows
         sphere = sphere_around(points)
         if sphere is None:
             return

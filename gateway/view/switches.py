@@ -1,13 +1,19 @@
 """The tab "Scene" of the panel: what is shown, and how."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import viser
 
+from gateway.descriptions.plate_forces import METRES_PER_NEWTON
 from gateway.view.axes import UP_AXES, UpAxis
 from gateway.view.colors import SourceColor
 from gateway.view.server import set_theme
+
+_LEGEND: Final = (
+    f"<div class=gateway>Yellow arrows are forces: 1 m for {1 / METRES_PER_NEWTON:.0f} N. Axes are tools: "
+    "red x, green y, blue z. What is grey is not live.</div>"
+)
 
 
 class Switches:
@@ -29,6 +35,7 @@ class Switches:
             )
             themes = server.gui.add_button_group("Background", ("dark", "light"))
             self._group = server.gui.add_folder("Sources")
+            server.gui.add_html(_LEGEND)
         self.has_chosen_up = False
         """Whether somebody has chosen the axis that points up."""
 

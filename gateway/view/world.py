@@ -2,9 +2,11 @@
 
 from typing import Final
 
+import numpy as np
 import viser
 
 from gateway.descriptions.plate_forces import METRES_PER_NEWTON
+from gateway.takes.component_rows import Array
 from gateway.view.axes import PLANES, UP_AXES, UpAxis, on_floor
 from gateway.view.colors import GREY
 
@@ -38,6 +40,11 @@ class World:
         for axis, grid in self._grids.items():
             grid.visible = axis == up
         self._unit.position = on_floor(up, 1.0, 0.0)
+
+    @property
+    def mark(self) -> Array:
+        """Where the mark for 1 m is, shape (1, 3)."""
+        return np.array([self._unit.position])
 
     def show_scale(self, *, forces: bool) -> None:
         """Say at the mark for 1 m how much force an arrow of this length is, if there are ``forces``."""

@@ -138,6 +138,14 @@ def test_the_page_says_that_it_gets_nothing_any_more(page: Page, shown: Shown) -
     expect(line).to_be_visible(timeout=TIMEOUT_MS)
 
 
+def test_in_a_narrow_window_the_panel_is_closed(shown: Shown, new_page: NewPage) -> None:
+    page = new_page(viewport={"width": 700, "height": 500})
+    page.goto(shown.address)
+    page.wait_for_function("document.querySelector('canvas')?.clientWidth > 600", timeout=TIMEOUT_MS)
+    expect(page.get_by_role("tab", name="Sources")).to_have_count(0, timeout=TIMEOUT_MS)
+    page.wait_for_function("document.querySelector('canvas')?.clientWidth > 600", timeout=TIMEOUT_MS)
+
+
 def test_on_a_phone_the_panel_is_closed_until_somebody_taps_its_title(
     shown: Shown, new_page: NewPage
 ) -> None:

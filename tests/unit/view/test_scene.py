@@ -10,6 +10,7 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
+from gateway.view.camera import Sphere
 from gateway.view.labels import MAX_LABELS
 from gateway.view.markers import GHOST_S
 from gateway.view.scene import Scene
@@ -270,8 +271,8 @@ def test_the_view_is_fitted_to_plates_and_again_when_somebody_comes(
     picture: Picture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A take, or a measurement, may begin after the page was opened."""
-    fitted: list[float] = []
-    monkeypatch.setattr("gateway.view.scene.fit", lambda _client, sphere, _up: fitted.append(sphere.radius))
+    fitted: list[Sphere] = []
+    monkeypatch.setattr("gateway.view.scene.fit", lambda _client, sphere, _up: fitted.append(sphere))
     clients: Any = {1: SimpleNamespace(client_id=1)}
     lab = picture.lab()
     picture.show_parameters(lab, PLATE)
@@ -282,7 +283,8 @@ def test_the_view_is_fitted_to_plates_and_again_when_somebody_comes(
     for _ in range(3):
         picture.now_s += 0.3
         picture.scene.update([lab.source], clients)
-    assert [radius > 1 for radius in fitted] == [False, True]
+    assert [sphere.radius > 1 for sphere in fitted] == [False, True]
+    assert np.linalg.norm(np.subtract(fitted[0].centre, (1, 0, 0))) <= fitted[0].radius  # the scale is seen
 
 
 def test_the_up_axis_is_that_of_the_plates_until_somebody_chooses(picture: Picture) -> None:
