@@ -24,7 +24,7 @@ LONG_RUNNING: Final = (
 )
 """Commands that run until Ctrl-C."""
 
-TIMEOUT_S: Final = 60
+TIMEOUT_S: Final = 120
 
 _NUMBER: Final = r"-?\d+(?:,\d{3})*(?:\.\d+)?"
 _SIZE: Final = rf"{_NUMBER}\s+(?:bytes|[kMG]B)\b"

@@ -28,7 +28,7 @@ SCENE: Final = (
     *("--rate", str(RATE_HZ), "--analog-rate", str(ANALOG_RATE_HZ)),
     *("--markers", "4", "--tools", "2", "--analog", "3", "--plates", "1"),
 )
-TIMEOUT_S: Final = 30.0
+TIMEOUT_S: Final = 120.0
 
 
 class Lab:
