@@ -63,7 +63,7 @@ class Lab:
         source: dict[str, Any] = {"name": "lab", "host": "127.0.0.1", "port": server_port, "streams": STREAMS}
         self.gateway = Gateway(
             make_settings(
-                sources=(SourceSettings(**source, reconnect=reconnect, stall_timeout_s=1.0),),
+                sources=(SourceSettings(**source, reconnect=reconnect, stall_timeout_s=60.0),),
                 zenoh=ZenohSettings(config=zenoh_keys("peer")),
                 lcm=LcmSettings(url="memq://"),
                 metrics=MetricsSettings(port=port),
