@@ -214,7 +214,7 @@ async def test_a_refused_resume_is_repeated_until_the_server_accepts_it() -> Non
     await asyncio.sleep(60)
     lab.server.answer = refusing("StreamFrames AllFrames")
     lab.has_subscribers = True
-    await asyncio.sleep(2)  # two refusals again: they are counted in a row
+    await asyncio.sleep(5)  # three refusals, which are not added to the first two
     lab.server.answer = obliging
     await asyncio.sleep(60)
     assert (lab.status.rate, lab.session.is_open) == ("AllFrames", True)
