@@ -11,13 +11,18 @@ import os
 import pkgutil
 import sys
 import tempfile
+import threading
 from collections.abc import Mapping
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import gateway.cli
 
-_TIMEOUT_S: Final = 60.0
+_TIMEOUT_S: Final = 120.0
+_LOCK: Final = threading.Lock()
+"""Starting a process also reads the status of those that have ended. A status can be read once only."""
+
 _FORKS: Final = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
     [
@@ -38,10 +43,12 @@ def run_command(*arguments: str | Path, environ: Mapping[str, str] | None = None
     variables = {**os.environ, "COLUMNS": "200", **(environ or {})}
     with tempfile.TemporaryDirectory() as folder:
         process = _FORKS.Process(target=_run, args=(list(map(str, arguments)), folder, variables))
-        process.start()
-        process.join(_TIMEOUT_S)
-        if process.exitcode is None:
-            process.kill()
+        with _LOCK:
+            process.start()
+        wait([process.sentinel], _TIMEOUT_S)
+        with _LOCK:
+            if process.exitcode is None:
+                process.kill()
             process.join()
         assert process.exitcode is not None
         texts = [(Path(folder) / name).read_text() for name in ("stdout", "stderr")]

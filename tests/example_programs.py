@@ -138,7 +138,7 @@ def output_until_the_end(process: "subprocess.Popen[str]") -> str:
     """
     assert process.stdout is not None
     text = process.stdout.read()
-    process.wait(30)
+    process.wait(120)
     return text
 
 

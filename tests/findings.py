@@ -67,7 +67,7 @@ async def run_doctor(
 
 def lab(port: int, *streams: StreamSettings, **keys: Any) -> SourceSettings:
     """Return the settings of the source "lab" on this machine; ``keys`` are further settings."""
-    source: dict[str, Any] = {"host": "127.0.0.1", "reply_timeout_s": 0.1, "connect_timeout_s": 5.0}
+    source: dict[str, Any] = {"host": "127.0.0.1", "reply_timeout_s": 60.0, "connect_timeout_s": 60.0}
     source["streams"] = streams or (StreamSettings(),)
     return SourceSettings(name="lab", port=port, **(source | keys))
 

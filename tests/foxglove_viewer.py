@@ -221,7 +221,7 @@ class Viewer:
         [number] = [number for number, channel in self.subscriptions.items() if channel["topic"] == topic]
         self.send({"op": "unsubscribe", "subscriptionIds": [number]})
 
-    async def wait_until(self, condition: Callable[[], object], timeout_s: float = 30) -> None:
+    async def wait_until(self, condition: Callable[[], object], timeout_s: float = 120) -> None:
         """Wait until a condition on what has been received holds."""
         async with asyncio.timeout(timeout_s), self._changed:
             await self._changed.wait_for(lambda: condition() or self.is_closed)

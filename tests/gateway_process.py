@@ -68,12 +68,12 @@ class GatewayProcess:
 
     def wait_for_clock(self) -> None:
         """Wait until the gateway knows the clock of the server."""
-        wait_until(lambda: self.statuses and self.statuses[-1].streams[0].clock.has_clock, 60)
+        wait_until(lambda: self.statuses and self.statuses[-1].streams[0].clock.has_clock)
 
     def wait_for_frames(self, count: int) -> None:
         """Wait for ``count`` further frames."""
         before = len(self.headers["3d"])
-        wait_until(lambda: len(self.headers["3d"]) >= before + count, 40)
+        wait_until(lambda: len(self.headers["3d"]) >= before + count)
 
 
 @contextlib.contextmanager

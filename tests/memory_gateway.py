@@ -39,15 +39,16 @@ class MemoryGateway:
 async def run_gateway(port: int, **settings: Any) -> AsyncIterator[MemoryGateway]:
     """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
 
-    It reconnects at once, and its timeouts are short. ``settings`` replaces settings of the source.
+    It reconnects at once, and waits so long for replies and frames that only a defect ends a connection.
+    ``settings`` replaces settings of the source.
     """
     source: dict[str, Any] = {
         "name": "lab",
         "host": "127.0.0.1",
         "port": port,
         "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-        "reply_timeout_s": 0.3,
-        "stall_timeout_s": 1.0,
+        "reply_timeout_s": 60.0,
+        "stall_timeout_s": 60.0,
     }
     output = MemoryOutput()
     gateway = Gateway(

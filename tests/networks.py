@@ -17,7 +17,7 @@ from tests.needs import need_programs
 _LCM_PORTS: Final = itertools.count(7720)
 _PORTS: Final = itertools.cycle(range(10_000, 32_000))
 """By default, Linux chooses ports from 32768 on."""
-_OPEN_TIMEOUT_S: Final = 30.0
+_OPEN_TIMEOUT_S: Final = 120.0
 _MULTICAST: Final = ("224.0.0.0/4", "dev", "lo")
 
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from tests.gateway_process import PROGRAM
 
-_TIMEOUT_S: Final = 40.0
+_TIMEOUT_S: Final = 120.0
 _LINE: Final = re.compile(rb"\x1b\[(\d+);1H\x1b\[K((?:(?!\x1b\[\d+;1H|\x1b\[\?).)*)", re.DOTALL)
 _STYLE: Final = re.compile(rb"\x1b\[[\d;]*m")
 

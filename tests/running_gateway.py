@@ -7,7 +7,7 @@ from typing import Final
 
 from gateway.gateway import Gateway
 
-_STOP_TIMEOUT_S: Final = 30.0
+_STOP_TIMEOUT_S: Final = 60.0
 
 
 @asynccontextmanager

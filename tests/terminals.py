@@ -27,7 +27,7 @@ LONG_RUNNING: Final = (
 LISTS: Final = ("rtc3d-gateway list", "rtc3d-gateway params", "rtc3d-gateway take list")
 """Commands that print another text where stdout is not a terminal; the pages show that of a terminal."""
 
-TIMEOUT_S: Final = 60
+TIMEOUT_S: Final = 120
 
 _NUMBER: Final = r"-?\d+(?:,\d{3})*(?:\.\d+)?"
 _SIZE: Final = rf"{_NUMBER}\s+(?:bytes|[kMG]B)\b"

@@ -58,7 +58,7 @@ def test_every_command_prints_the_output_on_the_page(
 def test_searching_in_the_network_would_be_seen(scouts: socket.socket) -> None:
     with zenoh.open(zenoh.Config()):
         scouts.setblocking(True)
-        scouts.settimeout(10)
+        scouts.settimeout(60)
         assert scouts.recv(1)
 
 

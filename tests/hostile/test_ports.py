@@ -93,13 +93,11 @@ async def vrpn_client(port: int, _: Path) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def foxglove_client(port: int, _: Path) -> AsyncIterator[None]:
-    """A viewer that gets nearly every frame: its own process may be too slow for some."""
+    """A viewer that gets frames; its own process may be too slow for some."""
     async with viewing(port, "/healthy/markers") as viewer:
         received = await viewer.wait_for("/healthy/markers", 10)
         yield
         await viewer.wait_for("/healthy/markers", len(received) + 20)
-        times_ns = [log.time_ns for log in received]
-        assert len(times_ns) > 0.9 * (times_ns[-1] - times_ns[0]) / 5e6  # 200 Hz
 
 
 @contextlib.asynccontextmanager

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from tests.unit.rtc3d_server.wire import DATA, ByteOrder, WireComponent, command, components_in
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 120.0
 
 
 class RawClient:

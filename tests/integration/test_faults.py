@@ -24,6 +24,7 @@ from tests.waiting import wait_until_async
 _Result = TypeVar("_Result")
 
 MAX_FRAMES_IN_TRANSIT = 20  # when a fault ends
+TIMEOUTS = {"reply_timeout_s": 1.0, "stall_timeout_s": 1.0}  # only they end some faults
 
 
 def scene() -> SyntheticScene:
@@ -50,13 +51,16 @@ async def wait_for_data(lab: MemoryGateway) -> None:
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 async def test_after_each_fault_data_flows_again(kind: str) -> None:
-    async with Simulator(scene(), port=free_port()) as simulator, run_gateway(simulator.port) as lab:
+    async with (
+        Simulator(scene(), port=free_port()) as simulator,
+        run_gateway(simulator.port, **TIMEOUTS) as lab,
+    ):
         await lab.wait_for("3d", 20)
         fault = simulator.faults.begin(KINDS[kind].model_validate({}))
         # Wait until the fault has an effect: it changed something, or the gateway noticed it.
         frames = simulator.frames_sent
         await wait_until_async(
-            lambda: fault.num_happened or lab.status.last_error or simulator.frames_sent > frames + 100, 10
+            lambda: fault.num_happened or lab.status.last_error or simulator.frames_sent > frames + 100
         )
         await simulator.faults.clear()
         await wait_for_data(lab)
@@ -78,12 +82,12 @@ class ManyFaults(RuleBasedStateMachine):
         self._in_loop(self._start())
 
     def _in_loop(self, work: Coroutine[Any, Any, _Result]) -> _Result:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(60)
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(240)
 
     async def _start(self) -> None:
         self.simulator = await self._stack.enter_async_context(Simulator(scene(), port=free_port()))
         self.proxy = await self._stack.enter_async_context(FuzzingProxy(self.simulator.port))
-        self.lab = await self._stack.enter_async_context(run_gateway(self.proxy.port))
+        self.lab = await self._stack.enter_async_context(run_gateway(self.proxy.port, **TIMEOUTS))
         await self.lab.wait_for("3d")
 
     @rule(kind=st.sampled_from(sorted(KINDS)))
@@ -119,7 +123,7 @@ class ManyFaults(RuleBasedStateMachine):
             return self.simulator.frames_sent + self.lab.status.reconnects
 
         enough = progress() + frames
-        self._in_loop(wait_until_async(lambda: progress() >= enough or bool(self.simulator.faults.active), 5))
+        self._in_loop(wait_until_async(lambda: progress() >= enough or bool(self.simulator.faults.active)))
 
     @rule()
     def recover(self) -> None:

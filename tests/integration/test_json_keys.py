@@ -94,7 +94,7 @@ def test_a_subscriber_of_json_alone_starts_a_stream_on_demand(lab: Lab) -> None:
     ("arguments", "shown"),
     [
         ("echo --count 300 --json", [f'"mocap/lab/{key}"' for key in ("3d", "6d", "analog", "force")]),
-        ("echo --hz --seconds 1.5", ["mocap/lab/6d/"]),
+        ("echo --hz --count 300", ["mocap/lab/6d/"]),
         ("echo --component 6d/* --count 50", ["mocap/lab/6d/"]),
         ("list --json", ['"source": "lab"', '"problem": ""']),
         ("params 3d", ["Marker 1"]),
@@ -116,7 +116,7 @@ def test_recordings_have_messages_and_no_json(lab: Lab, tmp_path: Path) -> None:
     """What ``record`` writes, and the gateway's own take of the same time."""
     file = tmp_path / "take.lcmlog"
     assert run("take", "start", "one", "--source", "lab", "--connect", lab.endpoint).returncode == 0
-    done = run("record", str(file), "--seconds", "1", "--source", "lab", "--connect", lab.endpoint)
+    done = run("record", str(file), "--seconds", "3", "--source", "lab", "--connect", lab.endpoint)
     assert run("take", "stop", "--source", "lab", "--connect", lab.endpoint).returncode == 0
     assert done.returncode == 0
     assert "left out" not in done.stdout + done.stderr

@@ -75,7 +75,9 @@ class Gateway:
         before = self.requests_received()
         place = ("nsenter", "--net", "--target", str(self._other_computer)) if from_other else ()
         subprocess.run(
-            [*place, sys.executable, "-c", SEND_REQUESTS, f"{REQUESTS_URL}?ttl={ttl}"], check=True, timeout=20
+            [*place, sys.executable, "-c", SEND_REQUESTS, f"{REQUESTS_URL}?ttl={ttl}"],
+            check=True,
+            timeout=120,
         )
         after = self.requests_received()
         assert before is not None

@@ -28,7 +28,7 @@ SCENE: Final = (
     *("--rate", str(RATE_HZ), "--analog-rate", str(ANALOG_RATE_HZ)),
     *("--markers", "4", "--tools", "2", "--analog", "3", "--plates", "1"),
 )
-TIMEOUT_S: Final = 30.0
+TIMEOUT_S: Final = 120.0
 WAITING_S: Final = 3.0
 """How long no gateway runs: longer than the first searches of liblsl, which come in quick succession."""
 

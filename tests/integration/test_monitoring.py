@@ -39,7 +39,7 @@ from tests.losses import amounts
 from tests.memory_gateway import run_gateway
 from tests.networks import free_port, zenoh_keys
 from tests.running_gateway import running_gateway
-from tests.servers import ScriptedServer, markers_frame, ok
+from tests.servers import ScriptedServer, markers_frame, ok, packet
 from tests.waiting import wait_until_async
 
 ROOT = Path(__file__).parents[2]
@@ -63,7 +63,7 @@ class Lab:
         source: dict[str, Any] = {"name": "lab", "host": "127.0.0.1", "port": server_port, "streams": STREAMS}
         self.gateway = Gateway(
             make_settings(
-                sources=(SourceSettings(**source, reconnect=reconnect, stall_timeout_s=1.0),),
+                sources=(SourceSettings(**source, reconnect=reconnect, stall_timeout_s=60.0),),
                 zenoh=ZenohSettings(config=zenoh_keys("peer")),
                 lcm=LcmSettings(url="memq://"),
                 metrics=MetricsSettings(port=port),
@@ -315,6 +315,8 @@ async def test_frames_that_the_server_numbered_and_did_not_send_are_counted() ->
     numbers = (*range(1, 301), *range(351, 401))
 
     def answer(command: str) -> bytes:
+        if command.startswith("SendParameters"):
+            return packet(2, b"<RT_Parameters Ver='1.00'/>")
         is_stream = command.startswith("StreamFrames") and "Stop" not in command
         frames = (markers_frame(number, (0.0, 0.0, 0.0)) for number in numbers if is_stream)
         return ok(f"OK-{command}") + b"".join(frames)

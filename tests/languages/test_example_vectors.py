@@ -24,7 +24,7 @@ def printed_for(program: ExampleProgram, lines: list[bytes]) -> list[Any]:
     program.build()
     run = subprocess.run(
         [*program.command, "--vectors"], input=b"".join(line + b"\n" for line in lines), cwd=EXAMPLES,
-        capture_output=True, check=False, timeout=60,
+        capture_output=True, check=False, timeout=120,
     )  # fmt: skip
     assert (run.returncode, printed_errors(run)) == (0, b"")
     printed = [json.loads(line, parse_constant=no_json) for line in run.stdout.decode().split("\n")[:-1]]

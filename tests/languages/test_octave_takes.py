@@ -27,7 +27,7 @@ def octave_prints(code: str) -> tuple[str, str]:
     """Run code with read_take.m, and return what Octave prints: results, and warnings."""
     run = subprocess.run(
         ["octave-cli", "--quiet", "--no-init-file", "--path", str(EXAMPLES), "--eval", code],
-        capture_output=True, check=False, timeout=60,
+        capture_output=True, check=False, timeout=120,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     return run.stdout.decode(), printed_errors(run).decode()

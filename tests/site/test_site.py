@@ -16,7 +16,7 @@ pytestmark = pytest.mark.chromium
 
 __all__ = ["chromium", "new_page"]
 
-expect.set_options(timeout=30_000)  # busy machines need longer than the default of 5 s
+expect.set_options(timeout=60_000)  # busy machines need longer than the default of 5 s
 
 PHONE: Final = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
 

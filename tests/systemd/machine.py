@@ -88,7 +88,7 @@ class Machine:
         """Return a property of a unit."""
         return (await self.run("systemctl", "show", "--value", "--property", name, unit)).text.strip()
 
-    async def wait_for(self, name: str, wanted: str, unit: str = UNIT, timeout_s: float = 15) -> str:
+    async def wait_for(self, name: str, wanted: str, unit: str = UNIT, timeout_s: float = 120) -> str:
         """Wait until a property of a unit contains ``wanted``, and return the property."""
         value = ""
         try:

@@ -11,7 +11,6 @@ from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_serve
 from tests.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {
-    "test_automatic_streams.py",
     "test_daemon.py",
     "test_gateway.py",
     "test_gateway_defects.py",

@@ -169,7 +169,10 @@ class Picture:
         colors: list[Array] = []
 
         def is_drawn() -> bool:
-            [[x, y]] = self.page.evaluate(_ON_SCREEN, [node, [position]])
+            places = self.page.evaluate(_ON_SCREEN, [node, [position]])
+            if places is None:  # the page has not drawn the node yet
+                return False
+            [[x, y]] = places
             clip = FloatRect(x=round(x) - 1, y=round(y) - 1, width=3, height=3)
             pixels = Image.open(io.BytesIO(self.page.screenshot(style=_NO_PANEL, clip=clip))).convert("RGB")
             colors.append(np.asarray(pixels).mean(axis=(0, 1)))
@@ -178,4 +181,4 @@ class Picture:
         try:
             self.wait_until(is_drawn)
         except AssertionError:
-            raise AssertionError(f"{position} is drawn as {colors[-1]}") from None
+            raise AssertionError(f"{position} is drawn as {colors[-1:]}") from None

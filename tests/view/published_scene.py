@@ -38,6 +38,8 @@ class PublishedScene:
         """In mm."""
         self.step_mm = 0.0
         """How far all markers move from frame to frame, back and forth, along each axis."""
+        self.is_blinking = False
+        """Whether the last marker is missing in all frames but every tenth."""
         self.is_sending = True
         """Whether frames are published; the status always is."""
         self.endpoint = endpoint
@@ -86,6 +88,8 @@ class PublishedScene:
     def _frame(self, number: int) -> bytes:
         items = np.zeros(len(self.markers), ITEM_DTYPES[ComponentType.MARKERS])
         positions = np.reshape(self.markers, (-1, 3)) + self.step_mm * (number % 2)
+        if self.is_blinking and number % 10:
+            positions[-1] = MISSING
         items["x"], items["y"], items["z"] = positions.T
         now = now_utime()
         prefix = PREFIX.pack(now, now, number, 1, self._version)

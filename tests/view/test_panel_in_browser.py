@@ -24,7 +24,7 @@ __all__ = ["chromium", "new_page"]
 HOSTILE: Final = ("<img src=x onerror=alert(1)>", "[x](http://192.0.2.1)")
 SPIKE: Final = 500.0
 
-TIMEOUT_MS: Final = 40_000
+TIMEOUT_MS: Final = 60_000
 """Chromium that renders in software takes a while on a busy computer."""
 
 _PLOTS: Final = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(plot => plot.chart)"
@@ -127,7 +127,7 @@ def test_a_stop_is_said_with_its_reason_until_data_come_again(page: Page, shown:
     expect(stopped).to_contain_text("no measurement running", timeout=TIMEOUT_MS)
     shown.is_sending = True
     expect(banner).to_contain_text("● live lab", timeout=TIMEOUT_MS)
-    expect(stopped).to_have_count(0)
+    expect(stopped).to_have_count(0, timeout=TIMEOUT_MS)
 
 
 def test_the_page_says_that_it_gets_nothing_any_more(page: Page, shown: Shown) -> None:

@@ -16,7 +16,7 @@ from tests.view.picture import Picture, Position
 from tests.view.published_scene import MISSING, PublishedScene, published_scene
 from tests.view.view_process import ViewProcess, view_process
 
-pytestmark = [pytest.mark.netns, pytest.mark.chromium, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.netns, pytest.mark.chromium, pytest.mark.timeout(600)]
 
 __all__ = ["chromium", "new_page"]
 
@@ -93,8 +93,10 @@ def test_markers_are_drawn_where_they_are(scene: PublishedScene, picture: Pictur
 
 def test_a_missing_marker_is_absent_and_its_last_place_fades(scene: PublishedScene, picture: Picture) -> None:
     picture.wait_for_drawn(MARKERS, TOP, is_blue)
-    scene.markers = [LEFT, RIGHT, MISSING]
+    scene.is_blinking = True  # so that the last place does not fade before a slow browser shows it
     picture.wait_for_points(LAST_PLACES, [TOP])
+    scene.is_blinking = False
+    scene.markers = [LEFT, RIGHT, MISSING]
     picture.wait_for_points(MARKERS, [LEFT, RIGHT])
     picture.wait_for_points(LAST_PLACES, [])
     picture.wait_for_drawn(MARKERS, TOP, is_background)

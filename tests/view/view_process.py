@@ -51,7 +51,7 @@ class ViewProcess:
     def end(self, number: signal.Signals = signal.SIGINT) -> int:
         """Stop it; return its exit status. ``output`` is complete then."""
         self.process.send_signal(number)
-        rest, _ = self.process.communicate(timeout=30)
+        rest, _ = self.process.communicate(timeout=60)
         self.output += rest
         return self.process.returncode
 
@@ -101,7 +101,7 @@ class Viewer:
     def wait_for_updates(self, count: int) -> None:
         """Wait for ``count`` further packages."""
         goal = self.num_received + count
-        wait_until(lambda: self.num_received >= goal, timeout_s=60)
+        wait_until(lambda: self.num_received >= goal)
 
     def leave(self) -> None:
         """Disconnect."""

@@ -96,7 +96,16 @@ REFUSALS: Final = "server refused Version 1.0: err-unknown command; the server r
     ("result", "server", "check", "found", "remedy", "keys"),
     [
         case(FAILING, web_server, "protocol", "is not an RT server; its first bytes are 'HTTP/1.1 4", PORTS),
-        case(FAILING, silent, "protocol", "accepts a connection but sends nothing", "restart the RT server."),
+        case(
+            *(
+                FAILING,
+                silent,
+                "protocol",
+                "accepts a connection but sends nothing",
+                "restart the RT server.",
+            ),
+            reply_timeout_s=0.1,
+        ),
         case(FAILING, disconnecting, "protocol", "the connection to 127.0.0.1:", "accepts one more client"),
         case(
             *(FAILING, replying(parameters(), refused="StreamFrames"), "protocol"),
@@ -153,6 +162,7 @@ REFUSALS: Final = "server refused Version 1.0: err-unknown command; the server r
         case(
             *(FAILING, cut_while_streaming, "frames"),
             *("the server closed the connection while the doctor waited", "takes over the stream"),
+            reply_timeout_s=1.0,
         ),
         case(
             *(FAILING, replying(XML[100], *FRAMES, NO_DATA), "frames"),
@@ -337,7 +347,7 @@ async def test_components_that_share_the_only_connection_are_a_warning() -> None
         else:
             client.cut()
 
-    finding = (await diagnose(serve_one, streams="auto")).of("rate")
+    finding = (await diagnose(serve_one, streams="auto", reply_timeout_s=1.0)).of("rate")
     assert finding.result is WARNING
     assert finding.found == (
         "3d 100 of 100, 6d 100 of 200 Hz, because the server accepts one connection only"

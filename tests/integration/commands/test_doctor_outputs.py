@@ -79,7 +79,7 @@ async def doctor(*arguments: str) -> Completed:
 
 async def test_without_a_failing_check_the_status_is_0() -> None:
     async with Simulator(SyntheticScene(markers=1, tools=0, analog=0, plates=0)) as simulator:
-        done = await doctor("--server", f"127.0.0.1:{simulator.port}", "--json")
+        done = await doctor("--server", f"127.0.0.1:{simulator.port}", "--json", "--seconds", "3")
     report = json.loads(done.stdout)
     assert (done.status, done.stderr, report["ok"]) == (0, "", True)
     assert "red" not in {each["result"] for each in report["findings"]}

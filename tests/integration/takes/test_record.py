@@ -62,7 +62,7 @@ class RecordProcess:
         """Wait for the end of the program, after a signal if given."""
         if number is not None:
             self.process.send_signal(number)
-        stdout, _ = self.process.communicate(timeout=60)
+        stdout, _ = self.process.communicate(timeout=120)
         stderr = self._stderr.read_text()
         assert "Traceback" not in stderr + stdout
         assert "defect" not in stderr
@@ -179,7 +179,7 @@ def test_a_recording_has_what_was_published_with_parameters_first(tmp_path: Path
     renames = ("--fault", "rename,every_s=3,for_s=1.5")
     with lab(tmp_path, side, *renames, parameters_interval_s=0.3) as gateway:
         with recording(path, *gateway.options) as record:
-            wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_PARAMETERS") > 3, 60)
+            wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_PARAMETERS") > 3)
             ended = record.end(signal.SIGTERM)
         assert_same_bytes(path, gateway.published)
     assert ended.status == 0, ended
@@ -253,7 +253,7 @@ def test_the_first_messages_are_recorded_with_the_seconds_given(tmp_path: Path) 
     recorded = by_channel(path)
     assert recorded.keys() == {f"MOCAP_LAB_1_{end}" for end in ("TAKE", "PARAMETERS", "3D", "END")}
     utimes = [prefix_of(message).utime for message in recorded["MOCAP_LAB_1_3D"]]
-    assert 0.5e6 < utimes[-1] - utimes[0] < 30e6  # on a busy computer, the end comes late
+    assert 0 < utimes[-1] - utimes[0] < 30e6  # on a busy computer, the end comes late
 
 
 # A publisher of the test, which can do what a gateway does not -------------------------------
@@ -349,7 +349,7 @@ def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Pu
             shown += os.read(reading, 65536).decode()
         (tmp_path / "walk.lcmlog").unlink()
         process.send_signal(signal.SIGINT)
-        stdout, _ = process.communicate(timeout=30)
+        stdout, _ = process.communicate(timeout=120)
     os.close(terminal)
     os.close(reading)
     assert process.returncode == 1

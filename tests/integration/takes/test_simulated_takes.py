@@ -131,7 +131,7 @@ async def test_a_gateway_follows_parameters_that_change(tmp_path: Path) -> None:
     path = write_take(tmp_path / "lab.lcmlog", messages)
     async with (
         Simulator(TakeScene(path), once=True) as simulator,
-        run_gateway(simulator.port, stall_timeout_s=30.0, reply_timeout_s=30.0) as lab,
+        run_gateway(simulator.port) as lab,
     ):
         found = await lab.wait_for("3d", 300)
         [source] = lab.gateway.sources

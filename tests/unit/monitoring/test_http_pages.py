@@ -37,7 +37,7 @@ class Site:
         reader, writer = await self.connect()
         try:
             writer.write(request)
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(120):
                 return await reader.read()
         except ConnectionError:
             return b""
@@ -165,7 +165,7 @@ async def test_closing_disconnects_clients_and_frees_the_port(site: Site) -> Non
     reader, writer = await site.connect()
     await wait_until_async(lambda: site.pages._connections)
     await site.pages.close()
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(120):
         assert await reader.read() == b""
     writer.close()
     await again.start(["127.0.0.1"], site.port)

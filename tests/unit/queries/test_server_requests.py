@@ -92,13 +92,15 @@ async def test_losing_the_connection_while_waiting_for_another_request_is_an_err
 
 
 async def test_without_a_connection_the_error_has_the_address_or_reason_age_and_remedy() -> None:
-    source = FakeSource()
+    source = FakeSource(two_streams=True)
     source.server.is_connected = False
     error = await source.parameters_error()
     assert error.code == "no-connection"
     assert str(error) == "source 'lab' has no connection yet: connecting to 192.0.2.1:3020"
     source.status.record_error("connection refused by 192.0.2.1:3020; is the RT server running?")
     source.status.last_error_s -= 300
+    source.second_status.record_error("an older error")
+    source.second_status.last_error_s -= 400
     problem, _, remedy = str(await source.parameters_error(stale_ok=True)).partition("; ")
     assert re.fullmatch(
         r"source 'lab' has no connection: refused by 192.0.2.1:3020, tried 3..\.. s ago", problem

@@ -133,14 +133,23 @@ def test_an_event_loop_whose_timers_are_late_keeps_the_pace(late_ms: int) -> Non
     assert subscriber.times_ms[-1] < 1000, "slower than the stream itself"
 
 
-def test_a_second_stop_does_not_lead_to_a_burst() -> None:
+@pytest.mark.parametrize(("costs_s", "at_once"), [(0.0, 32), (MS, 16)])
+def test_a_second_stop_does_not_lead_to_a_burst(costs_s: float, at_once: int) -> None:
     subscriber = Subscriber()
+    subscriber.costs_s = costs_s
     subscriber.arrive(frames(1000))
     subscriber.backlog.publish_due()
     subscriber.now_s += 5.0
     before = len(subscriber.published)
     subscriber.backlog.publish_due()
-    assert len(subscriber.published) - before <= 32
+    assert len(subscriber.published) - before <= at_once
+
+
+def test_a_restart_within_a_backlog_does_not_lead_to_a_burst() -> None:
+    subscriber = Subscriber()
+    subscriber.arrive([frame(1_000_000), *frames(200)])
+    subscriber.run()
+    assert subscriber.times_ms[-1] == pytest.approx(100, abs=2)
 
 
 @pytest.mark.parametrize(

@@ -210,6 +210,13 @@ async def test_a_refused_resume_is_repeated_until_the_server_accepts_it() -> Non
     lab.server.answer = obliging
     await asyncio.sleep(60)
     assert requests(lab) == [STOP, START, START, START]
+    lab.has_subscribers = False
+    await asyncio.sleep(60)
+    lab.server.answer = refusing("StreamFrames AllFrames")
+    lab.has_subscribers = True
+    await asyncio.sleep(5)  # three refusals, which are not added to the first two
+    lab.server.answer = obliging
+    await asyncio.sleep(60)
     assert (lab.status.rate, lab.session.is_open) == ("AllFrames", True)
     lab.changes.cancel()
 

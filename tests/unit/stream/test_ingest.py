@@ -144,12 +144,12 @@ def test_while_late_the_newest_of_each_component_is_published() -> None:
     late = [
         frame_of(600, (MARKERS, 600), (TOOLS, 600)),
         frame_of(601, (MARKERS, 601), (TOOLS, 601)),
-        frame_of(602, (MARKERS, 602)),
+        frame_of(602, (FORCE, 602)),
         frame_of(603, (MARKERS, 603)),
     ]
     lab.receive(*late, late_us=200_000)
-    assert lab.published == [(601, ["6d"]), (603, ["3d"])]
-    assert amounts(lab.status.losses.report()) == {"skipped while behind": (4, 3)}
+    assert lab.published == [(601, ["6d"]), (602, ["force"]), (603, ["3d"])]
+    assert amounts(lab.status.losses.report()) == {"skipped while behind": (3, 2)}
 
 
 def test_without_a_clock_a_long_batch_is_late() -> None:

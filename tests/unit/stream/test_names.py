@@ -64,6 +64,15 @@ def test_a_late_answer_serves_the_next_attempt_and_no_other(resolver: Resolver) 
     uvloop.run(attempts())
 
 
+def test_attempts_at_the_same_time_share_the_answer(resolver: Resolver) -> None:
+    async def attempts() -> None:
+        first, second = await asyncio.gather(look_up("two"), look_up("two"))
+        assert first == second == ["127.0.0.1"]
+        assert resolver.names == ["two"]
+
+    uvloop.run(attempts())
+
+
 def test_an_error_is_not_kept(resolver: Resolver) -> None:
     async def attempts() -> None:
         resolver.error = socket.gaierror(socket.EAI_NONAME, "no")

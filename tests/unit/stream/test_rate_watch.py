@@ -35,6 +35,7 @@ class Lab:
         rate: Rate | None = None,
         has_clock: bool = True,
         is_full_rate: bool = True,
+        reports_sharing: bool = True,
         announced: Mapping[ComponentType, float] = ANNOUNCED,
     ) -> None:
         self.stream = StreamSettings(components=components or (MARKERS, TOOLS), rate=rate or AllFrames())
@@ -42,6 +43,7 @@ class Lab:
         self.watch = RateWatch(self.status)
         self.announced = dict(announced)
         self.is_full_rate = is_full_rate
+        self.reports_sharing = reports_sharing
         self.has_clock = has_clock
         self.now_s = 1000.0
         self.timestamp_us = 0.0
@@ -77,7 +79,7 @@ class Lab:
             arrivals,
             self.now_s,
             is_full_rate=self.is_full_rate,
-            reports_sharing=True,
+            reports_sharing=self.reports_sharing,
         )
 
     def seconds(self, counts: Iterable[int]) -> list[str]:
@@ -92,6 +94,22 @@ def test_frames_that_are_too_slow_are_reported_once(caplog: pytest.LogCaptureFix
     assert [record.message for record in caplog.records if record.levelno == logging.WARNING] == [
         f"lab (3d 6d): {SLOW}"
     ]
+
+
+def test_a_measurement_waits_for_enough_frames_of_the_followed_component() -> None:
+    """Its time stamps are the measure: 20 of them are there after 20 s."""
+    lab = Lab()
+    for _ in range(60):
+        lab.second(100, followed=1)
+    assert lab.status.limitations == []
+    lab.second(100, followed=1)
+    assert lab.status.limitations == [SLOW]
+
+
+def test_a_component_that_shares_a_stream_is_not_reported_twice() -> None:
+    """The plan of ``streams: auto`` says it already."""
+    lab = Lab(MARKERS, ANALOG, announced=ANNOUNCED | {ANALOG: 2000.0}, reports_sharing=False)
+    assert lab.seconds([200] * 60) == []
 
 
 HZ_60 = Frequency(60.0)

@@ -203,6 +203,16 @@ async def test_silence_after_a_stop_is_not_checked_by_a_request_for_frames() -> 
         assert lab.commands[3:] == ["StreamFrames Stop"] * 4
 
 
+async def test_silence_after_a_resume_is_not_checked_by_a_stop() -> None:
+    answer = no_measurement(silent_to("Version", "SendParameters"))
+    lab = await started(answer)
+    await lab.control.stop()
+    await lab.control.request(0)
+    async with lab.monitored(by_control=True):
+        await asyncio.sleep(10)
+        assert lab.commands[3:] == ["StreamFrames Stop", *[NAMED] * 4]
+
+
 async def test_a_server_that_no_longer_answers_is_not_alive() -> None:
     lab = await started(no_measurement())
     lab.server.answer = silent_to("")
@@ -250,6 +260,10 @@ async def test_frames_that_come_after_the_second_request_are_streaming() -> None
         assert lab.status.state is StreamState.STREAMING
         await asyncio.sleep(2.9)
         assert not monitoring.done()
+        await lab.control.stop()
+        await lab.control.request(0)  # which is repeated once more if no frames come
+        await asyncio.sleep(3.5)
+        assert (monitoring.done(), lab.commands[-3:]) == (False, ["StreamFrames Stop", NAMED, NAMED])
 
 
 async def test_a_second_request_that_is_refused_ends_the_connection() -> None:

@@ -124,6 +124,7 @@ def test_delays_double_up_to_the_maximum_and_are_shortened_at_random() -> None:
     for delays_s in runs:
         assert_delays(delays_s, [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10])
     assert len({run[0] for run in runs}) > 1
+    assert_delays([Backoff(reconnect).delay_after(STEADY_S, had_data=True)], [0.2])
 
 
 async def test_delays_grow_while_the_server_is_away(caplog: pytest.LogCaptureFixture) -> None:

@@ -24,7 +24,7 @@ from gateway.outputs.lsl.wire import Kind, Message, Report
 from tests.lsl_receiver import lsl_config
 from tests.waiting import wait_until
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 120.0
 CANNOT_OPEN = Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]')
 
 _GATEWAY = """

@@ -101,6 +101,15 @@ async def test_equal_queries_share_an_answer_until_there_is_one() -> None:
         assert (await query(lab.peer, "mocap/lab/status?a=1;b=2")).payload == b"2"
 
 
+async def test_at_the_end_peers_see_at_once_that_no_answer_follows() -> None:
+    async with open_lab() as lab, asyncio.timeout(60):
+        lab.service.may_answer.clear()
+        waiting = asyncio.create_task(query_all(lab.peer, "mocap/lab/status"))
+        await wait_until_async(lambda: lab.service.num_calls == 1)
+        await lab.output.stop_queries()
+        assert await waiting == []
+
+
 async def test_more_different_questions_than_are_answered_at_a_time_wait(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

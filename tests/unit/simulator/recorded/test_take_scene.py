@@ -39,7 +39,7 @@ class Player:
         self.frames: RecordedFrames = self.scene.frames(MARKERS, 24)
 
     def until(self, elapsed_us: int, condition: Callable[[], bool]) -> None:
-        deadline_s = time.monotonic() + 20
+        deadline_s = time.monotonic() + 120
         while not condition():
             assert time.monotonic() < deadline_s
             self.scene.advance(elapsed_us)

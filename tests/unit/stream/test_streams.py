@@ -16,6 +16,8 @@ from tests.unit.stream.scripted_server import Connection, ScriptedServer
 from tests.unit.test_source import HOST, Lab
 from tests.virtual_time import settle, until
 
+pytestmark = pytest.mark.interpreted  # gateway.source gets another Supervisor
+
 EVERYTHING = "3d 6d analog force event"
 TWO = ["3d 6d force event", "analog"]
 ONE_CONNECTION = "analog arrives at 200 Hz instead of 2000 Hz: "
