@@ -23,6 +23,11 @@ _REMEDIES: Final = {
 logger = logging.getLogger(__name__)
 
 
+def is_full(error: OSError) -> bool:
+    """Return whether room on the disk would help."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
 class Disk:
     """Remembers and logs the present problem of the disk. Called in the thread that writes."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.losses import Losses
-from gateway.outputs.takes.disk import RETRY_S, Disk
+from gateway.outputs.takes.disk import RETRY_S, Disk, is_full
 from gateway.outputs.takes.header import FileHeader
 from gateway.takes.recording import LogFile, utime_of
 
@@ -53,6 +53,14 @@ class LogSink(ABC):
     def log_for(self, utime: int) -> LogFile:
         """Return the log for messages from ``utime`` on, in µs since the Unix epoch. Raises OSError."""
 
+    def make_room(self) -> bool:
+        """Delete what is less important, because the disk is full. Return False if there is nothing."""
+        return False
+
+    def _waits_for(self, error: OSError) -> bool:  # noqa: ARG002 - for those that override it
+        """Return whether to write again what the disk did not accept, or to lose it at once."""
+        return True
+
     def give_up(self) -> None:
         """Lose what the disk does not accept at once from now on. Any thread may call it."""
         self._gives_up.set()
@@ -73,8 +81,10 @@ class LogSink(ABC):
                 log = self.log_for(utime_of(rest[0][1]))
                 rest = rest[log.append(rest) :]
             except OSError as error:
+                if is_full(error) and self.make_room():
+                    continue
                 self.disk.failed(self.path, error)
-                if self._gives_up.wait(RETRY_S):
+                if not self._waits_for(error) or self._gives_up.wait(RETRY_S):
                     self.lose(rest)
                     break
             else:

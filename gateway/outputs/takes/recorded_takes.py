@@ -85,11 +85,17 @@ class RecordedTakes:
             header=self._header(recording),
             disk=self.disk,
             losses=recording.losses,
+            make_room=self._make_room,
         )
         recording.take = take
         created = recorder.call(take.create)  # first, because what is recorded from now on follows it
-        recording.add(recorder, take, self.settings.components)
+        recording.add(recorder, take, self.settings.components, is_first=True)
         return self._begun(recorder, recording, take, created)
+
+    def _make_room(self) -> bool:
+        """Delete rolling segments, the oldest of each source, in the thread that writes."""
+        rolling = [each.segments for each in [*self._recordings.values()] if each.segments is not None]
+        return any([segments.make_room() for segments in rolling])  # noqa: C419 - of every source
 
     async def _begun(
         self, recorder: Recorder, recording: SourceRecording, take: TakeFile, created: Future[None]

@@ -14,7 +14,7 @@ from typing import Final
 
 from gateway.errors import QueryError
 from gateway.losses import Losses
-from gateway.outputs.takes.disk import Disk
+from gateway.outputs.takes.disk import Disk, is_full
 from gateway.outputs.takes.header import FileHeader
 from gateway.outputs.takes.log_sink import LogSink
 from gateway.takes.names import default_name, numbered
@@ -85,6 +85,7 @@ class RollingSegments(LogSink):
         self._log_began_s = 0.0
         self._num_segments = 0  # so far: no name is used twice
         self._saves: list[Save] = []
+        self._written_s = 0.0  # when something was written before a problem of the disk
 
     @property
     def path(self) -> Path:
@@ -92,10 +93,11 @@ class RollingSegments(LogSink):
         return self._folder
 
     def kept_s(self) -> float:
-        """Return how many seconds of the past could be saved now."""
+        """Return how many seconds of the past could be saved now; a problem of the disk ends them."""
+        end_s = self._written_s if self.disk.problem else self._monotonic()
         with contextlib.suppress(IndexError):  # the thread may take the last one
-            return self._monotonic() - self._segments[0].begin_s
-        return 0.0 if self._log is None else self._monotonic() - self._log_began_s
+            return end_s - self._segments[0].begin_s
+        return 0.0 if self._log is None else end_s - self._log_began_s
 
     def keep(self, keep_s: float) -> None:
         """Keep another number of seconds from now on."""
@@ -118,7 +120,21 @@ class RollingSegments(LogSink):
             self._log_began_s = now_s
             for save in [*self._saves]:
                 self._add_to_save(save)
+        if not self.disk.problem:
+            self._written_s = now_s
         return self._log
+
+    def make_room(self) -> bool:
+        """See LogSink: delete what has expired, otherwise the oldest segment."""
+        num_segments = len(self._segments)
+        self._delete_expired()
+        if self._segments and len(self._segments) == num_segments:
+            self._delete_oldest()
+        return bool(num_segments)
+
+    def _waits_for(self, error: OSError) -> bool:
+        """Do not wait for room: what waits would hold up the running takes, and take their room later."""
+        return not is_full(error)
 
     def _new_log(self, utime: int) -> LogFile:
         for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing

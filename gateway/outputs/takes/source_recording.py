@@ -112,13 +112,20 @@ class SourceRecording:
         ]
         publisher.set_targets(self._recorder, targets)
 
-    def add(self, recorder: Recorder, sink: LogSink, components: Collection[ComponentType]) -> None:
-        """Record everything from now on in ``sink``, too."""
+    def add(
+        self,
+        recorder: Recorder,
+        sink: LogSink,
+        components: Collection[ComponentType],
+        *,
+        is_first: bool = False,
+    ) -> None:
+        """Record everything from now on in ``sink``, too, and before the others if it ``is_first``."""
         self._recorder = recorder
         files = _Files(sink, components)
         for publisher in self._publishers:
             files.add(publisher)
-        self._files.append(files)
+        self._files.insert(0 if is_first else len(self._files), files)
         self._update()
 
     def remove(self, sink: LogSink) -> None:

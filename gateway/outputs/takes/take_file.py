@@ -1,6 +1,7 @@
 """The file of a take that was started and is not stopped yet."""
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 from gateway.errors import QueryError
@@ -18,7 +19,8 @@ logger = logging.getLogger(__name__)
 class TakeFile(LogSink):
     """The running take of a source. Its file exists from ``create`` on; what is written before is ignored.
 
-    If ``has_free_name``, a number is added to ``name`` if there is such a take already.
+    If ``has_free_name``, a number is added to ``name`` if there is such a take already. On a full disk,
+    ``make_room`` deletes what is less important; it returns False if there is nothing.
     """
 
     def __init__(
@@ -31,8 +33,10 @@ class TakeFile(LogSink):
         header: FileHeader,
         disk: Disk,
         losses: Losses,
+        make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         super().__init__(header, disk, losses)
+        self._make_room = make_room
         self.name = name
         """The name of the take; final after ``create``."""
         self.utime = utime
@@ -63,6 +67,10 @@ class TakeFile(LogSink):
             number += 1
             self.name = numbered(name, number)
         self._log = self.header.begin_log(self.path, self.name, self.utime)
+
+    def make_room(self) -> bool:
+        """See LogSink."""
+        return self._make_room()
 
     def cancel(self) -> None:
         """Do not create the file, because nobody waits for it any more. Any thread may call it."""

@@ -1,7 +1,9 @@
 """The last seconds, kept in segments and saved by links; the clock is the test's, so hours take no time."""
 
+import errno
 import logging
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -16,6 +18,8 @@ from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
+from gateway.takes.recording import LogFile
+from tests.recording_output import frames, still_lab
 from tests.settable_clock import Clock
 
 CHANNEL = b"MOCAP_LAB_3D"
@@ -286,3 +290,70 @@ def test_nothing_can_be_saved_before_the_first_message(rolling: Rolling) -> None
     assert caught.value.code == "nothing-yet"
     rolling.write(3)
     assert rolling.segments.kept_s() == 3.0
+
+
+# A full disk ---------------------------------------------------------------------------------
+
+
+class SmallDisk:
+    """Lets all logs below a folder together have ``num_bytes``."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.num_bytes = 10**9
+
+        def append(log: LogFile, messages: Sequence[tuple[bytes, bytes]]) -> int:
+            used = sum(path.stat().st_size for path in folder.rglob("*.lcmlog"))
+            if used + sum(28 + len(channel) + len(message) for channel, message in messages) > self.num_bytes:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return original(log, messages)
+
+        original = LogFile.append
+        monkeypatch.setattr(LogFile, "append", append)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SmallDisk:
+    return SmallDisk(tmp_path, monkeypatch)
+
+
+def test_on_a_full_disk_the_oldest_segments_make_room_for_new_ones(
+    rolling: Rolling, small_disk: SmallDisk
+) -> None:
+    rolling.write(35)
+    small_disk.num_bytes = sum(path.stat().st_size for path in rolling.files)
+    rolling.write(40)
+    kept = [number for path in rolling.files for number in numbers(path)]
+    assert kept == list(range(kept[0], 75))
+    assert (rolling.segments.num_lost, rolling.disk.problem) == (0, "")
+    assert 15 <= rolling.segments.kept_s() <= 35
+
+
+def test_without_any_segment_to_delete_new_messages_are_lost_at_once_and_counted(
+    rolling: Rolling, small_disk: SmallDisk
+) -> None:
+    """If they waited, they would hold up running takes, and take the room that is made later."""
+    rolling.write(5)
+    small_disk.num_bytes = 0
+    rolling.write(40)
+    assert rolling.segments.num_lost == 41  # with the message whose place the end of the segment should take
+    assert "No space left on device" in rolling.disk.problem
+    assert rolling.segments.kept_s() == 0  # the only segment is deleted, in vain
+    small_disk.num_bytes = 10**9
+    rolling.write(3)
+    assert rolling.disk.problem == ""
+    assert [number for path in rolling.files for number in numbers(path)] == [45, 46, 47]
+
+
+async def test_a_running_take_gets_the_room_of_the_segments(tmp_path: Path, small_disk: SmallDisk) -> None:
+    clock = Clock()
+    async with still_lab(tmp_path, clock, keep_last_s=60) as lab:
+        for _ in range(5):
+            lab.publish(size=10_000)
+            await lab.takes.written()
+            clock.now_s += 11
+        await lab.takes.start("lab", "walk")
+        small_disk.num_bytes = sum(path.stat().st_size for path in lab.directory.rglob("*.lcmlog"))
+        published = [lab.publish(size=2000) for _ in range(8)]
+        stopped = await lab.takes.stop("lab")
+        assert frames(lab.path("walk.lcmlog")) == published
+        assert (stopped.num_lost, stopped.is_cut_off) == (0, False)
