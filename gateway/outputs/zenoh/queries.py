@@ -135,7 +135,7 @@ class ZenohQueries:
             if status.matching:
                 self._call_in_loop(self._publish_soon, source)
 
-        queryable = session.declare_queryable(f"{key}/**", on_query)
+        queryable = session.declare_queryable(f"{key}/**", in_zenoh_thread(on_query))
         publisher = _parameters_publisher(session, f"{key}/parameters")
         # An AdvancedPublisher does not report its subscribers, so a plain publisher on the same key does.
         # Otherwise plain subscribers that connect late would have to wait for the next change.
