@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import threading
 import time
 from collections import deque
@@ -13,6 +14,36 @@ _IDLE_S: Final = 1.0
 """The thread ends when it has had nothing to do for this long. The next call starts another one."""
 
 _Result = TypeVar("_Result")
+
+
+class ThreadStarts:
+    """Whether the system lets the process start threads."""
+
+    def __init__(self) -> None:
+        self.num_failed = 0
+        """How many threads could not be started since the process began."""
+        self.is_failing = False
+        """Whether that is so now, as far as is known."""
+
+    def start(self, thread: threading.Thread) -> None:
+        """Start a thread. Raises RuntimeError if the system does not allow it."""
+        try:
+            thread.start()
+        except RuntimeError:
+            self.num_failed += 1
+            self.is_failing = True
+            raise
+        self.is_failing = False
+
+    def check(self) -> None:
+        """If the last start failed, try again with a thread that does nothing."""
+        if self.is_failing:
+            with contextlib.suppress(RuntimeError):
+                self.start(threading.Thread(target=lambda: None, name="test", daemon=True))
+
+
+thread_starts: Final = ThreadStarts()
+"""The threads of this process start here, so that its health can say when one could not."""
 
 
 class WorkerThread:
@@ -31,16 +62,26 @@ class WorkerThread:
         self._began_s: float | None = None  # the present call, on the monotonic clock
 
     def submit(self, call: Callable[[], _Result]) -> Future[_Result]:
-        """Queue ``call``; the returned future has its result or exception. It can be cancelled before."""
+        """Queue ``call``; the returned future has its result or exception. It can be cancelled before.
+
+        The exception is an OSError if no thread can be started.
+        """
         done: Future[_Result] = Future()
         with self._changed:
             self._calls.append((done, call))
             if self._is_running:
                 self._changed.notify()
             else:
-                threading.Thread(target=self._run, name=self._name, daemon=True).start()
-                self._is_running = True
+                self._start()
         return done
+
+    def _start(self) -> None:
+        try:
+            thread_starts.start(threading.Thread(target=self._run, name=self._name, daemon=True))
+            self._is_running = True
+        except RuntimeError as error:
+            done, _ = self._calls.pop()
+            done.set_exception(OSError(errno.EAGAIN, str(error)))
 
     async def run(self, call: Callable[[], _Result]) -> _Result:
         """Return the result of ``call``, or raise its exception."""

@@ -1,14 +1,17 @@
-"""What the system may refuse to the whole process: further open files, which connections are, too."""
+"""What the system may refuse to the whole process: further threads, and open files, as connections are."""
 
 import contextlib
 import errno
 import logging
 import os
 import resource
+import threading
+from pathlib import Path
 from typing import Final
 
 from gateway.errors import FILES_ADVICE, NO_FILES
 from gateway.log import HOLD_S, FailureLog
+from gateway.worker_thread import thread_starts
 
 MAX_FILES: Final = 65_536
 """How many files the gateway wants to open at most: more than the clients that its outputs accept."""
@@ -32,16 +35,22 @@ class ProcessLimits:
     """Finds out what the system refuses now, and logs when that begins and ends."""
 
     def __init__(self) -> None:
-        self._failures = FailureLog(logger, "gateway", HOLD_S)
+        self._files = FailureLog(logger, "gateway", HOLD_S)
+        self._threads = FailureLog(logger, "gateway", HOLD_S)
 
     def problems(self) -> list[str]:
         """Return what the system refuses now, and what to do. Call it once a second, or more often."""
-        problem = _file_problem()
-        if problem:
-            self._failures.failed(problem)
-        else:
-            self._failures.recovered("files can be opened again")
-        return [problem] if problem else []
+        problems = []
+        for failures, problem, recovery in (
+            (self._files, _file_problem(), "files can be opened again"),
+            (self._threads, _thread_problem(), "threads can be started again"),
+        ):
+            if problem:
+                failures.failed(problem)
+                problems.append(problem)
+            else:
+                failures.recovered(recovery)
+        return problems
 
 
 def _file_problem() -> str:
@@ -62,6 +71,24 @@ def _file_problem() -> str:
                 f"can be opened; {FILES_ADVICE}"
             )
     return ""
+
+
+def _thread_problem() -> str:
+    thread_starts.check()
+    if not thread_starts.is_failing:
+        return ""
+    return (
+        f"no further thread can be started beside the {_num_threads()} of the gateway "
+        f"({thread_starts.num_failed} attempts failed), so parts of it do not work; end other programs of "
+        "its user, or let it have more (TasksMax of the service)"
+    )
+
+
+def _num_threads() -> int:
+    try:
+        return sum(1 for _ in Path("/proc/self/task").iterdir())
+    except OSError:
+        return threading.active_count()
 
 
 class ReservedFiles:

@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 import uvloop
 
 from gateway.log import DefectLog
+from gateway.worker_thread import thread_starts
 
 _Result = TypeVar("_Result")
 
@@ -40,7 +41,7 @@ class LoopThread:
         self._num_bytes = 0  # that they hold
         self._is_closed = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        thread_starts.start(self._thread)
 
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
         """Have the loop make ``call``, which holds ``num_bytes``; return False if too many wait.

@@ -1,5 +1,6 @@
 """A thread for calls that may block in an output's library. The program does not wait for it when it ends."""
 
+import contextlib
 import functools
 import threading
 import time
@@ -8,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Final
 
-from gateway.worker_thread import make_call
+from gateway.worker_thread import make_call, thread_starts
 
 MAX_CALLS: Final = 4096
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -79,8 +80,9 @@ class SendThread:
 
     def _wake(self) -> None:
         if not self._is_running:
-            threading.Thread(target=self._run, name=self._name, daemon=True).start()
-            self._is_running = True
+            with contextlib.suppress(RuntimeError):  # the next call tries again
+                thread_starts.start(threading.Thread(target=self._run, name=self._name, daemon=True))
+                self._is_running = True
         self._changed.notify()
 
     def _run(self) -> None:

@@ -13,7 +13,7 @@ from typing import Final, Protocol, TypeVar
 
 from gateway.log import DefectLog
 from gateway.takes.event_log import SYNC
-from gateway.worker_thread import make_call
+from gateway.worker_thread import make_call, thread_starts
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
 """How much may wait for the disk; at 1.3 MB/s, the disk may stand still for 50 s."""
@@ -146,7 +146,7 @@ class Recorder:
         self._writer: threading.Thread | None = None
         if has_thread:
             self._writer = threading.Thread(target=self._run, name=name, daemon=True)
-            self._writer.start()
+            thread_starts.start(self._writer)
 
     @property
     def queued_bytes(self) -> int:

@@ -97,7 +97,7 @@ def test_a_subscriber_of_json_alone_starts_a_stream_on_demand(lab: Lab) -> None:
         ("echo --hz --count 300", ["mocap/lab/6d/"]),
         ("echo --component 6d/* --count 50", ["mocap/lab/6d/"]),
         ("list --json", ['"source": "lab"', '"problem": ""']),
-        ("params 3d", ["Marker 1"]),
+        ("params 3d --json", ["Marker 1"]),
         ("top --json --once", ['"num_foreign":0', '"num_beyond":0']),
     ],
 )

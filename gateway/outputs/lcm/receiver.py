@@ -13,7 +13,7 @@ from gateway.outputs.lcm.connection import open_lcm, reconnect, scheme_of, send_
 from gateway.outputs.lcm.datagrams import LcmDatagrams
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.token_bucket import TokenBucket
-from gateway.worker_thread import WorkerThread
+from gateway.worker_thread import WorkerThread, thread_starts
 
 RECEIVED_PER_S: Final = 2000.0
 """How many messages a second are received. LCM or the kernel discards further ones, uncounted."""
@@ -64,7 +64,7 @@ class LcmReceiver:
         if self._shared is not None:
             self._subscribe(self._shared)
         else:
-            self._thread.start()
+            thread_starts.start(self._thread)
 
     def add(self, channel: str, take: Take) -> None:
         """Receive on one more channel, until ``close``.

@@ -12,6 +12,7 @@ from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
 from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmSender
+from gateway.worker_thread import thread_starts
 
 MAX_QUEUED_BYTES: Final = 8 * 1024 * 1024
 MAX_QUEUED_MESSAGES: Final = 10_000
@@ -55,7 +56,7 @@ class LcmThreadSender:
     def open(self) -> None:
         """Start the thread, which opens LCM and retries until it succeeds or ``close`` is called."""
         self._problem = f"LCM has not opened {self._url} yet; check lcm.url"
-        self._thread.start()
+        thread_starts.start(self._thread)
 
     def send(self, channel: str, message: bytes, source: str = "") -> None:
         """Queue a message about ``source``.

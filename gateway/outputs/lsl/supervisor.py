@@ -15,6 +15,7 @@ from gateway.child_process import module_environment
 from gateway.log import FailureLog
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.wire import Message, Report
+from gateway.worker_thread import thread_starts
 
 SILENCE_S: Final = 10.0
 """If the process reports nothing for so long, or takes nothing, it is killed and another one started."""
@@ -94,9 +95,10 @@ class LslProcesses:
         ours.settimeout(SILENCE_S)
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
         self._socket = ours
-        threading.Thread(
+        reader = threading.Thread(
             target=self._read_reports, args=(ours, self._process), name="lsl-reports", daemon=True
-        ).start()
+        )
+        thread_starts.start(reader)
         reopen()
 
     def send(self, message: Message) -> bool:

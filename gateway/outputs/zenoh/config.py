@@ -76,7 +76,8 @@ def prepare_threads() -> None:
 def in_zenoh_thread(callback: Callable[[_Event], object]) -> "zenoh.handlers.Callback[_Event]":
     """Return a handler that calls ``callback`` in one of Zenoh's own threads, so it must not block.
 
-    A plain function gets one more thread for each declaration: 256 tools had 572 threads.
+    A plain function gets one more thread for each declaration: 256 tools had 572 threads, and 50 sources 50
+    more than one.
     """
     return zenoh.handlers.Callback(callback, indirect=False)
 

@@ -133,7 +133,7 @@ class ZenohQueries:
             if status.matching:
                 self._call_in_loop(self._publish_soon, source)
 
-        queryable = session.declare_queryable(f"{key}/**", on_query)
+        queryable = session.declare_queryable(f"{key}/**", in_zenoh_thread(on_query))
         parameters = f"{key}/parameters"
         publisher = session.declare_publisher(
             parameters, encoding=XML, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
@@ -146,8 +146,7 @@ class ZenohQueries:
         history = f"{parameters}/@adv/pub/{session.info.zid()}/uhlc/_"
 
         def on_history(query: zenoh.Query) -> None:
-            with self._lock:
-                newest = self._parameters.get(source)
+            newest = self._parameters.get(source)
             answers = {} if newest is None else {parameters: Answer(newest.xml, XML, _facts(newest))}
             self._answers.reply(source, query, answers)
 

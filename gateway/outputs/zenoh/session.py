@@ -15,6 +15,7 @@ from gateway.errors import OutputError
 from gateway.log import DefectLog, FailureLog, defect_text
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.config import in_zenoh_thread, prepare_threads, zenoh_reason
+from gateway.worker_thread import thread_starts
 
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5
@@ -81,7 +82,7 @@ class SessionHolder:
 
     def start(self) -> None:
         """Start the thread that opens the session."""
-        self._opener.start()
+        thread_starts.start(self._opener)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until the thread has opened the session and declared everything, or was never started."""
@@ -177,7 +178,7 @@ class SessionHolder:
 def close_session(session: zenoh.Session, output: str) -> None:
     """Close the session of an output; return when it is closed, or after _CLOSE_S."""
     closer = threading.Thread(target=_close, args=(session, output), name=f"{output}-close", daemon=True)
-    closer.start()
+    thread_starts.start(closer)
     closer.join(_CLOSE_S)
 
 

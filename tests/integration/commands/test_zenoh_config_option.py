@@ -130,5 +130,5 @@ def test_the_commands_show_the_certificate_of_a_gateway_that_listens(
         findings = doctor(tmp_path / "gateway.yaml")
         assert findings["link"]["found"] == "the session is open and connected to 0 routers and 1 peer"
         assert findings["gateway"]["found"] == "a gateway serves lab"
-        params = run_command("params", "3d", "--zenoh-config", str(file))
+        params = run_command("params", "3d", "--zenoh-config", str(file), "--json")
         assert (params.status, params.stderr) == (0, "")

@@ -108,8 +108,9 @@ async def test_alerts_learn_of_defects_and_of_nobody_who_subscribes(lab: Lab) ->
     assert lab.value("defects_total") == before + 2
     assert lab.value("source_subscribed", source="lab") == 0
     output, _ = lab.source.fan_out.outputs[0]
-    assert isinstance(output, ToyOutput)
-    output.wanted.add("3d")
+    assert isinstance(output, GuardedOutput)
+    assert isinstance(output.output, ToyOutput)
+    output.output.wanted.add("3d")
     assert lab.value("source_subscribed", source="lab") == 1
 
 

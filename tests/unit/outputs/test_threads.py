@@ -91,6 +91,27 @@ def test_zenoh_has_no_thread_for_each_key() -> None:
     output.close()
 
 
+def test_zenoh_has_no_thread_for_each_source() -> None:
+    """50 sources had 50 threads more than one."""
+    output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
+    with asyncio.Runner() as runner:
+        runner.run(_serve_queries(output))
+        output.start()
+        output.wait_until_open(30)
+        threads = Path("/proc/self/task")
+        num_before = len([*threads.iterdir()])
+        for number in range(30):
+            output.announce(f"lab{number}")
+        num_more = len([*threads.iterdir()]) - num_before
+        runner.run(output.stop_queries())
+    output.close()
+    assert num_more < 15  # Zenoh's own may grow
+
+
+async def _serve_queries(output: ZenohOutput) -> None:
+    output.serve_queries(object())  # type: ignore[arg-type]  # nobody asks
+
+
 UNUSED = [
     lambda: LcmOutput(LcmSettings()),
     lambda: LslOutput(LslSettings()),

@@ -98,5 +98,5 @@ def test_only_the_chosen_sources_are_received(tmp_path: Path) -> None:
     lab.lcm.publish("MOCAP_LAB_1_STATUS", lab.status("Lab-1"))
     wait_until(lambda: lab.recording.num_messages == 2)
     assert names(lab) == {"Lab-1"}
-    assert lab.channels() == ["MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_3D", "MOCAP_LAB_1_STATUS"]
+    assert lab.channels() == [f"MOCAP_LAB_1_{end}" for end in ("TAKE", "3D", "STATUS", "END")]
     lab.subscriber.close()
