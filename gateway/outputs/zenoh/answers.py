@@ -155,14 +155,19 @@ class ZenohAnswers:
 
     def _add(self, question: _Question, query: zenoh.Query) -> None:
         with self._lock:
-            joined = self._open.setdefault(question.identity, question)
-            joined.queries.append(query)
-            if joined is not question:
-                return
-            self._waiting.append(question)
-            if self._is_scheduled:
-                return
-            self._is_scheduled = True
+            is_closed = self._is_closed
+            if not is_closed:
+                joined = self._open.setdefault(question.identity, question)
+                joined.queries.append(query)
+                if joined is not question:
+                    return
+                self._waiting.append(question)
+                if self._is_scheduled:
+                    return
+                self._is_scheduled = True
+        if is_closed:
+            self._drop([query], question.source)
+            return
         with contextlib.suppress(RuntimeError):  # the loop has just ended
             self._loop.call_soon_threadsafe(self._start_next)
 
@@ -229,8 +234,8 @@ class ZenohAnswers:
 
     async def close(self) -> None:
         """Drop the pending queries, and close the sender. Peers see at once that no reply follows."""
-        self._is_closed = True
         with self._lock:
+            self._is_closed = True
             questions = list(self._open.values())
             self._waiting.clear()
         for task in self._tasks:
@@ -260,7 +265,9 @@ class ZenohAnswers:
 
     def _drop(self, queries: list[zenoh.Query], source: str) -> None:
         """Let the peers see that no reply follows."""
-        self._sender.submit(functools.partial(self._drop_now, queries, source))
+        drop = functools.partial(self._drop_now, queries, source)
+        if self._sender.submit(drop).cancelled():  # it is closed
+            drop()
 
     def _log_defect(self, source: str, selector: str, defect: Exception) -> QueryError:
         return self._defects.log(source, defect, f"query {safe_text(selector)}")

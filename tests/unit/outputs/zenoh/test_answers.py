@@ -196,3 +196,13 @@ async def test_a_query_that_is_too_long_is_an_error(selector: str, num_bytes: in
         [reply] = await asyncio.to_thread(lambda: list(lab.peer.get(selector, timeout=20, payload=payload)))
         assert (to_reply(reply).error, to_reply(reply).code) == (text, "bad-request")
         assert lab.service.num_calls == 0
+
+
+@pytest.mark.parametrize("selector", ["mocap/lab/status", "mocap/lab/$*a$*b$*c"])
+async def test_a_query_after_the_end_ends_without_a_reply(selector: str) -> None:
+    """Its peer would wait for it as long as for a gateway that thinks."""
+    async with open_lab() as lab:
+        await lab.output.stop_queries()
+        assert await query_all(lab.peer, selector) == []
+        assert lab.output.query_results == {"lab": {"no-reply": 1}}
+        assert lab.service.num_calls == 0
