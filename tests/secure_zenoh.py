@@ -87,7 +87,7 @@ def run_program(*arguments: str, log: Path, environ: Mapping[str, str] | None = 
 def run_gateway_with_simulator(
     folder: Path, zenoh_config: str, environ: Mapping[str, str] | None = None
 ) -> Iterator[Path]:
-    """Run a simulator and a gateway with ``zenoh_config``, as YAML; yield the log file of the gateway."""
+    """Run a simulator and a gateway with ``zenoh_config``, as YAML; yield its log file once frames arrive."""
     with ExitStack() as stack:
         simulator_log, log = folder / "simulator.log", folder / "gateway.log"
         stack.enter_context(run_program("simulate", "--port", "0", "--rate", "50", log=simulator_log))
@@ -108,6 +108,7 @@ def run_gateway_with_simulator(
                 environ=environ,
             )
         )
+        wait_until(lambda: "→ streaming" in log.read_text())
         yield log
 
 
