@@ -32,6 +32,7 @@
 #include "rtc3d_parameters_request_t.h"
 #include "rtc3d_parameters_t.h"
 #include "rtc3d_status_t.h"
+#include "rtc3d_take_details_t.h"
 #include "rtc3d_take_end_t.h"
 #include "rtc3d_take_t.h"
 #include "rtc3d_tool_pose_t.h"
@@ -49,7 +50,7 @@ static const struct type {
 } types[] = {
     TYPE(markers_t), TYPE(tools_t), TYPE(analog_t), TYPE(forces_t), TYPE(events_t), TYPE(tool_pose_t), TYPE(status_t),
     TYPE(clock_t), TYPE(parameters_t), TYPE(parameters_request_t), TYPE(parameters_reply_t), TYPE(command_request_t),
-    TYPE(command_reply_t), TYPE(take_t), TYPE(take_end_t),
+    TYPE(command_reply_t), TYPE(take_t), TYPE(take_details_t), TYPE(take_end_t),
     /* parts of messages */
     TYPE(marker_t), TYPE(tool_t), TYPE(force_t), TYPE(event_t), TYPE(clock_model_t), TYPE(count_t), TYPE(loss_t),
     TYPE(stream_status_t), TYPE(output_status_t),

@@ -32,6 +32,7 @@
 #include "rtc3d/parameters_request_t.hpp"
 #include "rtc3d/parameters_t.hpp"
 #include "rtc3d/status_t.hpp"
+#include "rtc3d/take_details_t.hpp"
 #include "rtc3d/take_end_t.hpp"
 #include "rtc3d/take_t.hpp"
 #include "rtc3d/tool_pose_t.hpp"
@@ -345,6 +346,11 @@ void write_fields(Json &json, const rtc3d::take_t &m)
     json("gateway_version", m.gateway_version)("recorder", m.recorder)("host", m.host);
 }
 
+void write_fields(Json &json, const rtc3d::take_details_t &m)
+{
+    json("utime", m.utime)("source", m.source)("subject", m.subject)("session", m.session)("note", m.note);
+}
+
 void write_fields(Json &json, const rtc3d::take_end_t &m)
 {
     json("utime", m.utime)("source", m.source)("messages_lost", m.messages_lost);
@@ -399,7 +405,8 @@ int print_vectors()
             to_json<rtc3d::markers_t, rtc3d::tools_t, rtc3d::analog_t, rtc3d::forces_t, rtc3d::events_t,
                     rtc3d::tool_pose_t, rtc3d::status_t, rtc3d::clock_t, rtc3d::parameters_t,
                     rtc3d::parameters_request_t, rtc3d::parameters_reply_t, rtc3d::command_request_t,
-                    rtc3d::command_reply_t, rtc3d::take_t, rtc3d::take_end_t>(name, *data);
+                    rtc3d::command_reply_t, rtc3d::take_t, rtc3d::take_details_t,
+                    rtc3d::take_end_t>(name, *data);
         if (json.empty())
             std::cout << "{\"error\": \"" << data->size() << " bytes are not a whole message of this type\"}\n";
         else

@@ -7,7 +7,7 @@ what they need.
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -15,9 +15,13 @@ from gateway.cli.completion import one_of, source_names
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
+from gateway.errors import QueryError
 from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.service.log_format import LogFormat, LogLevel
+
+if TYPE_CHECKING:
+    from gateway.takes.description import TakeDetails
 
 _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
 """The values of ``--component`` for commands that read or write recordings."""
@@ -169,6 +173,10 @@ def _checked_endpoint(text: str | None) -> str | None:
     return text
 
 
+SubjectOption = Annotated[str | None, typer.Option(help="Who is recorded, such as S01.")]
+SessionOption = Annotated[str | None, typer.Option(help="The session of the subject, such as baseline.")]
+NoteOption = Annotated[str | None, typer.Option(help="Anything else that belongs to the recording.")]
+
 SourceOption = Annotated[
     str | None,
     typer.Option(
@@ -261,6 +269,16 @@ def check_transport(
     for name, value in (("--url", url), ("--queries-url", queries_url)):
         if value is not None and not lcm:
             raise typer.BadParameter(f"{name} is for LCM; add --lcm")
+
+
+def checked_details(subject: str | None, session: str | None, note: str | None) -> "TakeDetails":
+    """Return who and what a recording is about. Raises BadParameter."""
+    from gateway.takes.description import TakeDetails
+
+    try:
+        return TakeDetails(subject or "", session or "", note or "").checked()
+    except QueryError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def chosen_log_level(level: LogLevel, *, verbose: bool, quiet: bool) -> LogLevel:

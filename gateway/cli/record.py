@@ -12,11 +12,15 @@ from gateway.cli.options import (
     ComponentsOption,
     ConnectOption,
     NoProgressOption,
+    NoteOption,
     PrefixOption,
+    SessionOption,
     SourcesOption,
+    SubjectOption,
     UrlOption,
     ZenohConfigOption,
     check_transport,
+    checked_details,
 )
 from gateway.cli.stop_signals import StopSignals
 
@@ -44,6 +48,9 @@ def record(
             min=0, help="Stop after this many seconds of messages; the default is to record until Ctrl-C."
         ),
     ] = None,
+    subject: SubjectOption = None,
+    session: SessionOption = None,
+    note: NoteOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="Record from LCM; the default is from Zenoh.")] = False,
     connect: ConnectOption = None,
     zenoh_config: ZenohConfigOption = None,
@@ -56,6 +63,7 @@ def record(
     A second Ctrl-C ends at once, without what waits for the disk.
     """
     check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
+    details = checked_details(subject, session, note)
     from gateway.cli.record_progress import RecordProgress
     from gateway.cli.record_summary import print_summary
     from gateway.recorder.file_sink import FileSink
@@ -67,7 +75,7 @@ def record(
     stop = StopSignals(_end_at_once)
     target = Target(file)
     recording = TakeRecording(
-        lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0
+        lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0, details
     )
     sources = list(dict.fromkeys(source or ()))
     try:

@@ -16,6 +16,7 @@ from gateway.cli.take_gateway import GatewayAddress, TakeReplies
 from gateway.cli.take_list import ListedTake, write_list
 from gateway.errors import QueryError
 from gateway.safe_text import safe_json, safe_text
+from gateway.takes.description import TakeDetails
 from gateway.takes.names import check_name
 
 
@@ -34,11 +35,11 @@ def gateway_address(
     return GatewayAddress(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout_s)
 
 
-def start_take(address: GatewayAddress, name: str | None, *, as_json: bool) -> None:
+def start_take(address: GatewayAddress, name: str | None, details: TakeDetails, *, as_json: bool) -> None:
     """Start a take."""
     _control(
         address,
-        {"set": "start"} | _named(name),
+        {"set": "start"} | _named(name) | _described(details),
         lambda take: f"take {take.name!r} is running",
         as_json=as_json,
     )
@@ -55,7 +56,13 @@ def stop_take(address: GatewayAddress, *, as_json: bool) -> None:
 
 
 def save_take(
-    address: GatewayAddress, name: str | None, last_s: float | None, after_s: float, *, as_json: bool
+    address: GatewayAddress,
+    name: str | None,
+    last_s: float | None,
+    after_s: float,
+    details: TakeDetails,
+    *,
+    as_json: bool,
 ) -> None:
     """Keep the last seconds as a take."""
     options = {"set": "save"}
@@ -66,7 +73,7 @@ def save_take(
     goes_on = f", and goes on for {after_s:g} s" if after_s else ""
     _control(
         address,
-        options | _named(name),
+        options | _named(name) | _described(details),
         lambda take: f"take {take.name!r} is saved: {_facts(take)}{goes_on}",
         as_json=as_json,
     )
@@ -98,6 +105,12 @@ def _named(name: str | None) -> dict[str, str]:
         return {}
     check_name(name)  # here, too: a name could contain further options
     return {"name": name}
+
+
+def _described(details: TakeDetails) -> dict[str, str]:
+    """Return the options that say what a take is about. A semicolon would end an option."""
+    texts = details._asdict().items()
+    return {name: text.replace("%", "%25").replace(";", "%3B") for name, text in texts if text}
 
 
 def _ask(address: GatewayAddress, options: Mapping[str, str]) -> TakeReplies:

@@ -8,11 +8,15 @@ import typer
 from gateway.cli.options import (
     ConnectOption,
     NoProgressOption,
+    NoteOption,
     PrefixOption,
     QueriesUrlOption,
+    SessionOption,
     SourceOption,
+    SubjectOption,
     UrlOption,
     ZenohConfigOption,
+    checked_details,
 )
 
 _NameArgument = Annotated[
@@ -26,6 +30,9 @@ _TimeoutOption = Annotated[float, typer.Option(min=0.1, help="How many seconds t
 
 def start(
     name: _NameArgument = None,
+    subject: SubjectOption = None,
+    session: SessionOption = None,
+    note: NoteOption = None,
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
@@ -43,7 +50,7 @@ def start(
     from gateway.cli.take_actions import gateway_address, start_take
 
     address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    start_take(address, name, as_json=as_json)
+    start_take(address, name, checked_details(subject, session, note), as_json=as_json)
 
 
 def stop(
@@ -76,6 +83,9 @@ def save(
         ),
     ] = None,
     after: Annotated[float, typer.Option(min=0.0, max=3600.0, help="For how many seconds to go on.")] = 0.0,
+    subject: SubjectOption = None,
+    session: SessionOption = None,
+    note: NoteOption = None,
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
@@ -93,7 +103,7 @@ def save(
     from gateway.cli.take_actions import gateway_address, save_take
 
     address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    save_take(address, name, last, after, as_json=as_json)
+    save_take(address, name, last, after, checked_details(subject, session, note), as_json=as_json)
 
 
 def list_(

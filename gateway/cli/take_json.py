@@ -38,6 +38,7 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
         "take": source.take_name,
         "recorder": source.recorder,
         "host": source.host,
+        **source.details._asdict(),
         "servers": source.servers,
         "gateway_versions": source.gateway_versions,
         "sessions": source.sessions,

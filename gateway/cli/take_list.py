@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from gateway.safe_text import safe_text
+from gateway.takes.description import TakeDetails
 from gateway.terminal.lists import print_list
 
 
@@ -22,6 +23,7 @@ class ListedTake:
         self.num_lost = round(_number(fields, "lost"))
         self.is_running = fields.get("is_running") is True
         self.is_cut_off = fields.get("is_cut_off") is True
+        self.details = TakeDetails(*(str(fields.get(name, "")) for name in TakeDetails._fields))
 
     @property
     def size_text(self) -> str:
@@ -64,13 +66,16 @@ def size_text(num_bytes: float) -> str:
 
 def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> None:
     """Write the list of the takes of all sources, and below it or on stderr what is not in it."""
-    headings = ("source", "name", "begin", "duration", "size", "state")
-    records = []
+    headings = ["source", "name", "begin", "duration", "size", "state", "about"]
+    records: list[list[str]] = []
     for source, content in replies.items():
         for take in listed_takes(content):
             state = "running" if take.is_running else ""
             states = ", ".join(filter(None, (state, take.problem)))
-            records.append((source, take.name, take.begin_text, take.duration_text, take.size_text, states))
+            facts = [source, take.name, take.begin_text, take.duration_text, take.size_text, states]
+            records.append([*facts, take.details.text])
+    if not any(record[-1] for record in records):
+        headings, records = headings[:-1], [record[:-1] for record in records]
     print_list(console, headings, records, numbers=("duration", "size"))
     notes = console if console.is_terminal else Console(stderr=True)
     for source, content in replies.items():

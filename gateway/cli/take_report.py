@@ -59,6 +59,8 @@ def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Itera
     if source.take_name:
         host = f" on {source.host}" if source.host else ""
         yield safe_text(f"Take {source.take_name!r}, recorded by {source.recorder}{host}")
+    if source.details.text:
+        yield safe_text(f"About {source.details.text}")
     texts = [_count(source.sessions, "connection")]
     if source.server_restarts:
         times = _times(source.server_restarts)
@@ -80,7 +82,7 @@ def _components_table(statistics: TakeStatistics, source: SourceStatistics) -> T
     rows = [
         _row(statistics, source, key, [part])
         for key, part in parts.items()
-        if "/" not in key and key not in ("take", "end")
+        if "/" not in key and key not in ("take", "details", "end")
     ]
     if poses:
         rows.insert(len(source.components), _row(statistics, source, _count(len(poses), "pose"), poses))

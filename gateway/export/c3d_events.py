@@ -62,6 +62,7 @@ def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_ro
     if not len(chosen):
         return []
     count = len(chosen)
+    subject = measurement.source.details.subject
     texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
     minutes, rest = np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)
     return [
@@ -69,7 +70,7 @@ def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_ro
         Parameter("CONTEXTS", [printable(_context_of(text)) for text in texts]),
         Parameter("LABELS", [printable(text.label) for text in texts]),
         Parameter("DESCRIPTIONS", [printable(text.description) for text in texts]),
-        Parameter("SUBJECTS", [printable(_value_of(text, "subject")) for text in texts]),
+        Parameter("SUBJECTS", [printable(_value_of(text, "subject") or subject) for text in texts]),
         Parameter("TIMES", np.stack([minutes, rest]).astype(np.float32)),
         Parameter("ICON_IDS", np.zeros(count, np.int16)),
         Parameter("GENERIC_FLAGS", np.zeros(count, np.int16)),

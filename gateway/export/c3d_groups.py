@@ -1,5 +1,6 @@
 """The groups of a C3D file, with the labels, units and descriptions of a measurement."""
 
+import textwrap
 from typing import Final
 
 import numpy as np
@@ -15,12 +16,14 @@ from gateway.export.c3d_format import (
     Parameter,
     Shape,
     encode_head,
+    encode_text,
     standard_groups,
     text_lists,
 )
 from gateway.export.c3d_plates import plate_group
 from gateway.export.job import ExportJob
 from gateway.export.take_time import utc_text
+from gateway.takes.description import TakeDetails
 
 _TEXT_SIZES: Final = (MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
 """How long labels may be, in bytes; the parameters of a file have 130 kB at most."""
@@ -55,7 +58,15 @@ def _groups(job: ExportJob, content: C3dContent, shape: Shape, max_bytes: int) -
     groups["TRIAL"] += [
         Parameter("DATE_TIME", [utc_text(content.measurement, content.start_s)]),
         Parameter("TIME_OFFSET", np.array(content.start_s, np.float32)),
+        *_details(job, content.measurement.source.details),
     ]
+    subject = content.measurement.source.details.subject
+    if subject:
+        groups["SUBJECTS"] = [
+            Parameter("USED", np.array(1, np.int16)),
+            Parameter("USES_PREFIXES", np.array(0, np.int16)),
+            Parameter("NAMES", [printable(subject)]),
+        ]
     groups["FORCE_PLATFORM"] = plate_group(content.plates)
     events = event_group(job, content.measurement, content.first_row, content.num_frames)
     if events:
@@ -65,6 +76,15 @@ def _groups(job: ExportJob, content: C3dContent, shape: Shape, max_bytes: int) -
         Parameter("VERSION_LABEL", [version_text()]),
     ]
     return groups
+
+
+def _details(job: ExportJob, details: TakeDetails) -> list[Parameter]:
+    """Return the session and the note, in lines as long as a parameter can have in any script."""
+    for text in (details.subject, details.session):
+        if encode_text(text) != text.encode():
+            job.note(f"{text!r} was cut: a C3D file has texts of at most {MAX_TEXT_BYTES} bytes")
+    texts = {"SESSION": [details.session], "NOTE": textwrap.wrap(details.note, MAX_TEXT_BYTES // 4)}
+    return [Parameter(name, lines) for name, lines in texts.items() if any(lines)]
 
 
 def _texts(

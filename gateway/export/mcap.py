@@ -95,7 +95,9 @@ class _SourceExport:
     @property
     def metadata(self) -> dict[str, str]:
         """What the take says about the source."""
-        return {"server": self._source.server, "gateway_version": self._source.gateway_version}
+        source = self._source
+        details = {name: text for name, text in source.details._asdict().items() if text}
+        return {"server": source.server, "gateway_version": source.gateway_version, **details}
 
     @property
     def problems(self) -> list[str]:

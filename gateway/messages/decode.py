@@ -26,6 +26,7 @@ MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
         rtc3d.command_request_t,
         rtc3d.command_reply_t,
         rtc3d.take_t,
+        rtc3d.take_details_t,
         rtc3d.take_end_t,
     )
 }

@@ -37,14 +37,21 @@ def summarise(message: Any) -> str:
             text = f"command {message.request_id} from {message.requester!r}: {command}"
         case rtc3d.command_reply_t():
             text = f"reply {message.request_id} to {message.requester!r}: {message.error or message.content}"
-        case rtc3d.take_end_t():
-            text = f"end of {message.source}, {message.messages_lost} messages lost"
-        case rtc3d.take_t():
-            text = f"take {message.name!r} of {message.source}, recorded on {message.host}"
+        case rtc3d.take_t() | rtc3d.take_details_t() | rtc3d.take_end_t():
+            text = _description(message)
         case _:
             frame = f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s"
             text = f"{frame}: {_frame_content(message)}"
     return text
+
+
+def _description(message: Any) -> str:
+    match message:
+        case rtc3d.take_t():
+            return f"take {message.name!r} of {message.source}, recorded on {message.host}"
+        case rtc3d.take_details_t():
+            return f"details of {message.source}: {message.subject!r}, {message.session!r}, {message.note!r}"
+    return f"end of {message.source}, {message.messages_lost} messages lost"
 
 
 def summarise_xml(xml: bytes) -> str:

@@ -10,7 +10,13 @@ from gateway.outputs.parameters_message import published_again
 from gateway.recorder.file_sink import FileSink
 from gateway.recorder.series import RecordedSeries, RecordedSource
 from gateway.subscriber.reception import Reception
-from gateway.takes.description import encode_take, encode_take_end
+from gateway.takes.description import (
+    NO_DETAILS,
+    TakeDetails,
+    encode_take,
+    encode_take_details,
+    encode_take_end,
+)
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 
 
@@ -29,6 +35,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         open_file: Callable[[list[str]], FileSink],
         components: Collection[str] | None = None,
         start_s: float = 0.0,
+        details: TakeDetails = NO_DETAILS,
     ) -> None:
         super().__init__()
         self.sink: FileSink | None = None
@@ -37,6 +44,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         """Whether somebody has moved or deleted the file; known after ``close``."""
         self._open_file = open_file
         self._components = components
+        self._details = details
         self._recorder = Recorder("record")
         self._held: deque[tuple[RecordedSeries, bytes]] = deque()
         self._held_bytes = 0
@@ -143,6 +151,9 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
             recorder="rtc3d-gateway record",
         )
         description = [(f"{source.channels}_TAKE".encode(), take)]
+        if self._details != NO_DETAILS:
+            about = encode_take_details(utime=utime, source=source.name, details=self._details)
+            description.append((f"{source.channels}_DETAILS".encode(), about))
         parameters = source.first_parameters
         series = self._find_series(source, "parameters", f"{source.channels}_PARAMETERS")
         if parameters is not None and series is not None:

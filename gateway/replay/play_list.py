@@ -10,7 +10,7 @@ from gateway.replay.timeline import ReplayTimeline
 from gateway.takes.reader import FIRST_PLACE, TakeReader
 
 _PARAMETERS: Final = "parameters"
-_DESCRIPTIONS: Final = frozenset({"take", "end"})
+_DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
 _MAX_CACHED: Final = 10_000
 
 

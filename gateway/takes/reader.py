@@ -39,6 +39,7 @@ _KEYS: Final[dict[type[Any], str]] = {
     rtc3d.clock_t: "clock",
     rtc3d.parameters_t: "parameters",
     rtc3d.take_t: "take",
+    rtc3d.take_details_t: "details",
     rtc3d.take_end_t: "end",
 }
 
@@ -47,8 +48,8 @@ class TakeMessage(NamedTuple):
     """One message of a take.
 
     ``key`` is the part of its Zenoh key below the source: "3d", "6d", "analog", "force", "event", "status",
-    "clock", "parameters", "6d/LABEL" (a pose), "take" for a ``take_t``, or "end" for a ``take_end_t``.
-    ``utime`` is the event's time.
+    "clock", "parameters", "6d/LABEL" (a pose), "take" for a ``take_t``, "details" for a
+    ``take_details_t``, or "end" for a ``take_end_t``. ``utime`` is the event's time.
     """
 
     utime: int

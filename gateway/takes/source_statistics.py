@@ -17,7 +17,7 @@ from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.clock_steps import ClockSteps
 from gateway.takes.component_rows import decode_rows
 from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
-from gateway.takes.description import has_end
+from gateway.takes.description import NO_DETAILS, decoded_details, has_end
 
 MAX_LISTED_CHANGES: Final = 100
 """How many changes of the parameters are listed; all are counted."""
@@ -26,7 +26,7 @@ _MAX_VERSIONS: Final = 32
 """How many versions of the parameters are kept to label what follows."""
 _MAX_TEXTS: Final = 20
 _MAX_KEYS: Final = 1000
-_DESCRIPTIONS: Final = frozenset({"take", "end"})
+_DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
 _HEAD_BYTES: Final = FINGERPRINT_BYTES + PREFIX.size
 
 
@@ -45,6 +45,8 @@ class SourceStatistics:
         self.name = name
         self.take_name = self.recorder = self.host = ""
         """What the newest description in the take says; "" without a description."""
+        self.details = NO_DETAILS
+        """Who and what the take is about, according to the newest details."""
         self.servers: list[str] = []
         """HOST:PORT of the server; several if it changed."""
         self.gateway_versions: list[str] = []
@@ -150,6 +152,9 @@ class SourceStatistics:
         if key == "end":
             self.num_lost += message.messages_lost
             self._num_open -= 1
+            return
+        if key == "details":
+            self.details = decoded_details(message)
             return
         if message.server:
             _note(self.servers, message.server)

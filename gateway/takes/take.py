@@ -16,6 +16,7 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_changes import differ_in_statistics_only
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.component_rows import decode_rows
+from gateway.takes.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.reader import MessageBatch, TakeReader
 from gateway.takes.series import ParametersEntry, Series, SeriesBuilder
 
@@ -25,13 +26,15 @@ class TakeSource:
     """One source (a server) of a take. A component that was not recorded is None.
 
     ``server`` is HOST:PORT and ``gateway_version`` the version of the gateway that published the messages,
-    both "" if the take does not say. ``parameters`` has the server's parameters at the beginning and at each
-    change, in order. ``malformed`` is how many messages could not be read, by component.
+    both "" if the take does not say. ``details`` has ``subject``, ``session`` and ``note``, each "" if nobody
+    said it. ``parameters`` has the server's parameters at the beginning and at each change, in order.
+    ``malformed`` is how many messages could not be read, by component.
     """
 
     name: str
     server: str = ""
     gateway_version: str = ""
+    details: TakeDetails = NO_DETAILS
     markers: Series | None = None
     tools: Series | None = None
     analog: Series | None = None
@@ -157,9 +160,9 @@ class _Loader:
                 times = zip(batch.utimes, messages, strict=True)
                 messages = [message for utime, message in times if first_utime <= utime < end_utime]
             self._add_frames(source, batch.key, messages)
-        elif batch.key in ("take", "status", "parameters"):
+        elif batch.key in ("take", "details", "status", "parameters"):
             for message in batch.messages:
-                if batch.key == "parameters" or not source.server:
+                if batch.key in ("details", "parameters") or not source.server:
                     self._describe(source, batch.key, message)
 
     def finish(self, start_utime: int) -> dict[str, TakeSource]:
@@ -186,6 +189,8 @@ class _Loader:
             return
         if key == "parameters":
             self._add_parameters(source, decoded)
+        elif key == "details":
+            source.details = decoded_details(decoded)
         else:
             source.server, source.gateway_version = decoded.server, decoded.gateway_version
 

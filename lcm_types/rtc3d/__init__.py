@@ -23,6 +23,7 @@ from .parameters_request_t import parameters_request_t as parameters_request_t
 from .parameters_t import parameters_t as parameters_t
 from .status_t import status_t as status_t
 from .stream_status_t import stream_status_t as stream_status_t
+from .take_details_t import take_details_t as take_details_t
 from .take_end_t import take_end_t as take_end_t
 from .take_t import take_t as take_t
 from .tool_pose_t import tool_pose_t as tool_pose_t

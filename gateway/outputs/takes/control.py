@@ -4,6 +4,7 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
+from urllib.parse import unquote
 
 from gateway.errors import QueryError
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, Answer
@@ -11,6 +12,7 @@ from gateway.outputs.encodings import JSON, LOG, json_bytes
 from gateway.outputs.takes.stored import StoredTake
 from gateway.outputs.takes.takes import Takes
 from gateway.safe_text import quoted
+from gateway.takes.description import MAX_DETAIL_CHARACTERS, TakeDetails
 from gateway.token_bucket import TokenBucket
 
 MAX_LISTED: Final = 1000
@@ -24,16 +26,16 @@ MAX_SAVED_S: Final = 3600.0
 
 _OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "": (),
-    "start": ("name",),
+    "start": ("name", *MAX_DETAIL_CHARACTERS),
     "stop": (),
-    "save": ("last", "after", "name"),
+    "save": ("last", "after", "name", *MAX_DETAIL_CHARACTERS),
     READ_OPTION: (READ_OPTION, "offset"),
 }
 """What peers can ask for, with the options that each takes; "" is the list."""
 
 _ACCEPTED: Final = (
     "none for a list, set=start;name=NAME, set=stop, set=save;last=SECONDS;after=SECONDS;name=NAME, "
-    "read=NAME;offset=BYTES"
+    "read=NAME;offset=BYTES; with start and save also subject=TEXT;session=TEXT;note=TEXT"
 )
 
 
@@ -49,7 +51,7 @@ class TakeCommand:
         action = _action(options)
         match action:
             case "start":
-                take = await self._takes.start(source, options.get("name", ""))
+                take = await self._takes.start(source, options.get("name", ""), _details(options))
             case "stop":
                 take = await self._takes.stop(source)
             case "save":
@@ -58,6 +60,7 @@ class TakeCommand:
                     _seconds(options, "last", MAX_SAVED_S, default=MAX_SAVED_S),
                     _seconds(options, "after", MAX_SAVED_S, default=0.0),
                     options.get("name", ""),
+                    _details(options),
                 )
             case "read":
                 return await self._read(source, options[READ_OPTION], _offset(options))
@@ -96,6 +99,7 @@ def _fields(take: StoredTake) -> dict[str, Any]:
         "is_running": take.is_running,
         "lost": take.num_lost,
         "is_cut_off": take.is_cut_off,
+        **take.details._asdict(),
     }
 
 
@@ -123,6 +127,19 @@ def _seconds(options: Mapping[str, str], option: str, maximum_s: float, *, defau
             f"{option}={quoted(text)} is not accepted; accepted: a number of seconds up to {maximum_s:g}"
         )
     return float(text)
+
+
+def _details(options: Mapping[str, str]) -> TakeDetails:
+    """Return what a take is about. %3B stands for a semicolon, which ends an option, and %25 for %."""
+    texts = {}
+    for name in options.keys() & MAX_DETAIL_CHARACTERS.keys():
+        try:
+            texts[name] = unquote(options[name], errors="strict")
+        except UnicodeDecodeError:
+            raise QueryError(
+                f"{name}={quoted(options[name])} is not accepted; accepted: UTF-8 after each %"
+            ) from None
+    return TakeDetails(**texts).checked()
 
 
 def _offset(options: Mapping[str, str]) -> int:

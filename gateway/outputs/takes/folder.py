@@ -20,7 +20,7 @@ from gateway.errors import ProtocolError, QueryError, TakeError
 from gateway.messages.decode import decode
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake, TakePiece
-from gateway.takes.description import has_end
+from gateway.takes.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.names import by_number, check_name, default_name, numbered
 from gateway.takes.new_file import NewFiles
@@ -87,6 +87,7 @@ class _Facts(NamedTuple):
     seconds: float
     num_lost: int
     is_cut_off: bool
+    details: TakeDetails
 
 
 class TakesFolder:
@@ -372,9 +373,12 @@ def _facts(entry: TakeEntry) -> _Facts:
     """Read the beginning and the end of a take; all zero if it has no messages."""
     begin_utime = end_utime = num_lost = 0
     is_cut_off = False
+    details = NO_DETAILS
     for path, status in entry.logs:
         try:
-            first = newest = next(EventLogReader(path).events())
+            beginning = EventLogReader(path).events()
+            first = newest = next(beginning)
+            second = next(beginning, first)
             tail_bytes = _TAIL_BYTES if path == entry.logs[-1][0] else _END_BYTES
             for event in EventLogReader(path).events(max(0, status.st_size - tail_bytes)):
                 newest = event
@@ -382,13 +386,15 @@ def _facts(entry: TakeEntry) -> _Facts:
             is_cut_off = True
             continue
         begin_utime, end_utime = begin_utime or first.utime, newest.utime
+        described = _decoded(second.message, rtc3d.take_details_t)
+        details = details if described is None else decoded_details(described)
         end = _decoded(newest.message, rtc3d.take_end_t)
         if end is not None:
             num_lost += end.messages_lost
         else:
             take = _decoded(first.message, rtc3d.take_t)
             is_cut_off = is_cut_off or (take is not None and has_end(take))
-    return _Facts(begin_utime, max(0.0, (end_utime - begin_utime) / 1e6), num_lost, is_cut_off)
+    return _Facts(begin_utime, max(0.0, (end_utime - begin_utime) / 1e6), num_lost, is_cut_off, details)
 
 
 def _decoded(message: bytes, message_type: type[Any]) -> Any | None:

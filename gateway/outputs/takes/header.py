@@ -7,25 +7,32 @@ from gateway import __version__
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.parameters_message import published_again
-from gateway.takes.description import encode_take, encode_take_end
+from gateway.takes.description import (
+    NO_DETAILS,
+    TakeDetails,
+    encode_take,
+    encode_take_details,
+    encode_take_end,
+)
 from gateway.takes.recording import LogFile
 
 
 @dataclass(frozen=True)
 class SourceDescription:
-    """A source in the files of takes. ``server`` is HOST:PORT, "" if it is not known."""
+    """A source in the files of a take. ``server`` is HOST:PORT, "" if it is not known."""
 
     source: str
     prefix: str
     server: str
+    details: TakeDetails = NO_DETAILS
 
     def channel(self, *path: str) -> bytes:
         """Return the channel of the key with this path."""
         return lcm_channel(self.prefix, self.source, *path).encode()
 
-    def take_message(self, name: str, utime: int) -> bytes:
-        """Return the ``take_t`` of a file that begins at ``utime``, in µs since the Unix epoch."""
-        return encode_take(
+    def messages(self, name: str, utime: int) -> list[tuple[bytes, bytes]]:
+        """Return what describes the source in a file that begins at ``utime``, in µs since the Unix epoch."""
+        take = encode_take(
             utime=utime,
             name=name,
             source=self.source,
@@ -34,6 +41,11 @@ class SourceDescription:
             gateway_version=__version__,
             recorder="rtc3d-gateway",
         )
+        messages = [(self.channel("take"), take)]
+        if self.details != NO_DETAILS:
+            details = encode_take_details(utime=utime, source=self.source, details=self.details)
+            messages.append((self.channel("details"), details))
+        return messages
 
     def end_message(self, utime: int, num_lost: int) -> bytes:
         """Return the ``take_end_t`` of a file that ends at ``utime`` and lacks ``num_lost`` messages."""
@@ -51,12 +63,11 @@ class FileHeader:
         self.description = description
         self.parameters = parameters
         self.parameters_channel: bytes = description.channel("parameters")
-        self._take_channel = description.channel("take")
         self._end_channel = description.channel("end")
 
     def messages(self, name: str, utime: int) -> list[tuple[bytes, bytes]]:
         """Return the first messages of a file, each with its channel."""
-        messages = [(self._take_channel, self.description.take_message(name, utime))]
+        messages = [*self.description.messages(name, utime)]
         if self.parameters is not None:
             messages.append((self.parameters_channel, published_again(self.parameters, utime)))
         return messages

@@ -21,6 +21,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
 from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
 from gateway.outputs.takes.take_file import TakeFile
+from gateway.takes.description import NO_DETAILS, TakeDetails
 from gateway.takes.names import check_name, default_name
 from gateway.takes.recording import Recorder
 
@@ -61,11 +62,13 @@ class RecordedTakes:
 
     # For peers.
 
-    async def start(self, source: str, name: str = "") -> StoredTake:
+    async def start(self, source: str, name: str = "", details: TakeDetails = NO_DETAILS) -> StoredTake:
         """See Takes."""
-        return await self.begin(source, name, has_free_name=not name)
+        return await self.begin(source, name, details, has_free_name=not name)
 
-    def begin(self, source: str, name: str, *, has_free_name: bool) -> Coroutine[Any, Any, StoredTake]:
+    def begin(
+        self, source: str, name: str, details: TakeDetails = NO_DETAILS, *, has_free_name: bool
+    ) -> Coroutine[Any, Any, StoredTake]:
         """Start a take at once, like ``start``; the coroutine, which must be awaited, waits for the disk.
 
         With ``has_free_name``, a number is added to the name if there is such a take already.
@@ -82,7 +85,7 @@ class RecordedTakes:
             name or default_name(source),
             now_utime(),
             has_free_name=has_free_name,
-            header=self._header(recording),
+            header=self._header(recording, details),
             disk=self.disk,
             losses=recording.losses,
             make_room=self._make_room,
@@ -108,7 +111,8 @@ class RecordedTakes:
             recording.detach(take)
             raise
         logger.info("takes: recording %s", take.path)
-        return StoredTake(take.name, 0, take.utime, 0.0, is_running=True)
+        details = take.header.description.details
+        return StoredTake(take.name, 0, take.utime, 0.0, is_running=True, details=details)
 
     def running(self, source: str) -> TakeFile | None:
         """Return the running take of a source."""
@@ -138,7 +142,12 @@ class RecordedTakes:
         return stored._replace(num_lost=take.num_lost)
 
     async def save(
-        self, source: str, last_s: float = math.inf, after_s: float = 0.0, name: str = ""
+        self,
+        source: str,
+        last_s: float = math.inf,
+        after_s: float = 0.0,
+        name: str = "",
+        details: TakeDetails = NO_DETAILS,
     ) -> StoredTake:
         """See Takes."""
         recording, recorder = self._announced(source), self._open_recorder()
@@ -163,7 +172,7 @@ class RecordedTakes:
         now_s = self._host.monotonic()
         folder = self._folder.directory / source / (name or default_name(source))
         since_s = now_s - last_s
-        call = partial(segments.save, folder, since_s, has_free_name=not name, goes_on=after_s > 0)
+        call = partial(segments.save, folder, since_s, details, has_free_name=not name, goes_on=after_s > 0)
         saved = recorder.call(call)
         try:
             save = await disk_result(saved, folder, self.disk)
@@ -257,9 +266,9 @@ class RecordedTakes:
         recording.segments = segments
         recording.add(recorder, segments, self.settings.components)
 
-    def _header(self, recording: SourceRecording) -> FileHeader:
+    def _header(self, recording: SourceRecording, details: TakeDetails = NO_DETAILS) -> FileHeader:
         source = recording.source
-        description = SourceDescription(source, self.settings.prefix, self.server(source))
+        description = SourceDescription(source, self.settings.prefix, self.server(source), details)
         return FileHeader(description, recording.parameters)
 
     def add_c3d(self, source: str, c3d_file: Path) -> None:

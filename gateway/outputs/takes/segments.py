@@ -8,15 +8,17 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from gateway.errors import QueryError
+from gateway.errors import QueryError, TakeError
 from gateway.losses import Losses
 from gateway.outputs.takes.disk import Disk, is_full
-from gateway.outputs.takes.header import FileHeader
+from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.log_sink import LogSink
+from gateway.takes.description import NO_DETAILS, TakeDetails
+from gateway.takes.event_log import EventLogReader
 from gateway.takes.names import default_name, numbered
 from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
@@ -41,7 +43,10 @@ class _Segment:
 
 
 class Save:
-    """A take that is being saved: a folder with a link to each segment."""
+    """A take that is being saved: a folder with a link to each segment.
+
+    Segments are shared, so what the take is about is in a file of its own, the first one.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -51,8 +56,20 @@ class Save:
 
     def link(self, segment: Path) -> None:
         """Add a segment. Raises OSError."""
-        os.link(segment, self.folder / f"{self.name}-{self._num_files + 1:03}{SUFFIX}")
+        os.link(segment, self._path(self._num_files + 1))
         self._num_files += 1
+
+    def describe(self, description: SourceDescription) -> None:
+        """Add a file that says what the take is about, after the first segment. Raises OSError."""
+        utime = next(EventLogReader(self._path(1)).events()).utime
+        log = FileHeader(description, None).begin_log(self._path(0), self.name, utime)
+        try:
+            log.append([(description.channel("end"), description.end_message(utime, 0))])
+        finally:
+            log.close()
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{self.name}-{number:03}{SUFFIX}"
 
     @property
     def is_full(self) -> bool:
@@ -171,7 +188,15 @@ class RollingSegments(LogSink):
 
     # Saving.
 
-    def save(self, folder: Path, since_s: float, *, has_free_name: bool, goes_on: bool) -> Save:
+    def save(
+        self,
+        folder: Path,
+        since_s: float,
+        details: TakeDetails = NO_DETAILS,
+        *,
+        has_free_name: bool,
+        goes_on: bool,
+    ) -> Save:
         """Keep the segments since a time on the monotonic clock as a take in a new ``folder``.
 
         If it ``goes_on``, further segments are added until ``end_save``. Otherwise, the present segment ends
@@ -187,7 +212,9 @@ class RollingSegments(LogSink):
                         save.link(segment.path)
             if self._log is not None:
                 save.link(self._log.path)
-        except OSError:
+            if details != NO_DETAILS:
+                save.describe(replace(self.header.description, details=details))
+        except (OSError, TakeError):
             shutil.rmtree(save.folder, ignore_errors=True)
             raise
         self._saves.append(save)

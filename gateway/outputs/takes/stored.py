@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+from gateway.takes.description import NO_DETAILS, TakeDetails
+
 MAX_PIECE_BYTES: Final = 1024 * 1024
 """The most bytes of a take that one call reads."""
 
@@ -23,6 +25,7 @@ class StoredTake(NamedTuple):
     is_running: bool = False
     num_lost: int = 0
     is_cut_off: bool = False
+    details: TakeDetails = NO_DETAILS
 
 
 class SourceTakes(NamedTuple):

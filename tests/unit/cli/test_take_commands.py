@@ -32,6 +32,12 @@ def test_a_row_has_what_matters() -> None:
     assert "lab: the last 60 s are kept, to be saved with: take save" in text
 
 
+def test_what_takes_are_about_is_a_column_if_somebody_said_it() -> None:
+    about = {"subject": "S01", "session": "pre", "note": "left knee"}
+    assert "subject S01, session pre: left knee" in written(takes=[TAKE, TAKE | about], num_takes=2)
+    assert "about" not in written(takes=[TAKE], num_takes=1)
+
+
 def test_without_a_terminal_there_is_one_line_for_each_take(capsys: pytest.CaptureFixture[str]) -> None:
     """It was a table of 80 columns, with names on two lines."""
     out = io.StringIO()

@@ -30,7 +30,7 @@ from gateway.rtc3d.parameters import (
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from tests.recorded_scenes import record_scene, scene_messages
-from tests.takes import START_UTIME, Message, description, frame, parameters
+from tests.takes import START_UTIME, Message, description, details, frame, parameters
 from tests.unit.export.exported import (
     NAN,
     SCENE,
@@ -153,9 +153,13 @@ def test_events_have_their_side_as_context(tmp_path: Path) -> None:
         frame(ComponentType.EVENT, [item], n, timestamp_us=5_000_000, utime=START_UTIME + 3000)
         for n, item in enumerate(items)
     ]
-    found, _ = export_c3d(tmp_path, [parameters(described), *scene_messages(SCENE, 100), *events])
+    about = details("S01", "baseline", "left knee, second visit after surgery")
+    found, _ = export_c3d(tmp_path, [about, parameters(described), *scene_messages(SCENE, 100), *events])
+    assert (found("SUBJECTS", "USED").tolist(), found("SUBJECTS", "NAMES")) == ([1], ["S01"])
+    assert found("TRIAL", "SESSION") == ["baseline"]
+    assert found("TRIAL", "NOTE") == ["left knee, second visit after", "surgery"]
     assert found("EVENT", "CONTEXTS") == ["Left", "Right", "Right", "Invalid", "General"]
-    assert found("EVENT", "SUBJECTS") == ["", "", "", "", "Anna"]
+    assert found("EVENT", "SUBJECTS") == ["S01", "S01", "S01", "S01", "Anna"]
 
 
 def test_labels_that_c3d_cannot_hold_are_changed_and_reported(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from tests.recorded_scenes import scene_messages
-from tests.takes import START_UTIME, Message, description, frame, markers, parameters
+from tests.takes import START_UTIME, Message, description, details, frame, markers, parameters
 from tests.unit.export.exported import export_messages
 from tests.unit.export.read_mcap import (
     McapContent,
@@ -91,7 +91,12 @@ def test_every_value_of_a_real_recording_is_exported(tmp_path: Path) -> None:
 
 
 def test_every_value_of_a_computed_scene_is_exported(tmp_path: Path) -> None:
-    messages = [description(), parameters(SCENE.parameters), *scene_messages(SCENE, 50)]
+    messages = [
+        description(),
+        details("S01"),
+        parameters(SCENE.parameters),
+        *scene_messages(SCENE, 50),
+    ]
     content = export(tmp_path, messages)
     assert_equals_take(content, tmp_path / "take.lcmlog")
     assert content.schemas == {
@@ -103,7 +108,8 @@ def test_every_value_of_a_computed_scene_is_exported(tmp_path: Path) -> None:
         "/lab/plates": "foxglove.SceneUpdate",
         "/lab/parameters": "rtc3d.Parameters",
     }
-    assert content.metadata == {"lab": {"server": "192.0.2.20:3020", "gateway_version": "1.0"}}
+    facts = {"server": "192.0.2.20:3020", "gateway_version": "1.0", "subject": "S01"}
+    assert content.metadata == {"lab": facts}
     [attachment] = content.attachments
     assert (attachment.name, attachment.media_type) == ("lab-parameters-1.xml", "application/xml")
     assert attachment.data == encode_parameters(SCENE.parameters)

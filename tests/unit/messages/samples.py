@@ -92,6 +92,15 @@ def take_message() -> bytes:
     return encoded
 
 
+def take_details_message() -> bytes:
+    """Return what a take is about."""
+    message = rtc3d.take_details_t()
+    message.utime, message.source = 1_700_000_000_000_000, "lab"
+    message.subject, message.session, message.note = "S01", "baseline", "left knee"
+    encoded: bytes = message.encode()
+    return encoded
+
+
 def take_end_message() -> bytes:
     """Return the end of a take."""
     message = rtc3d.take_end_t()

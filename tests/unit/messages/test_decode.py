@@ -14,6 +14,7 @@ from tests.unit.messages.samples import (
     component_message,
     parameter_messages,
     status_of,
+    take_details_message,
     take_end_message,
     take_message,
     tool_pose_messages,
@@ -23,7 +24,8 @@ from tests.vectors import COMPONENTS, LONG_EVENTS, MARKERS
 
 MISSING = [None] * 3
 PUBLISHED = [*map(component_message, COMPONENTS), *tool_pose_messages(), status_of(), unknown_clock()]
-EVERY_MESSAGE = [*PUBLISHED, *parameter_messages(), *command_messages(), take_message(), take_end_message()]
+IN_FILES = [take_message(), take_details_message(), take_end_message()]
+EVERY_MESSAGE = [*PUBLISHED, *parameter_messages(), *command_messages(), *IN_FILES]
 
 
 def test_every_message_is_decoded_by_its_fingerprint_and_can_be_written_as_json() -> None:
@@ -36,7 +38,7 @@ def test_every_message_is_decoded_by_its_fingerprint_and_can_be_written_as_json(
         assert json.loads(json.dumps(value, allow_nan=False)) == value
         assert json_text(decoded) == json.dumps(value, separators=(",", ":"), ensure_ascii=False)
     assert set(MESSAGE_TYPES_BY_NAME) == {type(decode(message)).__name__ for message in EVERY_MESSAGE}
-    assert len(MESSAGE_TYPES_BY_NAME) == 15
+    assert len(MESSAGE_TYPES_BY_NAME) == 16
 
 
 def test_messages_that_are_unknown_or_truncated_anywhere_are_rejected() -> None:

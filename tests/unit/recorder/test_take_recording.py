@@ -21,6 +21,7 @@ from gateway.subscriber import reception
 from gateway.subscriber import series as subscriber_series
 from gateway.subscriber.reception import MAX_SOURCES
 from gateway.subscriber.series import FINGERPRINTS
+from gateway.takes.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
 from tests.settable_clock import Clock
@@ -46,7 +47,9 @@ def status(source: str, sequence: int = 0) -> bytes:
 class Recorded:
     """A recording on a file in a folder."""
 
-    def __init__(self, folder: Path, *components: str, start_s: float = 0.0) -> None:
+    def __init__(
+        self, folder: Path, *components: str, start_s: float = 0.0, details: TakeDetails = NO_DETAILS
+    ) -> None:
         self.path = folder / "walk.lcmlog"
         target = Target(self.path)
         self.opened: list[list[str]] = []
@@ -55,7 +58,7 @@ class Recorded:
             self.opened.append(sources)
             return FileSink(target.open(sources))
 
-        self.recording = TakeRecording(open_file, components or None, start_s)
+        self.recording = TakeRecording(open_file, components or None, start_s, details)
 
     def source(self, name: str) -> RecordedSource:
         source = self.recording.source(name, f"MOCAP_{name.upper().replace('-', '_')}", is_known=True)
@@ -130,6 +133,18 @@ def test_the_file_begins_with_the_description_although_messages_came_first(recor
     assert (take.server, take.gateway_version) == ("192.0.2.7:3020", "0.0.9")
     assert take.utime == parameters.utime == UTIME + 5000 * 40
     assert (parameters.parameters_version, parameters.session, parameters.xml) == (7, 1, "<b/>")
+
+
+def test_each_source_has_what_the_recording_is_about(tmp_path: Path) -> None:
+    """The file can be split by source, as exports do."""
+    about = TakeDetails("S01", "baseline", "left knee")
+    recorded = Recorded(tmp_path, details=about)
+    for name in ("lab", "hall"):
+        recorded.describe(name)
+    messages = dict(recorded.events())
+    for name in ("lab", "hall"):
+        details = decode(messages[f"MOCAP_{name.upper()}_DETAILS"])
+        assert (details.source, *decoded_details(details)) == (name, *about)
 
 
 def test_parameters_are_written_when_they_change_only(recorded: Recorded) -> None:

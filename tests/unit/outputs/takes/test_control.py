@@ -9,9 +9,11 @@ import pytest
 from gateway.errors import QueryError
 from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, TakeCommand
 from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
+from gateway.takes.description import NO_DETAILS, TakeDetails
 from tests.settable_clock import Clock
 
-WALK = StoredTake("walk-1", 4096, 1_700_000_000_000_000, 12.34567, is_running=True, num_lost=2)
+ABOUT = TakeDetails("S01", note="left knee")
+WALK = StoredTake("walk-1", 4096, 1_700_000_000_000_000, 12.34567, True, 2, details=ABOUT)
 WALK_FIELDS = {
     "name": "walk-1",
     "bytes": 4096,
@@ -20,6 +22,9 @@ WALK_FIELDS = {
     "is_running": True,
     "lost": 2,
     "is_cut_off": False,
+    "subject": "S01",
+    "session": "",
+    "note": "left knee",
 }
 
 
@@ -47,11 +52,18 @@ def command_of(takes: FakeTakes, clock: Clock | None = None) -> TakeCommand:
 @pytest.mark.parametrize(
     ("options", "call"),
     [
-        ({"set": "start"}, ("start", "lab", "")),
-        ({"set": "start", "name": "walk-1"}, ("start", "lab", "walk-1")),
+        ({"set": "start"}, ("start", "lab", "", NO_DETAILS)),
+        ({"set": "start", "name": "walk-1"}, ("start", "lab", "walk-1", NO_DETAILS)),
+        (
+            {"set": "start", "subject": "S01", "session": " pre ", "note": "50 %25%3B s=1 动作"},
+            ("start", "lab", "", TakeDetails("S01", "pre", "50 %; s=1 动作")),
+        ),
         ({"set": "stop"}, ("stop", "lab")),
-        ({"set": "save"}, ("save", "lab", MAX_SAVED_S, 0.0, "")),
-        ({"set": "save", "last": "120", "after": "1.5", "name": "fall"}, ("save", "lab", 120.0, 1.5, "fall")),
+        ({"set": "save"}, ("save", "lab", MAX_SAVED_S, 0.0, "", NO_DETAILS)),
+        (
+            {"set": "save", "last": "120", "after": "1.5", "name": "fall", "subject": "S" * 64},
+            ("save", "lab", 120.0, 1.5, "fall", TakeDetails("S" * 64)),
+        ),
     ],
 )
 async def test_takes_are_started_stopped_and_saved(options: dict[str, str], call: tuple[Any, ...]) -> None:
@@ -103,6 +115,9 @@ ACCEPTED = "is not accepted"
         ({"offset": "0"}, "unknown option 'offset' of take"),
         ({"read": "w", "offset": "-1"}, "offset='-1' is not accepted; accepted: a number of bytes"),
         *(({"read": "w", "offset": offset}, ACCEPTED) for offset in ("nan", "", "9" * 19, "٣", "1\n")),
+        ({"set": "stop", "note": "w"}, "unknown option 'note' of take with set=stop"),
+        *(({"set": "start", "note": note}, ACCEPTED) for note in ("two%0Alines", "%1B[2J", "n" * 501, "%FF")),
+        *(({"set": "save", name: "s" * 65}, "up to 64 characters") for name in ("subject", "session")),
         ({"set": "save", "last": "nan"}, "last='nan' is not accepted; accepted: a number of seconds up to"),
         *(({"set": "save", "last": last}, f"last='{last}' {ACCEPTED}") for last in ("inf", "-1", "3601")),
         *(({"set": "save", "after": after}, ACCEPTED) for after in ("1e3", "9" * 1_000_000)),

@@ -16,6 +16,7 @@ from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.takes.description import TakeDetails
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
 from gateway.takes.recording import LogFile
@@ -144,6 +145,20 @@ def test_a_saved_take_ends_at_once_and_its_segments_are_shared(rolling: Rolling)
     ]
     for log in logs:
         assert next(EventLogReader(log).events()).channel == "MOCAP_LAB_TAKE"
+
+
+def test_what_a_saved_take_is_about_is_in_a_first_file_of_its_own(rolling: Rolling) -> None:
+    """Segments are shared between takes, so nothing can be added to them; times must not go back, though."""
+    rolling.write(25)
+    about = TakeDetails("S01", note="fell")
+    save = rolling.segments.save(rolling.takes / "fall", 0.0, about, has_free_name=False, goes_on=False)
+    first, second, *_ = sorted(save.folder.iterdir())
+    assert first.name == "fall-000.lcmlog"
+    utimes = [event.utime for path in (first, second) for event in EventLogReader(path).events()]
+    assert utimes == sorted(utimes)
+    take = TakesFolder(rolling.takes.parent).take_at(save.folder)
+    assert (take.details, take.is_cut_off, take.num_lost) == (about, False, 0)
+    assert numbers(save.folder) == [*range(25)]
 
 
 def test_takes_that_go_on_get_each_segment_until_their_end(rolling: Rolling) -> None:

@@ -20,6 +20,9 @@ from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.stored import StoredTake
+from gateway.takes import open_take
+from gateway.takes.description import NO_DETAILS, TakeDetails
+from gateway.takes.statistics import take_statistics
 from tests.recording_output import events, frames, still_lab
 from tests.settable_clock import Clock
 from tests.virtual_time import run_in_virtual_time
@@ -69,6 +72,24 @@ async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_
     assert (changed.xml, changed.sequence) == ("<changed/>", 2)
     times = [event.utime for event in found]
     assert times == sorted(times)
+
+
+async def test_what_a_take_is_about_is_in_its_file_and_its_list(tmp_path: Path) -> None:
+    """A year later, nobody knows whose steps these were; the file and the list say it."""
+    about = TakeDetails("S01", "baseline", "left knee; 50 %")
+    async with still_lab(tmp_path) as lab:
+        started = await lab.takes.start("lab", "walk", about)
+        lab.publish()
+        await lab.takes.stop("lab")
+        await lab.takes.start("lab", "silent")
+        await lab.takes.stop("lab")
+        listed = {take.name: take.details for take in (await lab.takes.list("lab")).takes}
+    assert started.details == about
+    assert listed == {"walk": about, "silent": NO_DETAILS}
+    path = lab.path("walk.lcmlog")
+    assert [event.channel for event in events(path)[:2]] == ["MOCAP_LAB_TAKE", "MOCAP_LAB_DETAILS"]
+    assert open_take(path).sources["lab"].details == about
+    assert take_statistics(path).sources["lab"].details == about
 
 
 async def test_parameters_stay_in_order_although_long_ones_are_encoded_elsewhere(tmp_path: Path) -> None:
