@@ -13,14 +13,16 @@ from tests.soak.soak import (
     BACKOFF_S,
     COMPONENTS,
     MAX_SILENCE_S,
+    NUM_TOOLS,
     RATE_HZ,
     RECOVERY_LIMIT_S,
     STALL_S,
     Round,
     Soak,
+    Usage,
 )
 
-_NUM_MEMORY_COLUMNS: Final = 6
+_NUM_USAGE_COLUMNS: Final = 6
 
 
 def report(soak: Soak) -> str:
@@ -28,8 +30,8 @@ def report(soak: Soak) -> str:
     sections = [
         _introduction(soak),
         _totals(soak),
-        "The memory of the gateway, in MiB, after each part of the time:",
-        _memory(soak),
+        "What the gateway used after each part of the time, memory in MiB:",
+        _usage(soak),
         "The healthy source during each attack: its longest silence at a subscriber and its missing "
         "messages, the lines that all sources together logged in one round at most, and the largest growth "
         "of the gateway's memory in one round.",
@@ -69,11 +71,13 @@ def _introduction(soak: Soak) -> str:
         f"Random faults and attacks for {soak.minutes:g} minutes (`make soak SOAK_MINUTES="
         f"{soak.minutes:g}`, seed {soak.seed}), {datetime.now(UTC):%Y-%m-%d}, version {version_text()}, "
         f"Python {platform.python_version()}, uvloop {version('uvloop')}, {platform.machine()}. "
-        f"The gateway has two sources at {RATE_HZ:g} Hz, and some whose servers are hostile. Each round "
-        "begins one attack and one fault of the first source's simulator (see `rtc3d-gateway simulate "
-        "--list-faults`), ends both after a few seconds, and waits until data of that source flows again. "
-        "Nothing disturbs the server of the second, healthy source. The first source's stall_timeout_s is "
-        f"{STALL_S:g} and its reconnect.max_delay_s is {BACKOFF_S:g}."
+        f"The gateway has two sources at {RATE_HZ:g} Hz, one with {NUM_TOOLS} tools, each on a key of its "
+        "own, and some whose servers are hostile. All outputs are on. Each round reloads a changed "
+        "configuration (one source more or less, other names on ROS 2), begins one attack and one fault of "
+        "the first source's simulator (see `rtc3d-gateway simulate --list-faults`), ends both after a few "
+        "seconds, and waits until data of that source flows again. Nothing disturbs the server of the "
+        f"healthy source. The first source's stall_timeout_s is {STALL_S:g} and its reconnect.max_delay_s is "
+        f"{BACKOFF_S:g}."
     )
 
 
@@ -115,12 +119,17 @@ def _silent_rounds(rounds: Sequence[Round]) -> list[Round]:
     return [each for each in rounds if max(each.longest_silence_s.values()) > MAX_SILENCE_S]
 
 
-def _memory(soak: Soak) -> str:
-    memory_kib = [soak.start_kib, *(each.memory_kib for each in soak.rounds)]
-    parts = [number / (_NUM_MEMORY_COLUMNS - 1) for number in range(_NUM_MEMORY_COLUMNS)]
-    titles = ["time", *(f"{part:.0%}" for part in parts), "peak"]
-    values = [memory_kib[round(part * (len(memory_kib) - 1))] for part in parts] + [max(memory_kib)]
-    return _table(titles, [["memory", *(f"{value / 1024:.1f}" for value in values)]])
+def _usage(soak: Soak) -> str:
+    usage = [soak.start, *(each.usage for each in soak.rounds)]
+    parts = [number / (_NUM_USAGE_COLUMNS - 1) for number in range(_NUM_USAGE_COLUMNS)]
+    shown = [usage[round(part * (len(usage) - 1))] for part in parts]
+    shown.append(Usage(*map(max, zip(*usage, strict=True))))
+    rows: list[list[object]] = [
+        ["memory", *(f"{each.memory_kib / 1024:.1f}" for each in shown)],
+        ["threads", *(each.threads for each in shown)],
+        ["descriptors", *(each.descriptors for each in shown)],
+    ]
+    return _table(["time", *(f"{part:.0%}" for part in parts), "peak"], rows)
 
 
 def _attacks(rounds: Sequence[Round]) -> str:
@@ -128,7 +137,9 @@ def _attacks(rounds: Sequence[Round]) -> str:
     growth_kib: defaultdict[str, int] = defaultdict(int)
     for before, after in zip([rounds[0], *rounds], rounds, strict=False):
         by_attack[after.attack].append(after)
-        growth_kib[after.attack] = max(growth_kib[after.attack], after.memory_kib - before.memory_kib)
+        growth_kib[after.attack] = max(
+            growth_kib[after.attack], after.usage.memory_kib - before.usage.memory_kib
+        )
     rows = [
         (
             attack,

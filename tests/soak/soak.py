@@ -1,23 +1,27 @@
 """One run: rounds of faults and attacks, what subscribers receive, and the memory of the gateway.
 
-The gateway has three kinds of sources: ``lab``, a simulator in this process with faults; ``healthy``, a
-simulator that nothing disturbs, in another process; and sources whose servers are attackers. In each round,
-one fault and one attack begin and end; then data of ``lab`` must flow again.
+The gateway has four kinds of sources: ``lab``, a simulator in this process with faults; ``healthy``, a
+simulator that nothing disturbs, in another process; ``tools``, one with hundreds of tools; and sources whose
+servers are attackers. All outputs are on. In each round, the gateway reloads a configuration with or without
+one more source and with other names on ROS 2, and one fault and one attack begin and end; then data of
+``lab`` must flow again.
 """
 
 import asyncio
 import json
 import random
+import signal
 import sys
 import tempfile
 import time
 from asyncio.subprocess import DEVNULL
 from collections import Counter
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
@@ -38,11 +42,13 @@ from tests.hostile.gateway_under_attack import (
     log_lines_per_minute,
     longest_silence_s,
     num_missing,
+    rss_kib,
     run_gateway,
 )
 from tests.lsl_receiver import lsl_config
 from tests.name_server import dead_name_server
-from tests.networks import free_port
+from tests.networks import free_endpoint, free_port
+from tests.networks import open_zenoh as open_session
 from tests.soak.attacks import ATTACKS, Target
 from tests.waiting import wait_until_async
 
@@ -52,6 +58,10 @@ BACKOFF_S: Final = 0.5
 STALL_S: Final = 1.0
 RECOVERY_LIMIT_S: Final = 30.0
 FAULT_S: Final = (0.3, 3.0)
+NUM_TOOLS: Final = 300
+TOOLS_SCENE: Final = ("--markers", "0", "--tools", str(NUM_TOOLS), "--rate", "10", "--analog-rate", "10")
+"""A source with tools by the hundred; each has a key of its own."""
+
 ATTACK_START_S: Final = 1.0
 """How long the process of an attack takes to start."""
 
@@ -92,6 +102,21 @@ class ReceivedMessages:
                 self.status = decoded
 
 
+class Usage(NamedTuple):
+    """What a process uses."""
+
+    memory_kib: int
+    threads: int
+    descriptors: int
+
+    @classmethod
+    def of(cls, process_id: int) -> "Usage":
+        """Return what a process uses now."""
+        folder = Path(f"/proc/{process_id}")
+        threads, descriptors = (len([*(folder / name).iterdir()]) for name in ("task", "fd"))
+        return cls(rss_kib(process_id), threads, descriptors)
+
+
 @dataclass(frozen=True)
 class Round:
     """One fault and one attack, and what the healthy source suffered meanwhile."""
@@ -105,14 +130,18 @@ class Round:
     missing: int
     lines: int
     """The number of lines that were logged."""
-    memory_kib: int
-    """The memory of the gateway at the end."""
+    usage: Usage
+    """What the gateway used at the end."""
 
 
 class Soak:
-    """One run of ``minutes``. ``gateway_report`` is about the whole run, ``start_kib`` its first memory."""
+    """One run of ``minutes``.
+
+    ``gateway_report`` is about the whole run, ``start`` what the gateway used at its beginning.
+    """
 
     gateway_report: Report
+    start: Usage
 
     def __init__(self, minutes: float, seed: int) -> None:
         self.minutes = minutes
@@ -120,9 +149,9 @@ class Soak:
         self.random = random.Random(seed)
         self.messages = ReceivedMessages()
         self.rounds: list[Round] = []
-        self.start_kib = 0
         self.sent: Counter[str] = Counter()
         self._attacks: list[str] = []
+        self._reload: Callable[..., None]
 
     async def run(self, console: Console) -> None:
         """Run for ``minutes`` and print a line after each round."""
@@ -131,7 +160,13 @@ class Soak:
         )
         ports = {name: free_port() for name in HOSTILE}
         output_ports = {name: free_port() for name in ("rtc3d", "vrpn", "foxglove")}
-        with tempfile.TemporaryDirectory() as folder, simulator_process(*HEALTHY_SCENE) as (healthy_port, _):
+        router = open_session("router", listen=(ros_router := free_endpoint()))
+        router.declare_subscriber("**", lambda _sample: None)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            simulator_process(*HEALTHY_SCENE) as (healthy_port, _),
+            simulator_process(*TOOLS_SCENE) as (tools_port, _),
+        ):
             async with Simulator(scene, port=free_port()) as simulator:
                 sources: dict[str, Source] = {
                     "lab": {
@@ -140,6 +175,7 @@ class Soak:
                         "stall_timeout_s": STALL_S,
                     },
                     **ports,
+                    "tools": tools_port,
                     "dead-name": {"host": "dead.example.org"},
                     "nobody": free_port(),
                 }
@@ -149,6 +185,9 @@ class Soak:
                     for name, port in output_ports.items()
                 }
                 settings["lsl"] = {"enabled": True, "config": str(lsl_config(Path(folder)))}
+                settings["ros2"] = {"enabled": True, "connect": ros_router}
+                settings["zenoh"] = {"tool_poses": True}
+                settings["takes"] = {"enabled": True, "directory": f"{folder}/takes", "keep_last_s": 30}
                 with dead_name_server(Path(folder)) as before_command:
                     async with run_gateway(
                         Path(folder),
@@ -157,8 +196,10 @@ class Soak:
                         settings,
                         before_command=before_command,
                     ) as gateway:
+                        self._reload = partial(_reload, gateway, sources, settings)
                         await self._run(simulator, gateway, output_ports, tuple(ports.values()), console)
                 self.gateway_report = gateway.report
+        router.close()
 
     async def _run(
         self,
@@ -182,7 +223,7 @@ class Soak:
         end_s = time.monotonic() + 60 * self.minutes
         try:
             await wait_until_async(lambda: self.messages.received["3d"] > RATE_HZ)
-            self.start_kib = gateway.rss_kib()
+            self.start = Usage.of(gateway.process.pid)
             await gateway.arrivals()  # what came before the first round
             while time.monotonic() < end_s and gateway.process.returncode is None:
                 await self._round(simulator.faults, gateway, target)
@@ -201,6 +242,7 @@ class Soak:
     async def _round(self, faults: Faults, gateway: RunningGateway, target: Target) -> None:
         fault, attack = self.random.choice(sorted(KINDS)), self._next_attack()
         lines = gateway.log.count("\n")
+        self._reload(is_odd=bool(len(self.rounds) % 2))
         async with _attacking(attack, target):
             await asyncio.sleep(ATTACK_START_S)
             faults.begin(KINDS[fault].model_validate({}))
@@ -225,7 +267,7 @@ class Soak:
                 longest_silence_s(arrivals),
                 num_missing(arrivals),
                 gateway.log.count("\n") - lines,
-                gateway.rss_kib(),
+                Usage.of(gateway.process.pid),
             )
         )
 
@@ -258,8 +300,19 @@ def _line(done: Round) -> str:
     silence_ms = 1000 * max(done.longest_silence_s.values())
     return (
         f"{done.fault:24} {done.attack:26} {recovered}; healthy: {silence_ms:4.0f} ms silent, "
-        f"{done.missing} missing; {done.memory_kib / 1024:.1f} MiB"
+        f"{done.missing} missing; {done.usage.memory_kib / 1024:.1f} MiB, {done.usage.threads} threads, "
+        f"{done.usage.descriptors} descriptors"
     )
+
+
+def _reload(
+    gateway: RunningGateway, sources: Mapping[str, Source], settings: Mapping[str, Any], *, is_odd: bool
+) -> None:
+    """Let the gateway add or remove a source, and give everything on ROS 2 another name."""
+    guest = {"guest": gateway.healthy_port} if is_odd else {}
+    ros2 = {**settings["ros2"], "namespace": "guests" if is_odd else "mocap"}
+    gateway.write_config({**sources, **guest}, {**settings, "ros2": ros2})
+    gateway.process.send_signal(signal.SIGHUP)
 
 
 @asynccontextmanager
