@@ -197,10 +197,10 @@ class TakesFolder:
         entries = sorted(self.entries(source), key=lambda entry: entry.end_s, reverse=True)
         return [self._stored(entry, entry.path.name in running) for entry in entries]
 
-    def take_at(self, path: Path) -> StoredTake:
+    def take_at(self, path: Path, *, is_running: bool = False) -> StoredTake:
         """Return the take with this path, without extension. Raises OSError, and QueryError if it is gone."""
         for entry in _source_entries(path.parent, path.name):
-            return self._stored(entry, is_running=False)
+            return self._stored(entry, is_running)
         raise QueryError(f"there is no take {path} any more; somebody has removed it")
 
     def _stored(self, entry: TakeEntry, is_running: bool) -> StoredTake:

@@ -187,8 +187,8 @@ class RecordedTakes:
         else:
             recording.ended(save.folder)
         logger.info("takes: saving %s", save.folder)
-        stored = await self._reader.read(partial(self._folder.take_at, save.folder), folder)
-        return stored._replace(is_running=after_s > 0)
+        stored = partial(self._folder.take_at, save.folder, is_running=after_s > 0)
+        return await self._reader.read(stored, folder)
 
     async def list(self, source: str) -> SourceTakes:
         """See Takes."""
@@ -198,9 +198,9 @@ class RecordedTakes:
         take = recording.take
         current: StoredTake | None = None
         if take is not None:
-            stored = await self._reader.read(partial(folder.take_at, take.stem), take.path)
+            stored = await self._reader.read(partial(folder.take_at, take.stem, is_running=True), take.path)
             if recording.take is take:  # otherwise, it has just ended
-                current = stored._replace(is_running=True, num_lost=take.num_lost)
+                current = stored._replace(num_lost=take.num_lost)
                 takes = [current if each.name == current.name else each for each in takes]
         kept_s = 0.0 if recording.segments is None else recording.segments.kept_s()
         return SourceTakes(current, takes, kept_s)

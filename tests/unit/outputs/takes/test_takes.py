@@ -173,11 +173,13 @@ async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
         await lab.takes.stop("lab")
         await lab.takes.save("lab", 60, 0, "fall")
         lab.publish()
-        await lab.takes.save("lab", 60, 30, "long fall")
+        saving = await lab.takes.save("lab", 60, 30, "long fall")
+        assert (saving.is_running, saving.is_cut_off) == (True, False)
         await lab.takes.start("lab", "run")
         found = await lab.takes.list("lab")
         assert found.running is not None
         assert (found.running.name, found.running.is_running) == ("run", True)
+        assert not any(take.is_cut_off for take in [found.running, *found.takes])
         running = {take.name: take.is_running for take in found.takes}
         assert running == {"walk": False, "fall": False, "long fall": True, "run": True}
         [walk] = [take for take in found.takes if take.name == "walk"]
@@ -200,10 +202,10 @@ async def test_a_take_that_ends_while_listed_has_ended(
         take_at = TakesFolder.take_at
         ends: list[Coroutine[Any, Any, StoredTake]] = []
 
-        def end_and_read(folder: TakesFolder, path: Path) -> StoredTake:
+        def end_and_read(folder: TakesFolder, path: Path, *, is_running: bool = False) -> StoredTake:
             if not ends:
                 ends.append(lab.takes.end("lab"))
-            return take_at(folder, path)
+            return take_at(folder, path, is_running=is_running)
 
         monkeypatch.setattr(TakesFolder, "take_at", end_and_read)
         assert (await lab.takes.list("lab")).running is None
