@@ -20,9 +20,6 @@ from gateway.rtc3d.packets import PacketType, encode_packet
 
 Peer = Generator[Counter[str] | None, Any, None]
 
-LSL_CONFIG: Final = "[ports]\nIPv6 = disable\n[multicast]\nResolveScope = machine\n[log]\nlevel = -3\n"
-"""The configuration of liblsl, so that it finds streams of this computer without multicast."""
-
 _VRPN_COOKIE: Final = b"vrpn: ver. 07.35  0".ljust(24, b"\0")
 _READ_BYTES: Final = 1 << 20
 _POLL_S: Final = 0.02

@@ -23,6 +23,7 @@ from benchmarks.workbench import lcm_url, relay_cuts
 from benchmarks.workloads import DENSE
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.outputs.registry import OUTPUTS
+from tests.lsl_receiver import lsl_config
 from tests.networks import free_port
 
 TITLE: Final = "CPU time per frame of five components at 1000 Hz, by output"
@@ -72,9 +73,9 @@ def _endpoint(port: int) -> str:
 
 
 def _lsl_config(at: Endpoints) -> Path:
+    """Return the configuration that the gateway and its peer share, as docs/how-to/lsl.md recommends it."""
     file = at.folder / "lsl_api.cfg"
-    file.write_text(output_peers.LSL_CONFIG)
-    return file
+    return file if file.exists() else lsl_config(at.folder)
 
 
 def _zenoh_peer(endpoint: str, keys: str) -> Worker:

@@ -5,6 +5,7 @@
     GatewayError                  base of all errors that this package raises on purpose
     ├── ConfigError               a configuration is invalid: every problem, with file and line
     ├── TakeError                 a recording (.lcmlog, .c3d) cannot be read, written or converted
+    │   └── SelectionError        a recording lacks the chosen source or part, or no format has this extension
     ├── ProtocolError             bytes that violate RTC3D
     │   ├── PacketError           §4: a size out of bounds; the connection must end
     │   ├── FrameError            §7: sizes and counts contradict each other; the frame is rejected
@@ -42,6 +43,10 @@ class ConfigError(GatewayError):
 
 class TakeError(GatewayError):
     """A recording, an event log or a C3D file, cannot be read, played, written or converted."""
+
+
+class SelectionError(TakeError):
+    """A recording lacks the source or part that options choose, or there is no format for an extension."""
 
 
 class ProtocolError(GatewayError):

@@ -38,11 +38,16 @@ class HandshakeRefusedError(Exception):
     """The server's HTTP response, if it is not that of a WebSocket."""
 
 
-def upgrade_request(key: bytes, subprotocol: str) -> bytes:
+def upgrade_request(key: bytes, subprotocol: str, *headers: str) -> bytes:
+    """Return the request of a program, or with ``headers``, such as Origin, that of a browser."""
     return (
-        b"GET / HTTP/1.1\r\nHost: viewer\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: " + key + b"\r\n"
-        b"Sec-WebSocket-Protocol: " + subprotocol.encode() + b"\r\n\r\n"
+        b"Sec-WebSocket-Protocol: "
+        + subprotocol.encode()
+        + b"\r\n"
+        + "".join(f"{header}\r\n" for header in headers or ("Host: viewer",)).encode()
+        + b"\r\n"
     )
 
 
@@ -88,11 +93,13 @@ class Viewer:
         self.is_closed = False
 
     @classmethod
-    async def open(cls, port: int, subprotocol: str = "foxglove.sdk.v1", host: str = "127.0.0.1") -> Self:
+    async def open(
+        cls, port: int, subprotocol: str = "foxglove.sdk.v1", *headers: str, host: str = "127.0.0.1"
+    ) -> Self:
         """Connect and complete the handshake. Raises HandshakeRefusedError."""
         reader, writer = await asyncio.open_connection(host, port, limit=1 << 26)
         key = base64.b64encode(os.urandom(16))
-        writer.write(upgrade_request(key, subprotocol))
+        writer.write(upgrade_request(key, subprotocol, *headers))
         head = (await reader.readuntil(b"\r\n\r\n")).decode()
         if not head.startswith("HTTP/1.1 101 "):
             writer.close()

@@ -49,6 +49,7 @@ def echo(
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
 
     from gateway.cli.echo_messages import Limits, print_messages
+    from gateway.cli.echo_units import Units
     from gateway.cli.gateway_queries import exit_with
     from gateway.cli.silence import Silence
     from gateway.errors import QueryError
@@ -64,7 +65,10 @@ def echo(
 
             num_received = print_rates(subscribe, request, limits, silence, sys.stdout, as_json=as_json)
         else:
-            num_received = print_messages(subscribe, request, limits, silence, sys.stdout, as_json=as_json)
+            units = Units(name, request)
+            num_received = print_messages(
+                subscribe, request, limits, silence, units, sys.stdout, as_json=as_json
+            )
     except QueryError as error:
         exit_with([error])
         return

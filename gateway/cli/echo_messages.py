@@ -5,8 +5,10 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from typing import Final, TextIO
 
+from gateway.cli.echo_units import Units
 from gateway.cli.message_lines import json_line, text_line
 from gateway.cli.silence import Silence
 from gateway.outputs.kind import Receive, Subscription, SubscriptionRequest
@@ -68,6 +70,7 @@ def print_messages(
     request: SubscriptionRequest,
     limits: Limits,
     silence: Silence,
+    units: Units,
     out: TextIO,
     *,
     as_json: bool,
@@ -77,7 +80,7 @@ def print_messages(
     Raises OutputError if the output does not open, QueryError if there cannot be any messages.
     """
     messages = WaitingMessages()
-    line = json_line if as_json else text_line
+    line = json_line if as_json else partial(text_line, units_of=units.of)
     num_printed = 0
     try:
         with closing(subscribe(request, messages.put)):

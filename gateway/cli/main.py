@@ -1,7 +1,7 @@
 """The command line ``rtc3d-gateway``.
 
 Exit status: 0 success, 1 failure, 2 wrong command line or configuration, 130 Ctrl-C or SIGTERM.
-``params`` has three more.
+Commands that ask gateways have three more.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ import typer
 from gateway import version_text
 from gateway.cli.commands import LazyGroup
 from gateway.cli.completion import is_completion
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import ConfigError, GatewayError, SelectionError
 from gateway.safe_text import safe_lines
 from gateway.service.process_end import end_process
 
@@ -68,7 +68,7 @@ def _run() -> int:
         if sys.stdout is not stdout:  # typer replaces it if its reader is gone
             return 0
         return end.code if isinstance(end.code, int) else int(end.code is not None)
-    except ConfigError as error:
+    except (ConfigError, SelectionError) as error:
         _print_error(str(error))
         return 2
     except GatewayError as error:

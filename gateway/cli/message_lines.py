@@ -1,6 +1,7 @@
 """One line of text or JSON for each message that a gateway publishes."""
 
 import json
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from gateway.errors import ProtocolError
@@ -26,10 +27,14 @@ def json_line(name: str, message: bytes) -> str:
     return safe_json(json.dumps({"key": name} | fields))
 
 
-def text_line(name: str, message: bytes) -> str:
-    """Return a line of text: ``name`` (the key or channel) and a summary of the message."""
+def text_line(name: str, message: bytes, units_of: Callable[[str, Any], Sequence[str]]) -> str:
+    """Return a line of text: ``name`` (the key or channel) and a summary of the message.
+
+    ``units_of`` returns the units of the items of a decoded message with this name.
+    """
     try:
-        line = f"{name} {summarise(decode(message))}"
+        decoded = decode(message)
+        line = f"{name} {summarise(decoded, units_of(name, decoded))}"
     except ProtocolError as error:
         match _xml_or_json(message):
             case bytes() as xml:

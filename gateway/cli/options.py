@@ -167,6 +167,20 @@ def check_exists(option: str, path: Path | None) -> None:
         raise typer.BadParameter(f"{option}: {path} does not exist")
 
 
+def checked_take_name(text: str | None) -> str | None:
+    """Check that an argument can be the name of a take."""
+    if text is None:
+        return None
+    from gateway.errors import QueryError
+    from gateway.takes.names import check_name
+
+    try:
+        check_name(text)
+    except QueryError as error:
+        raise typer.BadParameter(str(error)) from None
+    return text
+
+
 def _checked_endpoint(text: str | None) -> str | None:
     if text is not None and not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
         raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")

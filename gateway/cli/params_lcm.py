@@ -31,7 +31,7 @@ def query_lcm(
         timeout_s=timeout_s,
     )
     received = [
-        ParametersReply(name, sections, xml_bytes(reply.xml), reply.age_s)
+        ParametersReply(name, sections, xml_bytes(reply.xml), reply.age_s, reply.parameters_version)
         for name, reply in replies.received.items()
     ]
     return Replies(received, replies.problems)

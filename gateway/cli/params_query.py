@@ -11,13 +11,15 @@ Sections = tuple[str, ...]
 class ParametersReply(NamedTuple):
     """The parameters of one source, as XML, reduced to ``sections``.
 
-    ``age_s`` is the time since the gateway received them from the server; None if unknown.
+    ``age_s`` is the time since the gateway received them from the server, and ``version`` the
+    ``parameters_version`` of the messages that they describe; None if unknown.
     """
 
     source: str
     sections: Sections
     xml: bytes
     age_s: float | None
+    version: int | None = None
 
 
 class Replies(NamedTuple):

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 from collections.abc import Callable
 
 import zenoh
@@ -47,10 +48,16 @@ def query_zenoh(
 
 
 def _parameters(reply: ZenohReply) -> ParametersReply:
-    return ParametersReply(reply.source, reply.path[1:], reply.payload, _age_s(reply.attachment))
+    age_s = _fact(reply.attachment, "age_s")
+    version = _fact(reply.attachment, "parameters_version")
+    return ParametersReply(
+        reply.source, reply.path[1:], reply.payload, age_s, None if version is None else int(version)
+    )
 
 
-def _age_s(attachment: bytes) -> float | None:
-    with contextlib.suppress(ValueError, TypeError, KeyError):
-        return float(json.loads(attachment)["age_s"])
+def _fact(attachment: bytes, name: str) -> float | None:
+    """Return a number in the attachment of a reply; None if there is none."""
+    with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
+        value = float(json.loads(attachment)[name])
+        return value if math.isfinite(value) else None
     return None

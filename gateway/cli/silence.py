@@ -6,19 +6,14 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from gateway.cli.echo_units import OUTPUTS, query_parameters
 from gateway.cli.find_sources import find_sources
 from gateway.cli.found_sources import FoundSource, FoundSources
-from gateway.cli.params_lcm import query_lcm
-from gateway.cli.params_query import Replies
-from gateway.cli.params_zenoh import query_zenoh
 from gateway.config.words import join_or
 from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import SubscriptionRequest
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
-from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
-from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.safe_text import quoted, safe_lines, safe_text
@@ -30,9 +25,7 @@ LOOK_S: Final = 0.4
 SAY_S: Final = 2.0
 """How long nothing is heard before this is said."""
 
-_QUERY_S: Final = 2.0
 _MAX_NAMED: Final = 20
-_OUTPUTS: Final = ("zenoh", "lcm")
 
 
 class Silence:
@@ -53,7 +46,7 @@ class Silence:
         Raises QueryError if there are gateways, and none of them has the source or the component.
         """
         silent_s = time.monotonic() - self._start_s
-        if self._output not in _OUTPUTS or self._is_said or silent_s < LOOK_S:
+        if self._output not in OUTPUTS or self._is_said or silent_s < LOOK_S:
             return
         if self._thread is None:
             self._thread = threading.Thread(target=self._look, name="find-sources", daemon=True)
@@ -110,7 +103,7 @@ class Silence:
     def _tool_labels(self) -> list[str]:
         """Return the labels of the tools of the sources, each once; [] if they are not known."""
         labels: dict[str, None] = {}
-        for reply in self._tool_parameters().received:
+        for reply in query_parameters(self._output, self._request, self._request.source, ("6d",)).received:
             try:
                 parameters = parse_parameters(reply.xml).parameters
             except ParametersError:
@@ -118,26 +111,6 @@ class Silence:
             num_tools = 0 if parameters.tools is None else len(parameters.tools.tools)
             labels |= dict.fromkeys(describe(ComponentType.TOOLS, parameters, num_tools).labels)
         return list(labels)
-
-    def _tool_parameters(self) -> Replies:
-        request = self._request
-        if self._output == "lcm":
-            return query_lcm(
-                request.prefix or DEFAULT_LCM_PREFIX,
-                request.source,
-                ("6d",),
-                fresh=False,
-                url=effective_lcm_url(request.address),
-                timeout_s=_QUERY_S,
-            )
-        return query_zenoh(
-            request.prefix or DEFAULT_ZENOH_PREFIX,
-            request.source,
-            ("6d",),
-            fresh=False,
-            open_session=lambda: open_zenoh(request.address, request.config),
-            timeout_s=_QUERY_S,
-        )
 
 
 def _check_component(key: str, sources: Sequence[FoundSource]) -> None:

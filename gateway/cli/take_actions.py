@@ -17,7 +17,6 @@ from gateway.cli.take_list import ListedTake, write_list
 from gateway.errors import QueryError
 from gateway.safe_text import safe_json, safe_text
 from gateway.takes.description import TakeDetails
-from gateway.takes.names import check_name
 
 
 def gateway_address(
@@ -100,11 +99,8 @@ def copy_take(address: GatewayAddress, name: str, file: Path | None, *, quiet: b
 
 
 def _named(name: str | None) -> dict[str, str]:
-    """Return the option for the name of a take, "" and None for its default. Raises QueryError."""
-    if not name:
-        return {}
-    check_name(name)  # here, too: a name could contain further options
-    return {"name": name}
+    """Return the option for the name of a take, None for its default."""
+    return {} if name is None else {"name": name}
 
 
 def _described(details: TakeDetails) -> dict[str, str]:

@@ -17,11 +17,16 @@ from gateway.cli.options import (
     UrlOption,
     ZenohConfigOption,
     checked_details,
+    checked_take_name,
 )
 
 _NameArgument = Annotated[
     str | None,
-    typer.Argument(metavar="NAME", help="The name of the take; the default is SOURCE-DATE-TIME."),
+    typer.Argument(
+        metavar="NAME",
+        callback=checked_take_name,
+        help="The name of the take; the default is SOURCE-DATE-TIME.",
+    ),
 ]
 _LcmOption = Annotated[bool, typer.Option("--lcm", help="Ask on LCM instead of Zenoh.")]
 _JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")]
@@ -128,7 +133,9 @@ def list_(
 
 
 def fetch(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the take.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", callback=checked_take_name, help="The name of the take.")
+    ],
     file: Annotated[
         Path | None,
         typer.Argument(metavar="FILE", help="A new file, or a folder; the default is NAME.lcmlog here."),

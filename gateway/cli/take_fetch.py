@@ -15,7 +15,6 @@ from gateway.cli.zenoh_client import ZenohReply
 from gateway.errors import QueryError
 from gateway.outputs.contract import READ_OPTION
 from gateway.takes.event_log import EventBoundary
-from gateway.takes.names import check_name
 from gateway.takes.new_file import NewFiles
 from gateway.takes.reader import SUFFIX
 
@@ -37,7 +36,6 @@ def fetch_take(address: GatewayAddress, name: str, file: Path | None, *, quiet: 
 
     Raises QueryError, and TakeError if the file exists or cannot be written.
     """
-    check_name(name)
     log = f"{name}{SUFFIX}"
     path = Path(log) if file is None else file / log if file.is_dir() else file
     with NewFiles() as files:

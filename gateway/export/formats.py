@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.config.words import join_or
-from gateway.errors import TakeError
+from gateway.errors import SelectionError, TakeError
 from gateway.export.c3d import export_c3d
 from gateway.export.csv_files import export_csv
 from gateway.export.job import ExportJob
@@ -38,7 +38,7 @@ def export_take(job: ExportJob) -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     write = FORMATS.get(job.out.suffix.lower())
     if write is None:
-        raise TakeError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
+        raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
     with job.files:
         write(job)
     return job.files.paths

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gateway.errors import TakeError
+from gateway.errors import SelectionError, TakeError
 from gateway.takes.new_file import NewFiles
 from gateway.takes.take import Take, open_take
 
@@ -90,7 +90,8 @@ def nothing_to_export(job: ExportJob, what: str) -> TakeError:
     """Return the error for a take without data that the format can hold."""
     part = "" if job.from_s is None and job.to_s is None else " between --from and --to"
     source = "" if job.source is None else f" of {job.source}"
-    return TakeError(
+    error = SelectionError if part else TakeError
+    return error(
         f"{job.take} has no {what}{source}{part}, and {job.out.suffix} holds nothing else; "
         "`rtc3d-gateway take info` lists what the take has"
     )

@@ -15,8 +15,11 @@ _MAX_SHOWN: Final = 4
 """The maximum number of channels, plates or events in a line."""
 
 
-def summarise(message: Any) -> str:
-    """Return a line about a decoded LCM message, with what a person wants to see first."""
+def summarise(message: Any, units: Sequence[str] = ()) -> str:
+    """Return a line about a decoded LCM message, with what a person wants to see first.
+
+    ``units`` are those of the items of a component, in their order; () if they are unknown.
+    """
     match message:
         case rtc3d.status_t():
             text = _status(message)
@@ -41,7 +44,7 @@ def summarise(message: Any) -> str:
             text = _description(message)
         case _:
             frame = f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s"
-            text = f"{frame}: {_frame_content(message)}"
+            text = f"{frame}: {_frame_content(message, units)}"
     return text
 
 
@@ -76,7 +79,7 @@ def summarise_xml(xml: bytes) -> str:
     return f"{size}: {', '.join(texts) or 'no markers, tools, channels, plates or events'}"
 
 
-def _frame_content(message: Any) -> str:
+def _frame_content(message: Any, units: Sequence[str]) -> str:
     match message:
         case rtc3d.tool_pose_t(visible=False):
             text = "out of view"
@@ -84,30 +87,43 @@ def _frame_content(message: Any) -> str:
             position, orientation = _rounded(message.position_m), _rounded(message.orientation_xyzw)
             text = f"position {position} m, orientation xyzw {orientation}"
         case rtc3d.markers_t():
-            text = f"{message.num_markers} markers, {_visibility(message.markers)}"
+            text = f"{message.num_markers} markers, {_visibility(message.markers, units)}"
         case rtc3d.tools_t():
-            text = f"{message.num_tools} tools, {_visibility(message.tools)}"
+            text = f"{message.num_tools} tools, {_visibility(message.tools, units)}"
         case rtc3d.analog_t():
-            text = f"{message.num_channels} channels, voltages {_first(message.voltages, _number, ', ')}"
+            voltages = _first(message.voltages, _number, ", ", units)
+            text = f"{message.num_channels} channels, voltages {voltages}"
         case rtc3d.forces_t():
-            text = f"{message.num_plates} plates, forces {_first(message.plates, _force, '; ')}"
+            text = f"{message.num_plates} plates, forces {_first(message.plates, _force, '; ', units)}"
         case _:
             text = f"{message.num_events} events: {_first(message.events, _event, '; ')}"
     return text
 
 
-def _visibility(items: Sequence[Any]) -> str:
+def _visibility(items: Sequence[Any], units: Sequence[str]) -> str:
     visible = [(item.x, item.y, item.z) for item in items if not math.isnan(item.x)]
-    first = f", first visible at {_rounded(visible[0])}" if visible else ""
+    first = f", first visible at {_with_unit(_rounded(visible[0]), units[:1])}" if visible else ""
     return f"{len(items) - len(visible)} missing{first}"
 
 
-def _first(items: Sequence[Any], text: Callable[[Any], str], separator: str) -> str:
-    """Return the first _MAX_SHOWN items as text, and "…" if there are more."""
+def _first(
+    items: Sequence[Any], text: Callable[[Any], str], separator: str, units: Sequence[str] = ()
+) -> str:
+    """Return the first _MAX_SHOWN items as text, and "…" if there are more.
+
+    A unit that all items share stands at the end, others after each item.
+    """
     texts = [text(item) for item in items[:_MAX_SHOWN]]
+    is_shared = len(set(units)) == 1
+    if not is_shared:
+        texts = [_with_unit(each, units[number : number + 1]) for number, each in enumerate(texts)]
     if len(items) > _MAX_SHOWN:
         texts.append("…")
-    return separator.join(texts)
+    return _with_unit(separator.join(texts), units[:1] if is_shared else ())
+
+
+def _with_unit(text: str, unit: Sequence[str]) -> str:
+    return " ".join([text, *filter(None, unit)])
 
 
 def _force(plate: Any) -> str:

@@ -5,7 +5,7 @@ import functools
 import ipaddress
 import re
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -76,6 +76,28 @@ def foreign_request(listen_host: str, hosts: Sequence[str], origins: Sequence[st
     ):
         return f"pages of {quoted(origins[0])} must not use this server"
     return ""
+
+
+def foreign_page(
+    listen_host: str, hosts: Sequence[str], origins: Sequence[str], is_allowed: Callable[[str], bool]
+) -> str:
+    """Return why a server must not serve a page of another server in a browser; "" if it may.
+
+    Allowed are pages from this server's host or from the browser's own computer, at any port, and origins
+    that ``is_allowed``. A request without Origin is from another program.
+    """
+    if not origins:
+        return ""
+    origin = _AUTHORITY.fullmatch(origins[0])
+    name = "" if origin is None else origin["ipv6"] or origin["name"]
+    if len(origins) == 1 and (is_allowed(origins[0]) or _is_own(name, "localhost")):
+        return ""
+    # Compared with Host, because a browser sends pages of an evil site at another address, too.
+    host = _AUTHORITY.fullmatch(hosts[0]) if hosts else None
+    is_same = host is not None and name.lower() == (host["ipv6"] or host["name"]).lower() != ""
+    if len(origins) == 1 and is_same and not foreign_request(listen_host, hosts, []):
+        return ""
+    return f"pages of {quoted(origins[0])} must not use this server"
 
 
 def _is_own(name: str, listen_host: str) -> bool:

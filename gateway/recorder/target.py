@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.errors import TakeError
+from gateway.errors import SelectionError, TakeError
 from gateway.takes.names import default_name, numbered
 from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
@@ -30,7 +30,7 @@ class Target:
             self._folder = path
             return
         if path.suffix not in {"", SUFFIX}:
-            raise TakeError(
+            raise SelectionError(
                 f"{path}: recordings are LCM event logs; choose a name that ends with {SUFFIX}, "
                 "and convert it afterwards (rtc3d-gateway export)"
             )

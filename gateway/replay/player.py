@@ -7,7 +7,7 @@ from contextlib import closing
 from functools import partial
 from typing import Final, Protocol
 
-from gateway.errors import TakeError
+from gateway.errors import SelectionError
 from gateway.replay.pace import Lateness, Pace
 from gateway.replay.play_list import Entry, Selection, play_list
 from gateway.replay.seek_index import SeekIndex
@@ -194,7 +194,7 @@ class Player:
             return seek_us
         self.num_passes += 1
         if not self.num_messages:
-            raise TakeError(
+            raise SelectionError(
                 f"{self._reader.path} has no messages to replay with these options; "
                 f"check --source ({', '.join(self._reader.source_names)}), --component, --from and --to"
             )

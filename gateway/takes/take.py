@@ -8,7 +8,7 @@ from typing import Final
 
 import rtc3d
 
-from gateway.errors import ParametersError, ProtocolError, TakeError
+from gateway.errors import ParametersError, ProtocolError, SelectionError
 from gateway.messages.decode import decode
 from gateway.messages.parameters_text import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
@@ -104,7 +104,7 @@ def open_take(
     and ``to_s`` the time of the events, in seconds from the first event of the take; what comes after
     ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
     much memory as their part of the file. Damage is skipped and counted. Raises TakeError if there is
-    no take, or if a source or component is not in it.
+    no take, and SelectionError, a TakeError, if a source or component is not in it.
     """
     wanted = _components(components)
     reader = TakeReader(Path(path))
@@ -125,7 +125,7 @@ def open_take(
     missing = set(sources or ()) - take.sources.keys()
     if missing:
         names = ", ".join(reader.source_names) or "none of a gateway"
-        raise TakeError(f"{path} has no source {min(missing)!r}; its sources are: {names}")
+        raise SelectionError(f"{path} has no source {min(missing)!r}; its sources are: {names}")
     return take
 
 
@@ -133,7 +133,7 @@ def _components(keys: Collection[str] | None) -> frozenset[str]:
     known = frozenset(COMPONENTS_BY_KEY)
     unknown = set(keys or ()) - known
     if unknown:
-        raise TakeError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
+        raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
     return known if keys is None else frozenset(keys)
 
 

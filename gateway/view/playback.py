@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import viser
 
-from gateway.errors import TakeError
+from gateway.errors import SelectionError
 from gateway.live.live_data import LiveData
 from gateway.replay.play_list import Selection
 from gateway.replay.player import Player
@@ -126,12 +126,12 @@ class Playback:
 
 
 def _check_messages(reader: TakeReader, selection: Selection) -> None:
-    """Raise TakeError if nothing of the take is selected. This reads up to the first such message."""
+    """Raise SelectionError if nothing of the take is selected. This reads up to the first such message."""
     if any(selection.has(message.source, message.key) for message in reader.messages()):
         return
     existing = ", ".join(reader.source_names)
     shown = f" of {', '.join(map(quoted, selection.sources))}" if selection.sources else ""
-    raise TakeError(f"{reader.path} has no messages{shown}; sources of the take: {existing}")
+    raise SelectionError(f"{reader.path} has no messages{shown}; sources of the take: {existing}")
 
 
 def _length_by_reading_us(reader: TakeReader) -> int:

@@ -2,6 +2,8 @@
 
 import math
 import re
+from configparser import ConfigParser
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +14,7 @@ from benchmarks.workloads import DENSE, Frames, cuts
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
+from tests.documents import ROOT
 
 FRAMES = 200
 
@@ -47,6 +50,20 @@ def test_the_peer_of_each_output_receives_everything() -> None:
     with outputs.Bench() as bench:
         bench.connect_peers()
     assert set(bench.peers) == {outputs.RELAY, *OUTPUTS} - {"takes"}
+
+
+def test_the_gateway_and_the_lsl_peer_share_the_recommended_configuration(tmp_path: Path) -> None:
+    """Peers with another search than the page recommends could miss streams, and with another session all."""
+    at = outputs.Endpoints(0, "", tmp_path)
+    config = ConfigParser()
+    config.read(outputs.CASES["lsl"].settings(at)["config"])
+    first = dict(config["multicast"]), config["lab"]["SessionID"]
+    config.read(outputs.CASES["lsl"].settings(at)["config"])
+    assert (dict(config["multicast"]), config["lab"]["SessionID"]) == first
+    page = (ROOT / "docs/how-to/lsl.md").read_text().partition("```ini\n")[2].partition("```")[0]
+    recommended = ConfigParser()
+    recommended.read_string(page)
+    assert first[0] == dict(recommended["multicast"])
 
 
 def test_frames_are_numbered_and_stamped_in_every_component() -> None:

@@ -1,7 +1,9 @@
 """The connections of viewers, with limits on what they can use up: clients are not trusted."""
 
 import logging
+import re
 import time
+from collections.abc import Collection
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection
@@ -11,6 +13,7 @@ from websockets.protocol import State
 
 from gateway.log import EventLog
 from gateway.outputs.foxglove import protocol
+from gateway.outputs.listen_address import foreign_page
 from gateway.token_bucket import TokenBucket
 
 MAX_CLIENTS: Final = 32
@@ -49,6 +52,10 @@ _FLUSH_BYTES: Final = 64 * 1024
 MAX_STALL_S: Final = 30.0
 """A viewer that has read nothing for this long, while so much waits, is disconnected."""
 
+_FOXGLOVE: Final = re.compile(r"https://([a-z0-9-]+\.)*foxglove\.dev")
+_DESKTOP: Final = "file://"
+"""Lichtblick for the desktop is a page from the disk, which no web site can be."""
+
 _SLOW: Final = "Send buffer limit reached"
 """The words of Foxglove's own bridge. Lichtblick adds an explanation to them."""
 
@@ -58,7 +65,9 @@ logger = logging.getLogger(__name__)
 class Admission:
     """Decides which connections may stay open, and logs why others end."""
 
-    def __init__(self) -> None:
+    def __init__(self, host: str, origins: Collection[str]) -> None:
+        self._host = host
+        self._origins = frozenset(origin.lower() for origin in origins)
         self._events = EventLog(logger, "foxglove")
         self.num_clients = 0
         """How many viewers have completed the handshake."""
@@ -76,13 +85,27 @@ class Admission:
         """Take note that the handshake is complete, or has failed."""
         self._handshakes.pop(connection, None)
 
-    def refuse(self, connection: ServerConnection, _request: Request) -> Response | None:
-        """Return the response to a viewer that is one too many; None to accept it."""
+    def refuse(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
+        headers = request.headers
+        reason = foreign_page(
+            self._host, headers.get_all("Host"), headers.get_all("Origin"), self._is_of_a_viewer
+        )
+        if reason:
+            reason = f"{reason}; if a viewer of yours is there, add it to foxglove.origins"
+            text = f"{_address(connection)} is refused: {reason}"
+            self._events.log(logging.WARNING, text, "foreign page")
+            return connection.respond(403, f"{reason}\n")
         if self.num_clients < MAX_CLIENTS:
             return None
         text = f"{_address(connection)} is refused: {MAX_CLIENTS} viewers are connected; close one of them"
         self._events.log(logging.WARNING, text, "refused")
         return connection.respond(503, f"{MAX_CLIENTS} viewers are connected already; close one of them.\n")
+
+    def _is_of_a_viewer(self, origin: str) -> bool:
+        """Return whether pages of this origin are viewers: Foxglove's, from the disk, or configured."""
+        origin = origin.lower()
+        return origin in self._origins or origin == _DESKTOP or bool(_FOXGLOVE.fullmatch(origin))
 
     def disconnect(self, connection: ServerConnection, reason: str) -> None:
         """End a connection at once, without waiting for the peer."""

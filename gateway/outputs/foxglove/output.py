@@ -39,7 +39,7 @@ class FoxgloveOutput(Output):
         self._problem = f"not listening on {self._address} yet"
         self._failures = FailureLog(logger, self.name)
         self._defects = DefectLog(logger, self.name)
-        self._server = FoxgloveServer(settings.host, settings.port, str(now_utime()))
+        self._server = FoxgloveServer(settings.host, settings.port, str(now_utime()), settings.origins)
         self._sources: dict[str, ServedSource] = {}
         self._thread: LoopThread | None = None
         self._is_closed = False

@@ -7,7 +7,7 @@ does not read. docs/design.md has more about this.
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -57,17 +57,18 @@ class Channel:
 class FoxgloveServer:
     """Advertises channels to viewers, and sends messages to those that subscribe to them.
 
-    All methods are called in one event loop. Channels can be opened before the server listens.
+    ``origins`` are those of further pages that may connect. All methods are called in one event loop.
+    Channels can be opened before the server listens.
     """
 
-    def __init__(self, host: str, port: int, session: str) -> None:
+    def __init__(self, host: str, port: int, session: str, origins: Sequence[str] = ()) -> None:
         self._host = host
         self._port = port
         self._info = protocol.server_info(SERVER_NAME, session)
         self._channels: dict[int, Channel] = {}
         self._last_number = 0
         self._viewers: set[Viewer] = set()
-        self._admission = Admission()
+        self._admission = Admission(host, origins)
         self._server: Server | None = None
         self._opening = asyncio.Lock()
         self._is_closed = False

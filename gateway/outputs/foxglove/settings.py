@@ -1,9 +1,19 @@
 """The section ``foxglove`` of the configuration."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
+from pydantic import Field
+
+from gateway.config.section import expects
 from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, Switch
+
+Origin = Annotated[
+    str,
+    Field(pattern=r"^https?://[A-Za-z0-9.:\[\]_-]{1,270}$"),
+    expects("http:// or https:// and a name or address, with the port if it is another than 80 or 443"),
+]
 
 
 class FoxgloveSettings(OutputSettings):
@@ -17,6 +27,11 @@ class FoxgloveSettings(OutputSettings):
 
     port: Port = 8765
     """The TCP port. Viewers connect to `ws://HOST:PORT`."""
+
+    origins: Annotated[
+        tuple[Origin, ...], expects("a list of the addresses of pages, such as http://viewer.lab:8080")
+    ] = ()
+    """Addresses of further pages with viewers. Those of Foxglove and of this computer may always connect."""
 
     @property
     def listens_on(self) -> Sequence[ListenAddress]:

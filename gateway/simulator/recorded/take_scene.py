@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median_low
 from typing import Final, NamedTuple
 
-from gateway.errors import TakeError
+from gateway.errors import SelectionError, TakeError
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.safe_text import quoted, safe_text
@@ -86,7 +86,7 @@ class TakeScene:
         moments = first_pass.moments()
         preview = list(islice(moments, _PREVIEW_MOMENTS))
         if not preview:
-            raise TakeError(
+            raise SelectionError(
                 f"{safe_text(str(path))} has no frames of {safe_text(self._source)}"
                 f"{_range_text(from_s, to_s)}; rtc3d-gateway take info shows what is in it"
             )
@@ -259,7 +259,7 @@ def _read_batch(moments: Iterator[Moment]) -> _Batch:
 
 
 def _chosen_source(reader: TakeReader, source: str | None) -> str:
-    """Return the source to play. Raises TakeError if the take has several, or others only.
+    """Return the source to play. Raises SelectionError if the take has several, or others only.
 
     Sources with few messages, compared with the others, do not count: a damaged channel looks like a source.
     """
@@ -272,12 +272,12 @@ def _chosen_source(reader: TakeReader, source: str | None) -> str:
     path, listed = safe_text(str(reader.path)), safe_text(", ".join(names)) or "none"
     if source is None:
         if len(names) > 1:
-            raise TakeError(f"{path} has several sources: {listed}; choose one with --source")
+            raise SelectionError(f"{path} has several sources: {listed}; choose one with --source")
         if not names:
             raise TakeError(f"{path} has no frames; choose another recording")
         return names[0]
     if source not in counts and all(message.source != source for message in reader.messages()):
-        raise TakeError(f"{path} has no source {quoted(source)}; its sources are: {listed}")
+        raise SelectionError(f"{path} has no source {quoted(source)}; its sources are: {listed}")
     return source
 
 

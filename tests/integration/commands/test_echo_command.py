@@ -18,7 +18,7 @@ from tests.command_process import run
 from tests.integration.commands.test_params_command import Lab
 from tests.networks import free_endpoint, lcm_url, open_zenoh
 from tests.pseudo_terminals import in_terminal
-from tests.queried_gateway import ParameterServer, run_gateway
+from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
 from tests.waiting import wait_until_async
 
 pytestmark = [pytest.mark.netns, pytest.mark.asyncio(loop_scope="module")]
@@ -107,6 +107,24 @@ async def test_the_poses_of_one_tool_are_printed(lab: Lab) -> None:
     for name, done in zip(("mocap/lab/6d/Tool%202", "MOCAP_LAB_6D_TOOL_2"), ended, strict=True):
         assert (done.status, done.stderr) == (0, "")
         assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [name] * 3
+
+
+async def test_values_have_the_units_of_the_parameters_which_are_asked_for_once() -> None:
+    """A position of 1.5 may be in metres or millimetres. A query per message would slow the gateway down."""
+    place = Lab(ParameterServer(), free_endpoint(), lcm_url())
+    scene = SyntheticScene(markers=2, tools=0, analog=2, plates=1, rate_hz=100, analog_rate_hz=100)
+    async with (
+        Simulator(scene) as simulator,
+        run_gateway(simulator.port, listen=place.endpoint, lcm_url=place.url) as gateway,
+    ):
+        await wait_until_cached(gateway)
+        await wait_until_async(lambda: gateway.sources[0].parameters_version)
+        for component, end in (("3d", ") mm"), ("analog", " mV"), ("force", ") N")):
+            for done in await place.run("echo", "--component", component, "--count", "20"):
+                assert (done.status, done.stderr) == (0, "")
+                assert [line.endswith(end) for line in done.stdout.splitlines()] == [True] * 20
+        for output in gateway.outputs:
+            assert 3 <= output.query_results["lab"]["ok"] < 20
 
 
 async def test_rates_count_the_messages_of_the_component(lab: Lab) -> None:

@@ -126,7 +126,7 @@ async def test_takes_are_started_listed_and_stopped_or_errors_say_why(tmp_path: 
         assert "no take of source 'lab' is running" in await error("stop", *options)
         assert "takes.keep_last_s is 0" in await error("save", *options)
         for name in ("../x", "x;set=stop"):
-            assert "cannot be the name of a take" in await error("start", name, *options)
+            assert "cannot be the name of a take" in await error("start", name, *options, status=2)
         assert await take("start", NAME, *options) == (0, f"lab: take {NAME!r} is running\n", "")
         await at.send(10)
         listed = await take("list", *options)

@@ -8,6 +8,7 @@ import pytest
 import rtc3d
 
 from gateway.cli.echo_messages import MAX_WAITING, Limits, print_messages
+from gateway.cli.echo_units import Units
 from gateway.cli.silence import Silence
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from tests.spec_parameters import in_root, spec_xml
@@ -16,6 +17,7 @@ MARKERS_BYTES = len(spec_xml("3d"))
 
 
 REQUEST = SubscriptionRequest()
+UNITS = Units("example", REQUEST)
 
 
 class Published:
@@ -37,7 +39,7 @@ def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
     out = io.StringIO()
     published = Published((name, message))
     silence = Silence("example", REQUEST)
-    assert print_messages(published, REQUEST, Limits(1, 10), silence, out, as_json=as_json) == 1
+    assert print_messages(published, REQUEST, Limits(1, 10), silence, UNITS, out, as_json=as_json) == 1
     return out.getvalue().removesuffix("\n")
 
 
@@ -121,6 +123,6 @@ def test_messages_that_come_faster_than_they_are_printed_are_counted(
     out = Interrupted() if is_interrupted else io.StringIO()
     with pytest.raises(KeyboardInterrupt) if is_interrupted else nullcontext():
         silence = Silence("example", REQUEST)
-        assert print_messages(published, REQUEST, Limits(7, 10), silence, out, as_json=False) == 7
+        assert print_messages(published, REQUEST, Limits(7, 10), silence, UNITS, out, as_json=False) == 7
         assert out.getvalue().count("\n") == 7
     assert capsys.readouterr().err.startswith("5 messages were not printed, because they came faster than")

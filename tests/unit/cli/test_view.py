@@ -43,7 +43,7 @@ def test_a_port_in_use_is_one_sentence() -> None:
 
 def test_a_source_that_the_take_does_not_have_is_one_sentence_and_no_page() -> None:
     run = view("examples/walk.lcmlog", "--port", "0", "--source", "nosuch")
-    assert (run.returncode, run.stdout) == (1, "")
+    assert (run.returncode, run.stdout) == (2, "")
     assert run.stderr == "examples/walk.lcmlog has no messages of 'nosuch'; sources of the take: lab\n"
 
 

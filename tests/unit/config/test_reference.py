@@ -60,7 +60,9 @@ def default_of(section: type[Section], key: str) -> str:
     if field.is_required():
         return "none"
     default = field.get_default(call_default_factory=True)
-    if isinstance(default, Section) or (isinstance(default, tuple) and isinstance(default[0], Section)):
+    if isinstance(default, Section) or (
+        isinstance(default, tuple) and default and isinstance(default[0], Section)
+    ):
         return "below"
     value = section.model_construct(**{key: default}).model_dump(mode="json", include={key})[key]
     if key == "components":

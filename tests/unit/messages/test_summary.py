@@ -21,7 +21,7 @@ from tests.unit.messages.samples import (
     tool_pose_messages,
     unknown_clock,
 )
-from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
+from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentVector
 
 LAB = "#17 lab at 192.0.2.20:3020: [3d 6d] "
 OUTPUTS = "; outputs: zenoh ok; lcm no multicast: ip route add"
@@ -93,6 +93,25 @@ def test_small_and_large_numbers_are_shown_without_rounding_errors() -> None:
     message = rtc3d.analog_t()
     message.num_channels, message.voltages = 3, [1.6e-7, -0.00012345, 2e9]
     assert summarise(message).endswith("voltages 1.6e-07, -0.0001234, 2e+09")
+
+
+@pytest.mark.parametrize(
+    ("vector", "units", "end"),
+    [
+        (MARKERS, ("mm", "mm"), "first visible at (1, -2.5, 1000) mm"),
+        (TOOLS, ("in", "in"), "first visible at (100, -200, 1600) in"),
+        (ANALOG, ("mV", "mV", "mV"), "voltages 0.1, -15000, 0 mV"),
+        (ANALOG, ("mV", "", "N"), "voltages 0.1 mV, -15000, 0 N"),
+        (FORCE, ("N", "N"), "forces (1.5, -0.75, 800); (4, 5, 6) N"),
+        (FORCE, ("", ""), "forces (1.5, -0.75, 800); (4, 5, 6)"),
+    ],
+    ids=range(6),
+)
+def test_a_summary_has_the_units_that_are_known(
+    vector: ComponentVector, units: tuple[str, ...], end: str
+) -> None:
+    """A position of 1.5 in a line may be metres or millimetres; channels can differ."""
+    assert summarise(decode(component_message(vector)), units).endswith(end)
 
 
 @pytest.mark.parametrize(("num_channels", "shown"), [(4, "1, 2, 3, 4"), (5, "1, 2, 3, 4, …")])

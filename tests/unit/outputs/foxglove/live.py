@@ -106,10 +106,13 @@ class LiveSource:
 
 
 @asynccontextmanager
-async def serving(*names: str) -> AsyncIterator[tuple[int, list[LiveSource]]]:
-    """Run an output with these sources; yield its port and the sources."""
+async def serving(
+    *names: str, settings: FoxgloveSettings | None = None
+) -> AsyncIterator[tuple[int, list[LiveSource]]]:
+    """Run an output with these sources, on a free port; yield its port and the sources."""
     port = free_port()
-    output = FoxgloveOutput(FoxgloveSettings(enabled=True, port=port))
+    settings = settings or FoxgloveSettings(enabled=True)
+    output = FoxgloveOutput(settings.model_copy(update={"port": port}))
     output.start()
     try:
         await wait_until_async(lambda: output.health().connected)
