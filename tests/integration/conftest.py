@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.integration.served import Served, directly, through_a_gateway
 from tests.networks import free_endpoint, open_zenoh
 
 
@@ -15,10 +14,3 @@ def router() -> Iterator[str]:
     session = open_zenoh("router", listen=endpoint)
     yield endpoint
     session.close()
-
-
-@pytest.fixture(params=[directly, through_a_gateway])
-def served(request: pytest.FixtureRequest) -> Served:
-    """How clients reach a simulator."""
-    serve: Served = request.param
-    return serve

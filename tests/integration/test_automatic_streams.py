@@ -6,8 +6,6 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import StreamSettings
-from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.server import RtServer
@@ -116,33 +114,6 @@ async def test_every_component_arrives_at_its_own_rate() -> None:
         assert server.num_opened == 2
 
 
-class _Nameless(_Filter):
-    def answer(self, packet: Packet) -> list[bytes]:
-        text = decode_text(packet.body)
-        if text.startswith("StreamFrames") and text.rstrip("\0\n").endswith(("3D", "6D", "Events", "Force")):
-            return [b"\0\0\0\x0e\0\0\0\0Error-"]
-        return super().answer(packet)
-
-
-async def test_a_server_that_knows_no_component_names_sends_everything_on_one_connection() -> None:
-    server = OneClientServer("serve")
-    server._new_filter = lambda each: _Nameless(each, server)
-    async with server, run_gateway(server.port) as lab:
-        analog = await lab.wait_for("analog", 100)
-        assert steps(analog) == {10}
-        assert components(lab) == [EVERYTHING]
-        assert f"{ONE_CONNECTION}the server does not accept the names of components" in lab.status.limitations
-        assert server.num_opened == 1
-
-
-async def test_configured_streams_are_not_planned() -> None:
-    stream = StreamSettings(components=(ComponentType.MARKERS, ComponentType.ANALOG))
-    async with OneClientServer("serve") as server, run_gateway(server.port, streams=(stream,)) as lab:
-        assert steps(await lab.wait_for("analog", 50)) == {10}
-        assert components(lab) == ["3d analog"]
-        assert server.num_opened == 1
-
-
 async def new_steps(lab: MemoryGateway, component: str, count: int, skipped: int = 20) -> set[int]:
     """Return the steps between ``count`` messages to come, without the first of them."""
     before = len(lab.messages(component))
@@ -184,31 +155,3 @@ async def test_a_server_for_one_client_sends_everything_on_one_connection(
         if reason.startswith("the server accepts"):  # and the first connection has streamed all the time
             requests = [number for number, command in server.commands if command.startswith("StreamFrames")]
             assert requests == [1, 1]
-
-
-async def test_other_rates_at_a_new_connection_are_planned_anew() -> None:
-    async with OneClientServer("serve") as server, run_gateway(server.port) as lab:
-        await lab.wait_until(lambda: components(lab) == TWO)
-        await lab.wait_for("analog", 10)
-        server.crash()
-        server.change_scene(lab_scene(500, 100))
-        await server.start()
-        await lab.wait_until(lambda: components(lab) == ["analog force event", "3d 6d"])
-        assert (await new_steps(lab, "3d", 50), await new_steps(lab, "analog", 30)) == ({1}, {1})
-        assert_continuous(lab)
-
-
-async def test_other_rates_during_a_connection_are_planned_anew() -> None:
-    async with (
-        OneClientServer("serve", lab_scene(200, 200)) as server,
-        run_gateway(server.port, parameters_interval_s=0.2) as lab,
-    ):
-        await lab.wait_for("analog", 20)
-        assert (components(lab), server.num_opened, lab.status.limitations) == ([EVERYTHING], 1, [])
-        server.change_scene(lab_scene())
-        await lab.wait_until(lambda: components(lab) == TWO)
-        assert await new_steps(lab, "analog", 200, skipped=50) == {1}
-        server.change_scene(lab_scene(200, 200))
-        await lab.wait_until(lambda: components(lab) == [EVERYTHING] and server.num_clients == 1)
-        await new_steps(lab, "analog", 30)
-        assert_continuous(lab)

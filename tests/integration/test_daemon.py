@@ -93,25 +93,6 @@ def test_start_and_stop_are_reported_to_systemd(site: Site) -> None:
     assert "zenoh" not in before[1]  # the session is open by now, so it has no problem
 
 
-def test_sighup_reloads_the_configuration(site: Site) -> None:
-    first, second = free_port(), free_port()
-    site.configure(first)
-    with site.running() as process:
-        site.file.write_text("sources: {}\nbogus: 1\n")
-        process.send_signal(signal.SIGHUP)
-        site.until(lambda sent: "new configuration refused, the old one stays in use: " in sent.status)
-        site.until(lambda sent: sent.stages == ["READY=1", "RELOADING=1", "READY=1"])
-        assert f"{site.file}:1:10: sources: " in site.notifications.status
-        assert "(and 1 more in the log)" in site.notifications.status
-        assert f"lab: waiting for 127.0.0.1:{first}" in site.notifications.status
-        site.configure(second)
-        process.send_signal(signal.SIGHUP)
-        site.until(lambda sent: f"lab: waiting for 127.0.0.1:{second}" in sent.status)
-        assert "refused" not in site.notifications.status
-        process.terminate()
-        assert process.wait(STOP_S) == 0
-
-
 def test_sighup_reloads_while_the_terminal_exists_and_stops_the_gateway_when_it_closes(site: Site) -> None:
     site.configure(free_port())
     terminal, end = pty.openpty()

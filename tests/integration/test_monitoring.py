@@ -25,7 +25,6 @@ from gateway.config.settings import (
     StreamSettings,
 )
 from gateway.gateway import Gateway
-from gateway.monitoring.health import health_page
 from gateway.monitoring.server import MonitoringServer
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -35,11 +34,8 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.configurations import make_settings
-from tests.losses import amounts
-from tests.memory_gateway import run_gateway
 from tests.networks import free_port, zenoh_keys
 from tests.running_gateway import running_gateway
-from tests.servers import ScriptedServer, markers_frame, ok, packet
 from tests.waiting import wait_until_async
 
 ROOT = Path(__file__).parents[2]
@@ -284,23 +280,6 @@ async def test_the_log_format_option_selects_the_format() -> None:
 # A running gateway ---------------------------------------------------------------------------
 
 
-async def test_health_depends_on_the_servers_state() -> None:
-    async with simulator() as server:
-        port = server.port
-    async with running_lab(port) as lab:
-        await lab.until_all(lambda status: status.last_error)
-        status, body = await lab.health()
-        assert (status, body["healthy"]) == (503, False)
-        assert [each["stream"] for each in body["streams"]] == ["3d 6d", "analog"]
-        assert all(f"refused by 127.0.0.1:{port}" in each["problem"] for each in body["streams"])
-        async with simulator(port) as server:
-            await lab.streaming()
-            assert (await lab.health())[0] == 200
-            server.stop_measurement()
-            await lab.until_all(lambda status: status.state is StreamState.NO_MEASUREMENT)
-            assert (await lab.health())[0] == 200
-
-
 async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.LogCaptureFixture) -> None:
     async with simulator() as server, running_lab(server.port) as first:
         caplog.clear()
@@ -309,24 +288,3 @@ async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.
         [warning] = [record for record in caplog.records if record.name == "gateway.monitoring.server"]
     assert warning.levelno == logging.WARNING
     assert re.search(f"port {first.port}: .*metrics.port", warning.message)
-
-
-async def test_frames_that_the_server_numbered_and_did_not_send_are_counted() -> None:
-    numbers = (*range(1, 301), *range(351, 401))
-
-    def answer(command: str) -> bytes:
-        if command.startswith("SendParameters"):
-            return packet(2, b"<RT_Parameters Ver='1.00'/>")
-        is_stream = command.startswith("StreamFrames") and "Stop" not in command
-        frames = (markers_frame(number, (0.0, 0.0, 0.0)) for number in numbers if is_stream)
-        return ok(f"OK-{command}") + b"".join(frames)
-
-    async with (
-        ScriptedServer(lambda client: client.commands(answer)) as server,
-        run_gateway(server.port) as gateway,
-    ):
-        await gateway.wait_until(gateway.status.losses.report)
-        assert amounts(gateway.status.losses.report()) == {"not sent by the server": (50, 50)}
-        assert json.loads(health_page(gateway.gateway).body)["status"] == "degraded"
-        messages = await gateway.wait_for("3d", len(numbers))
-        assert [message.sequence for message in messages] == list(range(len(numbers)))

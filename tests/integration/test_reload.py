@@ -113,50 +113,6 @@ def subscribed(builder: SettingsBuilder) -> Iterator[ReceivedMarkers]:
         session.close()
 
 
-async def test_a_changed_source_keeps_its_numbering_and_other_sources_are_not_affected() -> None:
-    builder = SettingsBuilder()
-    async with (
-        simulator() as kept,
-        simulator() as first,
-        simulator() as second,
-        running(builder.settings({"kept": kept.port, "moved": first.port})) as gateway,
-    ):
-        with subscribed(builder) as received:
-            names = ("mocap/kept/3d", "MOCAP_KEPT_3D", "mocap/moved/3d", "MOCAP_MOVED_3D")
-            for name in names:
-                await received.wait_for_more(name)
-            changes = await gateway.reload(builder.settings({"kept": kept.port, "moved": second.port}))
-            assert changes == ["source moved changed"]
-            assert not first.connections
-            for name in names:
-                await received.wait_for_more(name)
-                received.assert_gapless(name)
-            assert {session for session, _ in received.numbers["mocap/kept/3d"]} == {1}
-            assert [session for session, _ in received.numbers["mocap/moved/3d"]][-1] == 2
-
-
-async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> None:
-    builder, server, other = SettingsBuilder(), ParameterServer("of lab"), ParameterServer("of new")
-    async with (
-        ScriptedServer(server.script) as lab_server,
-        ScriptedServer(other.script) as new_server,
-        running(builder.settings({"lab": lab_server.port, "gone": lab_server.port})) as gateway,
-    ):
-        with zenoh_peer(builder.endpoint) as peer:
-            await wait_until_async(lambda: server.count("StreamFrames") >= 2)
-            changes = await gateway.reload(builder.settings({"new": new_server.port, "lab": lab_server.port}))
-            assert changes == ["source gone removed", "source new added"]
-            assert [source.name for source in gateway.sources] == ["new", "lab"]
-            await wait_until_async(lambda: server.count("Bye") == 1)
-            await wait_until_async(lambda: all(source.streams[0].session for source in gateway.sources))
-            assert b"of new" in (await query(peer, "mocap/new/parameters")).payload
-            assert b"of lab" in (await query(peer, "mocap/lab/parameters")).payload
-            assert await query_all(peer, "mocap/gone/parameters") == []
-            alive = await asyncio.to_thread(lambda: list(peer.liveliness().get("mocap/*/alive", timeout=5)))
-            keys = {str(reply.ok.key_expr) for reply in alive if reply.ok}
-            assert keys == {"mocap/lab/alive", "mocap/new/alive"}
-
-
 async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters() -> None:
     builder, server = SettingsBuilder(), ParameterServer("known")
     async with (
@@ -221,23 +177,6 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
             assert received.numbers[after][0][1] > received.numbers[before][-1][1]
             assert len(server.connections) == 1
     assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
-
-
-@pytest.mark.parametrize("output", ["lcm", "zenoh"])
-async def test_switching_tool_poses_does_not_reopen_the_output(output: str) -> None:
-    builder = SettingsBuilder()
-    async with simulator(tools=2) as server, running(builder.settings({"lab": server.port})) as gateway:
-        with subscribed(builder) as received:
-            outputs = list(gateway.outputs)
-            for is_on in (True, False, True):
-                changed = {output: getattr(builder, output)(tool_poses=is_on)}
-                settings = builder.settings({"lab": server.port}, **changed)
-                assert await gateway.reload(settings) == [f"output {output} changed"]
-                assert await gateway.reload(settings) == []
-                for name in ("mocap/lab/3d", "MOCAP_LAB_3D"):
-                    await received.wait_for_more(name)
-                    received.assert_gapless(name)
-            assert list(gateway.outputs) == outputs
 
 
 async def test_a_changed_zenoh_configuration_file_reopens_the_output_unless_zenoh_refuses_it(
