@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, SpoolSettings
+from gateway.config.settings import MetricsSettings, SpoolSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
@@ -18,7 +18,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from tests.configurations import make_settings
+from tests.configurations import local_source, make_settings
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.running_gateway import running_gateway
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
@@ -133,17 +133,9 @@ async def run_gateway(
     there. On LCM, it uses the URLs.
     ``source`` replaces settings of the source.
     """
-    defaults: dict[str, Any] = {
-        "name": "lab",
-        "host": "127.0.0.1",
-        "port": port,
-        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-        "reply_timeout_s": 5.0,
-        "query_timeout_s": 10.0,
-        "stall_timeout_s": 60.0,
-    }
+    timeouts = {"reply_timeout_s": 5.0, "query_timeout_s": 10.0, "stall_timeout_s": 60.0}
     # The configuration does not accept 0. It sends every fresh query to the server.
-    lab = SourceSettings(**(defaults | source)).model_copy(
+    lab = local_source(port, **(timeouts | source)).model_copy(
         update={} if "fresh_interval_s" in source else {"fresh_interval_s": 0.0}
     )
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
+from tests.configurations import write_config
 from tests.gateway_process import program
 from tests.networks import free_endpoint, free_port, zenoh_keys
 from tests.waiting import wait_until
@@ -53,13 +53,7 @@ class Site:
         self.notifications = Notifications(folder / "notify")
 
     def configure(self, port: int) -> None:
-        configuration = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
-            "zenoh": {"config": zenoh_keys("peer", listen=free_endpoint())},
-            "lcm": {"enabled": False},
-            "metrics": {"enabled": False},
-        }
-        self.file.write_text(yaml.safe_dump(configuration))
+        write_config(self.file, port, zenoh={"config": zenoh_keys("peer", listen=free_endpoint())})
 
     @contextmanager
     def running(self, **options: Any) -> Iterator[subprocess.Popen[bytes]]:

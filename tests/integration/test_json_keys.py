@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import pytest
-import yaml
 import zenoh
 
 from gateway.live.live_data import LiveData
 from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.event_log import EventLogReader
+from tests.configurations import write_config
 from tests.gateway_process import PROGRAM, program, simulator
 from tests.networks import free_endpoint, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
@@ -25,7 +25,7 @@ COMPONENTS: Final = {"3d", "6d", "analog", "force", "event"}
 
 
 class Lab(NamedTuple):
-    """A gateway with two sources, of which ``lazy`` streams on demand, and a peer of it.
+    """A gateway and a peer of it.
 
     ``everything`` has the keys of all that is published, also of JSON: a careless program asks for it.
     """
@@ -43,20 +43,15 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     everything: Counter[str] = Counter()
     with ExitStack() as stack:
         port, _ = stack.enter_context(simulator(*SCENE))
-        server = {"host": "127.0.0.1", "port": port}
-        configuration = {
-            "sources": [
-                {"name": "lab", "remote_control": True, **server},
-                {"name": "lazy", **server, "streams": [{"components": ["3d"], "on_demand": True}]},
-            ],
-            "zenoh": {"tool_poses": True, "config": zenoh_keys("router", listen=endpoint)},
-            "lcm": {"enabled": False},
-            "takes": {"enabled": True, "directory": str(folder / "takes")},
-            "metrics": {"enabled": False},
-        }
-        (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
+        config = write_config(
+            folder / "gateway.yaml",
+            port,
+            source={"remote_control": True},
+            zenoh={"tool_poses": True, "config": zenoh_keys("router", listen=endpoint)},
+            takes={"enabled": True, "directory": str(folder / "takes")},
+        )
         log = stack.enter_context((folder / "gateway.log").open("wb"))
-        stack.enter_context(program("run", "--config", str(folder / "gateway.yaml"), stderr=log))
+        stack.enter_context(program("run", "--config", str(config), stderr=log))
         peer = wait_for_zenoh(endpoint)
         stack.callback(peer.close)
         peer.declare_subscriber("mocap/lab/**", lambda sample: everything.update([str(sample.key_expr)]))
@@ -81,13 +76,6 @@ def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
     assert len(set(first["labels"])) == 12
     duration_s = (last["capture_utime"] - first["capture_utime"]) / 1e6
     assert (len(received) - 1) / duration_s < 31
-
-
-def test_a_subscriber_of_json_alone_starts_a_stream_on_demand(lab: Lab) -> None:
-    keys: set[str] = set()
-    with lab.peer.declare_subscriber("mocap/lazy/3d/json", lambda sample: keys.add(str(sample.key_expr))):
-        wait_until(lambda: keys)
-    assert keys == {"mocap/lazy/3d/json"}
 
 
 @pytest.mark.parametrize(

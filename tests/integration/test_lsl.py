@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pytest
 import pyxdf
-import yaml
 
+from tests.configurations import write_config
 from tests.gateway_process import PROGRAM, program, simulator
 from tests.integration.test_host_clock import WallClock
 from tests.lsl_receiver import LslReceiver, lsl_config
@@ -38,16 +38,9 @@ class Lab:
 
     def __init__(self, folder: Path, port: int) -> None:
         self.config = lsl_config(folder)
-        self.file = folder / "gateway.yaml"
+        lsl = {"enabled": True, "config": str(self.config)}
+        self.file = write_config(folder / "gateway.yaml", port, lsl=lsl)
         self.log_file = folder / "gateway.log"
-        self.configuration: dict[str, Any] = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
-            "zenoh": {"enabled": False},
-            "lcm": {"enabled": False},
-            "metrics": {"enabled": False},
-            "lsl": {"enabled": True, "config": str(self.config)},
-        }
-        self.file.write_text(yaml.safe_dump(self.configuration))
         self._exit = ExitStack()
         self._gateway = self._exit.enter_context(ExitStack())
 

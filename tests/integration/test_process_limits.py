@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import pytest
-import yaml
 
+from tests.configurations import write_config
 from tests.gateway_process import program
 from tests.networks import free_port
 from tests.waiting import wait_until
@@ -29,14 +29,8 @@ class Lab:
     def __init__(self, folder: Path) -> None:
         self.port, self.metrics_port = free_port(), free_port()
         self.file, self.log = folder / "gateway.yaml", folder / "log"
-        configuration = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": free_port()}],
-            "zenoh": {"enabled": False},
-            "lcm": {"enabled": False},
-            "rtc3d": {"enabled": True, "ports": {"lab": self.port}},
-            "metrics": {"port": self.metrics_port},
-        }
-        self.file.write_text(yaml.safe_dump(configuration))
+        rtc3d = {"enabled": True, "ports": {"lab": self.port}}
+        write_config(self.file, free_port(), rtc3d=rtc3d, metrics={"port": self.metrics_port})
 
     def reasons(self) -> list[str]:
         """Return the reasons on /healthz, each on a connection of its own."""

@@ -12,6 +12,7 @@ import pytest
 import rtc3d
 import zenoh
 
+from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode, to_json
 from gateway.outputs.lcm.connection import open_lcm
@@ -24,6 +25,7 @@ from tests.queried_gateway import (
     ParameterServer,
     ServerOfSections,
     gateway_with_server,
+    gateway_without_server,
     query,
     query_all,
     run_gateway,
@@ -63,15 +65,15 @@ class LcmPeer:
             self._lcm, "MOCAP_LAB_PARAMETERS_REPLY", lambda _, data: self.replies.append(decode(data))
         )
 
-    def send(self, number: int, *sections: str, requester: str = "test") -> None:
+    def send(self, number: int, *sections: str, requester: str = "test", fresh: bool = False) -> None:
         message = rtc3d.parameters_request_t()
-        message.request_id, message.requester = number, requester
+        message.request_id, message.requester, message.fresh = number, requester, fresh
         message.sections, message.num_sections = list(sections), len(sections)
         self._lcm.publish("MOCAP_LAB_PARAMETERS_REQUEST", message.encode())
 
-    async def request(self, number: int, *sections: str) -> bytes:
+    async def request(self, number: int, *sections: str, fresh: bool = False) -> bytes:
         """Send a request and return the XML of its only reply."""
-        self.send(number, *sections)
+        self.send(number, *sections, fresh=fresh)
         await wait_until_async(lambda: number in [reply.request_id for reply in self.replies])
         [reply] = [reply for reply in self.replies if reply.request_id == number]
         return bytes(reply.xml.encode())
@@ -105,6 +107,8 @@ async def test_on_lcm_parameters_are_the_servers_xml() -> None:
             num_requests = server.count("SendParameters")
             assert await peer.request(11, "3d", "force") == both
             assert server.count("SendParameters") == num_requests
+            assert await peer.request(12, "3d", "force", fresh=True) == both
+            assert server.count("SendParameters") == num_requests + 1
             assert 99 not in [reply.request_id for reply in peer.replies]
             assert not wrong_url_peer.replies
 
@@ -114,6 +118,19 @@ async def test_on_lcm_parameters_are_the_servers_xml() -> None:
 
 async def until_a_frame(gateway: Gateway) -> None:
     await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
+
+
+async def test_without_frames_the_current_frame_is_requested() -> None:
+    """It is no part of the stream, so it has no number of its own."""
+    server = ParameterServer()
+    server.has_measurement = False
+    async with gateway_with_server(server) as (_, _, gateway, peer):
+        [status] = gateway.sources[0].statuses
+        await wait_until_async(lambda: status.state.value == "no measurement")
+        server.has_measurement = True
+        message = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
+        assert (message.frame_number, message.sequence, message.session) == (7, -1, 1)
+        assert server.commands[-1] == "SendCurrentFrame 3D"
 
 
 USE_SCHEMAS = """
@@ -248,6 +265,37 @@ async def test_recordings_are_started_and_stopped_for_a_single_source() -> None:
 
 
 # Selectors -----------------------------------------------------------------------------------
+
+
+BAD_SELECTORS = [
+    ("", ["accepted below mocap/lab/: parameters, "]),
+    ("/parameters/4d", ["unknown section '4d'", *SECTIONS]),
+    ("/parameters/3d/more", ["unknown key 'parameters/3d/more'", "parameters/3d", "status"]),
+    ("/markers", ["unknown key 'markers'", "parameters", "3d", "recording", "schema/TYPE"]),
+    ("/alive", ["unknown key 'alive'"]),
+    ("/analog", ["component 'analog' is not configured for this source; accepted: 3d, event"]),
+    ("/schema/tools", ["unknown type", "tools_t", "parameters_reply_t"]),
+    ("/schema", ["unknown type", "markers_t"]),
+    ("/parameters?format=yaml", ["format='yaml' is not accepted; accepted: xml, json"]),
+    ("/parameters?fresh=yes", ["fresh='yes' is not accepted; accepted: true, false"]),
+    ("/parameters?fresh", ["fresh='' is not accepted"]),
+    ("/3d?fresh=true", ["unknown option 'fresh' of component; accepted: format=lcm|json"]),
+    ("/c3d?format=json", ["unknown option 'format' of c3d; accepted: none"]),
+    ("/parameters?a=b", ["unknown option 'a'", "format=xml|json, fresh=true|false, stale=ok"]),
+    ("/*?format=yaml", ["format='yaml' is not accepted; accepted: xml, json, lcm"]),
+    ("/*?a=b", ["unknown option 'a' of parameters, component, status", "format=", "stale=ok"]),
+    ("/*/nonsense", ["nothing of source 'lab' matches mocap/lab/*/nonsense", "parameters/3d"]),
+]
+
+
+async def test_the_error_for_a_bad_query_lists_what_is_accepted() -> None:
+    streams = (StreamSettings(components=(ComponentType.MARKERS, ComponentType.EVENT)),)
+    async with gateway_without_server(streams=streams) as (_, peer):
+        for selector, accepted in BAD_SELECTORS:
+            reply = await query(peer, f"mocap/lab{selector}")
+            assert reply.encoding == "text/plain;bad-request", selector
+            assert [text for text in accepted if text not in reply.error] == [], selector
+            assert "\n" not in reply.error
 
 
 async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer_but_files_and_recording(

@@ -11,12 +11,7 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import (
-    MetricsSettings,
-    ReconnectSettings,
-    Settings,
-    SourceSettings,
-)
+from gateway.config.settings import MetricsSettings, Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
@@ -28,7 +23,7 @@ from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
 from gateway.service.daemon import Daemon
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import make_settings
+from tests.configurations import local_source, make_settings
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
 from tests.running_gateway import running_gateway
@@ -37,9 +32,7 @@ from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-
-def simulator(tools: int = 0) -> Simulator:
-    return Simulator(SyntheticScene(markers=1, tools=tools, analog=0, plates=0, rate_hz=200))
+SCENE = SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200)
 
 
 class SettingsBuilder:
@@ -51,12 +44,8 @@ class SettingsBuilder:
 
     def settings(self, sources: Mapping[str, int], **sections: Any) -> Any:
         """Return settings with sources by name and port; ``sections`` replace the default sections."""
-        reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
         return make_settings(
-            sources=tuple(
-                SourceSettings(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
-                for name, port in sources.items()
-            ),
+            sources=tuple(local_source(port, name) for name, port in sources.items()),
             **{
                 "zenoh": self.zenoh(),
                 "lcm": self.lcm(),
@@ -80,14 +69,13 @@ async def running(settings: Settings) -> AsyncIterator[Gateway]:
 
 
 class ReceivedMarkers:
-    """The (session, sequence) of received marker messages, in order, by key or channel."""
+    """The sequence numbers of received marker messages, in order, by key or channel."""
 
     def __init__(self) -> None:
-        self.numbers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+        self.numbers: defaultdict[str, list[int]] = defaultdict(list)
 
     def append(self, name: str, message: bytes) -> None:
-        markers = decode(message)
-        self.numbers[name].append((markers.session, markers.sequence))
+        self.numbers[name].append(decode(message).sequence)
 
     async def wait_for_more(self, name: str, count: int = 20) -> None:
         """Wait for ``count`` more messages on a key or channel."""
@@ -95,7 +83,7 @@ class ReceivedMarkers:
         await wait_until_async(lambda: len(self.numbers[name]) >= wanted)
 
     def assert_gapless(self, name: str) -> None:
-        sequences = [sequence for _, sequence in self.numbers[name]]
+        sequences = self.numbers[name]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
 
 
@@ -164,7 +152,7 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
     output: str, other: str, before: str, kept: str, after: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     builder = SettingsBuilder()
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+    async with Simulator(SCENE) as server, running(builder.settings({"lab": server.port})) as gateway:
         with subscribed(builder) as received:
             await received.wait_for_more(before)
             await received.wait_for_more(kept)
@@ -174,7 +162,7 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
             await received.wait_for_more(after)
             await received.wait_for_more(kept)
             received.assert_gapless(kept)
-            assert received.numbers[after][0][1] > received.numbers[before][-1][1]
+            assert received.numbers[after][0] > received.numbers[before][-1]
             assert len(server.connections) == 1
     assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
 

@@ -28,10 +28,9 @@ START, STOP = (
 
 @dataclass
 class At:
-    """An address."""
+    """Where a server will listen."""
 
     port: int
-    host: str = "127.0.0.1"
 
 
 async def test_clients_stay_connected_until_the_server_is_there_and_while_it_restarts() -> None:

@@ -15,7 +15,6 @@ from gateway.stream.state import StreamState
 from tests.command_process import run
 from tests.integration.commands.test_params_command import SIDES, Lab, lab_without_server
 from tests.networks import free_endpoint, lcm_url, open_zenoh
-from tests.pseudo_terminals import in_terminal
 from tests.queried_gateway import ParameterServer, run_gateway
 from tests.servers import ScriptedServer
 from tests.waiting import wait_until_async
@@ -78,20 +77,6 @@ async def test_a_source_that_does_not_exist_is_status_3_with_those_that_do(at: L
         assert "no gateway found" in done.stderr
 
 
-async def test_two_gateways_with_the_same_source_are_both_listed(at: Lab) -> None:
-    """They disturb each other, so the user must see both, with their servers."""
-    async with (
-        ScriptedServer(ParameterServer().script) as listening,
-        run_gateway(listening.port, router=at.endpoint, lcm_url=at.url) as second,
-    ):
-        await wait_until_async(lambda: second.sources[0].sequence > 1)
-        for done in await at.run("list", "--json"):
-            sources = json.loads(done.stdout)["sources"]
-            assert (done.status, [source["source"] for source in sources]) == (0, ["lab", "lab"])
-            assert len({source["server"] for source in sources}) == 2
-            assert "2 gateways serve a source 'lab'" in done.stderr
-
-
 async def test_hostile_or_missing_answers_do_not_hide_a_gateway(at: Lab) -> None:
     """Other programs can neither hide a gateway nor write to the terminal; one that hangs is listed, too."""
     payloads = {"evil0": b"\x1b[2J", "evil1": bytes(3_000_000), "evil2": b""}
@@ -128,12 +113,3 @@ async def test_messages_of_other_programs_on_lcm_are_listed_as_unreadable(at: La
     lines = dict(line.split("\t", 1) for line in (await task).stdout.splitlines())
     assert sorted(lines) == ["lab", "old"]
     assert lines["old"].startswith("its status is of another version of rtc3d-gateway")
-
-
-async def test_on_a_terminal_a_table_is_printed(at: Lab) -> None:
-    """The columns have titles and fit the terminal."""
-    with in_terminal("list", "--connect", at.endpoint, columns=80, TERM="dumb") as terminal:
-        assert await asyncio.to_thread(terminal.wait_for_end) == 0
-    text = terminal.output.decode()
-    assert text.split()[:6] == ["source", "state", "components", "server", "host", "version"]
-    assert max(map(len, text.splitlines())) <= 80

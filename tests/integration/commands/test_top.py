@@ -12,10 +12,10 @@ from contextlib import ExitStack
 from typing import Any, Final, NamedTuple
 
 import pytest
-import yaml
 
 from gateway.top.pages import TWO_GATEWAYS
 from tests.command_process import Completed, run_command
+from tests.configurations import write_config
 from tests.gateway_process import program, simulator
 from tests.networks import free_endpoint, lcm_url, open_zenoh, zenoh_keys
 from tests.pseudo_terminals import PseudoTerminal, in_terminal
@@ -55,17 +55,17 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         router = stack.enter_context(contextlib.closing(open_zenoh("router", listen=endpoint)))
         router.declare_subscriber("mocap/Lab-1/3d", lambda sample: received.append(str(sample.key_expr)))
         port, simulated = stack.enter_context(simulator(*SCENE))
-        configuration = {
-            "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port}],
-            "zenoh": {"tool_poses": True, "config": zenoh_keys("client", connect=endpoint)},
-            "lcm": {"url": url},
-            "metrics": {"enabled": False},
-        }
-        (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
+        config = write_config(
+            folder / "gateway.yaml",
+            port,
+            source={"name": "Lab-1"},
+            zenoh={"tool_poses": True, "config": zenoh_keys("client", connect=endpoint)},
+            lcm={"url": url},
+        )
         running: list[Any] = []
 
         def start() -> None:
-            gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
+            gateway = program("run", "--config", str(config), stderr=subprocess.DEVNULL)
             running.append(stack.enter_context(gateway))
 
         def stop() -> None:
@@ -182,16 +182,6 @@ def test_a_source_that_nobody_serves_is_named_with_those_that_exist(lab: Lab) ->
     for ended in partly:
         assert (ended.status, ended.stderr) == (STATUS_3, error)
         assert "Marker 12" in ended.stdout
-
-
-def test_a_locale_other_than_utf_8_gets_tables_without_escapes(lab: Lab) -> None:
-    """Its arrows become ASCII."""
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "environ": {"PYTHONIOENCODING": "ascii"}}
-    with program("top", "--once", *lab.lcm, **pipes) as process:
-        text = process.communicate(timeout=120)[0].decode("ascii")
-    assert process.returncode == 0
-    assert "\\u" not in text
-    assert ">gateway" in text
 
 
 def test_pages_on_a_terminal_of_any_size(lab: Lab) -> None:

@@ -1,14 +1,19 @@
-"""``streams: auto``: a connection for each rate, and one connection where the server serves no more."""
+"""Streams of a whole gateway: those of its configuration, and those that ``auto`` chooses."""
 
 import asyncio
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 
+from gateway.config.settings import StreamSettings
+from gateway.rtc3d.commands import FrequencyDivisor
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.server import RtServer
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.memory_gateway import MemoryGateway, run_gateway
@@ -16,12 +21,7 @@ from tests.memory_gateway import MemoryGateway, run_gateway
 ONE_CONNECTION = "analog and force arrive at 200 Hz instead of 2000 Hz: "
 EVERYTHING = "3d 6d analog force event"
 TWO = ["3d 6d event", "analog force"]
-
-
-def lab_scene(rate_hz: float = 200, analog_rate_hz: float = 2000) -> SyntheticScene:
-    return SyntheticScene(
-        markers=3, tools=1, analog=2, plates=1, rate_hz=rate_hz, analog_rate_hz=analog_rate_hz
-    )
+SCENE = SyntheticScene(markers=3, tools=1, analog=2, plates=1, rate_hz=200, analog_rate_hz=2000)
 
 
 class _Filter(ConnectionFilter):
@@ -57,11 +57,11 @@ class OneClientServer(RtServer):
     requests frames: "close_first", "crash".
     """
 
-    def __init__(self, on_second: str, scene: SyntheticScene | None = None, **keys: Any) -> None:
-        super().__init__(scene or lab_scene(), new_filter=lambda each: _Filter(each, self), **keys)
+    def __init__(self, on_second: str) -> None:
+        super().__init__(SCENE, new_filter=lambda each: _Filter(each, self))
         self.on_second = on_second
         self.commands: list[tuple[int, str]] = []
-        self.num_opened = self.num_crashes = 0
+        self.num_opened = 0
 
     @property
     def num_clients(self) -> int:
@@ -84,7 +84,6 @@ class OneClientServer(RtServer):
                 other.transport.abort()
 
     def crash_and_restart(self) -> None:
-        self.num_crashes += 1
         self.crash()
         asyncio.get_running_loop().call_later(0.1, lambda: asyncio.ensure_future(self.start()))
 
@@ -95,6 +94,43 @@ def components(lab: MemoryGateway) -> list[str]:
 
 def steps(messages: list[Any]) -> set[int]:
     return {after.frame_number - before.frame_number for before, after in pairwise(messages)}
+
+
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+async def test_every_component_of_the_simulator_is_published(byte_order: str) -> None:
+    scene = SyntheticScene(markers=5, tools=1, analog=3, plates=1, rate_hz=200, analog_rate_hz=200)
+    counts = {"3d": "markers 5", "6d": "tools 1", "analog": "channels 3", "force": "plates 1"}
+    counts["event"] = "events 1"
+    async with (
+        Simulator(scene) as simulator,
+        run_gateway(simulator.port, byte_order=byte_order) as gateway,
+    ):
+        for component, (kind, count) in ((key, text.split()) for key, text in counts.items()):
+            [message, *_] = await gateway.wait_for(component)
+            assert getattr(message, f"num_{kind}") == int(count)
+        markers = await gateway.wait_for("3d", 20)
+        assert [message.sequence for message in markers] == list(range(len(markers)))
+        for message in markers:
+            # A scene is a function of time; frames are numbered from 1.
+            [items] = scene.items(ComponentType.MARKERS, np.array([message.frame_number - 1]))
+            assert [marker.x for marker in message.markers] == items["x"].tolist()
+            assert message.session == 1
+        status = gateway.status
+        expected = (StreamState.STREAMING, byte_order, "AllFrames")
+        assert (status.state, status.byte_order, status.rate) == expected
+
+
+async def test_each_stream_has_its_own_connection_and_its_configured_rate() -> None:
+    scene = SyntheticScene(markers=2, tools=0, analog=2, plates=0, rate_hz=200, analog_rate_hz=1000)
+    streams = (
+        StreamSettings(components=(ComponentType.MARKERS,), rate=FrequencyDivisor(4)),
+        StreamSettings(components=(ComponentType.ANALOG,)),
+    )
+    async with Simulator(scene) as simulator, run_gateway(simulator.port, streams=streams) as gateway:
+        assert steps(await gateway.wait_for("analog", 100)) == {1}
+        assert steps(await gateway.wait_for("3d", 10)) == {4}
+        assert len(simulator.connections) == 2
+        assert gateway.status.rate == "FrequencyDivisor:4"
 
 
 async def test_every_component_arrives_at_its_own_rate() -> None:
@@ -114,10 +150,29 @@ async def test_every_component_arrives_at_its_own_rate() -> None:
         assert server.num_opened == 2
 
 
-async def new_steps(lab: MemoryGateway, component: str, count: int, skipped: int = 20) -> set[int]:
-    """Return the steps between ``count`` messages to come, without the first of them."""
-    before = len(lab.messages(component))
-    return steps((await lab.wait_for(component, before + skipped + count))[before + skipped :])
+class _Nameless(_Filter):
+    def answer(self, packet: Packet) -> list[bytes]:
+        text = decode_text(packet.body)
+        if text.startswith("StreamFrames") and text.rstrip("\0\n").endswith(("3D", "6D", "Events", "Force")):
+            return [b"\0\0\0\x0e\0\0\0\0Error-"]
+        return super().answer(packet)
+
+
+async def test_a_server_that_knows_no_component_names_sends_everything_on_one_connection() -> None:
+    server = OneClientServer("serve")
+    server._new_filter = lambda each: _Nameless(each, server)
+    async with server, run_gateway(server.port) as lab:
+        analog = await lab.wait_for("analog", 100)
+        assert steps(analog) == {10}
+        assert components(lab) == [EVERYTHING]
+        assert f"{ONE_CONNECTION}the server does not accept the names of components" in lab.status.limitations
+        assert server.num_opened == 1
+
+
+async def new_steps(lab: MemoryGateway, component: str, count: int) -> set[int]:
+    """Return the steps between ``count`` messages to come, after the first 20 of them."""
+    first = len(lab.messages(component)) + 20
+    return steps((await lab.wait_for(component, first + count))[first:])
 
 
 def assert_continuous(lab: MemoryGateway) -> None:
