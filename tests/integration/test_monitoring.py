@@ -8,8 +8,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +23,6 @@ from gateway.config.settings import (
     StreamSettings,
 )
 from gateway.gateway import Gateway
-from gateway.monitoring.server import MonitoringServer
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
@@ -36,7 +34,7 @@ from tests.configurations import local_source, make_settings
 from tests.documents import ROOT
 from tests.needs import need_programs
 from tests.networks import free_port, zenoh_keys
-from tests.running_gateway import running_gateway
+from tests.running_gateway import monitored_gateway
 from tests.waiting import wait_until_async
 
 RULES: Final = ROOT / "config/prometheus/rtc3d-gateway.yaml"
@@ -51,10 +49,9 @@ PROMETHEUS_LABELS = {"job", "instance"}
 """Labels that Prometheus adds."""
 
 
-@asynccontextmanager
-async def running_lab(server_port: int, port: int) -> AsyncIterator[Gateway]:
-    """Run a gateway for the source "lab" on Zenoh and LCM, and its monitoring server."""
-    gateway = Gateway(
+def lab(server_port: int, port: int) -> Gateway:
+    """Return a gateway for the source "lab" on Zenoh and LCM."""
+    return Gateway(
         make_settings(
             sources=(local_source(server_port, streams=STREAMS, stall_timeout_s=60.0),),
             zenoh=ZenohSettings(config=zenoh_keys("peer")),
@@ -62,13 +59,6 @@ async def running_lab(server_port: int, port: int) -> AsyncIterator[Gateway]:
             metrics=MetricsSettings(port=port),
         )
     )
-    monitoring = MonitoringServer(gateway.settings.metrics, gateway)
-    async with running_gateway(gateway):
-        await monitoring.start()
-        try:
-            yield gateway
-        finally:
-            await monitoring.close()
 
 
 async def until_all(gateway: Gateway, condition: Callable[[StreamStatus], object]) -> None:
@@ -92,7 +82,7 @@ def families() -> dict[str, Metric]:
 
     async def run() -> dict[str, Metric]:
         port = free_port()
-        async with simulator() as server, running_lab(server.port, port) as gateway:
+        async with simulator() as server, monitored_gateway(lab(server.port, port)) as gateway:
             await until_all(gateway, lambda status: status.clock.has_clock)
             outputs = gateway.sources[0].fan_out.outputs
             await wait_until_async(lambda: all(status.messages["status"] for _, status in outputs))
@@ -257,7 +247,7 @@ async def test_the_log_format_option_selects_the_format() -> None:
 async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.LogCaptureFixture) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        async with simulator() as server, running_lab(server.port, port) as gateway:
+        async with simulator() as server, monitored_gateway(lab(server.port, port)) as gateway:
             await until_all(gateway, lambda status: status.state is StreamState.STREAMING)
     [warning] = [record for record in caplog.records if record.name == "gateway.monitoring.server"]
     assert warning.levelno == logging.WARNING

@@ -32,7 +32,7 @@ from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-SCENE = SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200)
+SCENE = SyntheticScene(markers=1, tools=2, analog=0, plates=0, rate_hz=200)
 
 
 class SettingsBuilder:
@@ -165,6 +165,23 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
             assert received.numbers[after][0] > received.numbers[before][-1]
             assert len(server.connections) == 1
     assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+@pytest.mark.parametrize("output", ["lcm", "zenoh"])
+async def test_switching_tool_poses_does_not_reopen_the_output(output: str) -> None:
+    builder = SettingsBuilder()
+    async with Simulator(SCENE) as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            outputs = list(gateway.outputs)
+            for is_on in (True, False, True):
+                changed = {output: getattr(builder, output)(tool_poses=is_on)}
+                settings = builder.settings({"lab": server.port}, **changed)
+                assert await gateway.reload(settings) == [f"output {output} changed"]
+                assert await gateway.reload(settings) == []
+                for name in ("mocap/lab/3d", "MOCAP_LAB_3D"):
+                    await received.wait_for_more(name)
+                    received.assert_gapless(name)
+            assert list(gateway.outputs) == outputs
 
 
 async def test_a_changed_zenoh_configuration_file_reopens_the_output_unless_zenoh_refuses_it(

@@ -17,6 +17,7 @@ from gateway.outputs.lcm import parameters as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
+from tests.command_in_process import run_in_process
 from tests.command_process import Completed, run
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
@@ -97,13 +98,6 @@ async def test_parameters_are_printed_as_lines_as_json_and_fresh_as_xml() -> Non
             requests = at.server.count("SendParameters")
 
 
-async def test_no_gateway_is_status_3() -> None:
-    for done in await Lab(ParameterServer(), free_endpoint(), lcm_url()).run("params"):
-        assert (done.status, done.stdout) == (3, "")
-        assert "gateway" in done.stderr
-        assert done.stderr.count("\n") == 1
-
-
 @pytest.mark.parametrize("is_late", [False, True], ids=["no gateway", "an answer that comes too late"])
 async def test_a_router_without_a_gateway_is_status_3(is_late: bool) -> None:
     """Also with a busy router: the query ends with Zenoh's own error."""
@@ -160,6 +154,20 @@ async def test_fresh_parameters_that_do_not_come(
         for done in await at.params("--fresh", "--timeout", str(timeout_s)):
             assert done.status == status
             assert text in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["4d"], "unknown section '4d'; known sections: general, 3d, 6d, analog, force, events"),
+        (["--json", "--xml"], "--json or --xml"),
+        (["--timeout", "0"], "--timeout"),
+    ],
+)
+def test_a_wrong_command_line_is_status_2(arguments: list[str], text: str) -> None:
+    done = run_in_process("params", *arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert text in " ".join(done.stderr.replace("│", " ").split())
 
 
 async def test_sources_of_several_gateways_are_shown_and_one_without_a_server_hides_no_other() -> None:
