@@ -8,7 +8,7 @@ from typing import Any, Final
 import yaml
 
 from gateway.config import loading
-from gateway.config.settings import ReconnectSettings, SourceSettings
+from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.outputs.registry import settings_type
 
 MODEL: Final[Any] = settings_type()
@@ -24,6 +24,11 @@ def local_source(port: int, name: str = "lab", **settings: Any) -> SourceSetting
     reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
     defaults: dict[str, Any] = {"name": name, "host": "127.0.0.1", "port": port, "reconnect": reconnect}
     return SourceSettings(**(defaults | settings))
+
+
+def local_settings(*sources: SourceSettings, **sections: Any) -> Any:
+    """Return settings with these sources and sections, and without metrics."""
+    return make_settings(**{"sources": sources, "metrics": MetricsSettings(enabled=False), **sections})
 
 
 def write_config(file: Path, port: int, *, source: Mapping[str, Any] | None = None, **sections: Any) -> Path:

@@ -4,11 +4,10 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gateway.config.settings import MetricsSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.memory import MemoryOutput
-from tests.configurations import local_source, make_settings
+from tests.configurations import local_settings, local_source
 from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
 
@@ -43,8 +42,7 @@ async def run_gateway(port: int, **settings: Any) -> AsyncIterator[MemoryGateway
     ``settings`` replaces settings of the source.
     """
     timeouts = {"reply_timeout_s": 60.0, "stall_timeout_s": 60.0}
-    sources = (local_source(port, **(timeouts | settings)),)
     output = MemoryOutput()
-    gateway = Gateway(make_settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output])
+    gateway = Gateway(local_settings(local_source(port, **(timeouts | settings))), [output])
     async with running_gateway(gateway):
         yield MemoryGateway(gateway, output)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from gateway.config.settings import MetricsSettings, SpoolSettings
+from gateway.config.settings import SpoolSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
@@ -18,7 +18,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from tests.configurations import local_source, make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.running_gateway import running_gateway
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
@@ -139,8 +139,8 @@ async def run_gateway(
         update={} if "fresh_interval_s" in source else {"fresh_interval_s": 0.0}
     )
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)
-    settings = make_settings(
-        sources=(lab,),
+    settings = local_settings(
+        lab,
         zenoh=ZenohSettings(
             enabled=bool(listen or router), config=keys, tool_poses=tool_poses, max_rate_hz=max_rate_hz or {}
         ),
@@ -149,7 +149,6 @@ async def run_gateway(
         ),
         takes=takes or TakesSettings(),
         spool=SpoolSettings(directory=None if spool is None else str(spool)),
-        metrics=MetricsSettings(enabled=False),
     )
     async with running_gateway(Gateway(settings)) as gateway:
         yield gateway

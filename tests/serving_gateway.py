@@ -4,14 +4,13 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Protocol
 
-from gateway.config.settings import MetricsSettings
 from gateway.gateway import Gateway
 from gateway.outputs.contract import Output
 from gateway.outputs.rtc3d.live_server import LiveServer
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.simulator.simulator import Simulator
-from tests.configurations import local_source, make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
 from tests.unit.rtc3d_server.counting_scene import CountingScene
@@ -56,9 +55,7 @@ async def serving_gateway(
     """
     port = free_port()
     output = Rtc3dOutput(Rtc3dSettings(enabled=True, ports={"lab": port}))
-    sources = (local_source(server.port, **source),)
-    settings = make_settings(sources=sources, metrics=MetricsSettings(enabled=False))
-    gateway = Gateway(settings, [output, *outputs])
+    gateway = Gateway(local_settings(local_source(server.port, **source)), [output, *outputs])
     async with running_gateway(gateway):
         served = ServingGateway(gateway, output, port)
         await wait_until_async(lambda: output.health().connected)

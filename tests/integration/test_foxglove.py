@@ -2,11 +2,9 @@
 
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 from mcap.reader import make_reader
 
-from gateway.config.settings import MetricsSettings, SourceSettings
 from gateway.export.formats import export_take
 from gateway.export.job import ExportJob
 from gateway.gateway import Gateway
@@ -16,7 +14,7 @@ from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.foxglove_viewer import viewing
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
@@ -24,14 +22,6 @@ from tests.running_gateway import running_gateway
 SCENE = SyntheticScene(markers=20, tools=3, analog=12, plates=2, rate_hz=100, analog_rate_hz=500)
 FRAMES = ("markers", "tools", "analog", "loads", "forces", "events")
 TOPICS = tuple(f"/lab/{name}" for name in (*FRAMES, "plates", "parameters"))
-
-
-def settings(port: int, *names: str, **source: Any) -> Any:
-    """Return settings with these sources, all on the server at ``port``."""
-    sources = tuple(
-        SourceSettings(name=name, host="127.0.0.1", port=port, **source) for name in names or ("lab",)
-    )
-    return make_settings(sources=sources, metrics=MetricsSettings(enabled=False))
 
 
 def raw_messages(path: Path) -> dict[str, list[tuple[int, bytes]]]:
@@ -47,7 +37,7 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
     takes = TakesOutput(TakesSettings(enabled=True, directory=str(tmp_path / "takes")))
     viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
     async with Simulator(SCENE) as server:
-        gateway = Gateway(settings(server.port), [takes, viewers])
+        gateway = Gateway(local_settings(local_source(server.port)), [takes, viewers])
         async with running_gateway(gateway):
             await gateway.opened.wait()
             async with viewing(viewers.settings.port, *TOPICS) as viewer:

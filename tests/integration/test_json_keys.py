@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -15,8 +14,9 @@ import zenoh
 from gateway.live.live_data import LiveData
 from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.event_log import EventLogReader
+from tests.command_process import run_command
 from tests.configurations import write_config
-from tests.gateway_process import PROGRAM, program, simulator
+from tests.gateway_process import program, simulator
 from tests.networks import free_endpoint, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
@@ -60,10 +60,6 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         yield Lab(endpoint, folder / "takes", peer, everything)
 
 
-def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run([*PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=False)
-
-
 def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
     """30 messages a second of 100, evenly spaced by the time of their capture."""
     received: list[dict[str, Any]] = []
@@ -90,8 +86,8 @@ def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
     ],
 )
 def test_commands_show_messages_and_no_json(lab: Lab, arguments: str, shown: list[str]) -> None:
-    done = run(*arguments.split(), "--source", "lab", "--connect", lab.endpoint)
-    assert (done.returncode, done.stderr) == (0, "")
+    done = run_command(*arguments.split(), "--source", "lab", "--connect", lab.endpoint)
+    assert (done.status, done.stderr) == (0, "")
     assert [text for text in shown if text not in done.stdout] == []
     assert "/json" not in done.stdout
 
@@ -103,10 +99,10 @@ def channels_in(file: Path) -> set[str]:
 def test_recordings_have_messages_and_no_json(lab: Lab, tmp_path: Path) -> None:
     """What ``record`` writes, and the gateway's own take of the same time."""
     file = tmp_path / "take.lcmlog"
-    assert run("take", "start", "one", "--source", "lab", "--connect", lab.endpoint).returncode == 0
-    done = run("record", str(file), "--seconds", "3", "--source", "lab", "--connect", lab.endpoint)
-    assert run("take", "stop", "--source", "lab", "--connect", lab.endpoint).returncode == 0
-    assert done.returncode == 0
+    assert run_command("take", "start", "one", "--source", "lab", "--connect", lab.endpoint).status == 0
+    done = run_command("record", str(file), "--seconds", "3", "--source", "lab", "--connect", lab.endpoint)
+    assert run_command("take", "stop", "--source", "lab", "--connect", lab.endpoint).status == 0
+    assert done.status == 0
     assert "left out" not in done.stdout + done.stderr
     for channels in (channels_in(file), channels_in(lab.takes / "lab" / "one.lcmlog")):
         assert {"MOCAP_LAB_3D", "MOCAP_LAB_6D"} <= channels

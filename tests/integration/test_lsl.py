@@ -1,7 +1,6 @@
 """LSL as its users see it: pylsl's inlets in another process, and the file that LabRecorder writes."""
 
 import json
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -12,8 +11,9 @@ import numpy as np
 import pytest
 import pyxdf
 
+from tests.command_process import run_command
 from tests.configurations import write_config
-from tests.gateway_process import PROGRAM, program, simulator
+from tests.gateway_process import program, simulator
 from tests.integration.test_host_clock import WallClock
 from tests.lsl_receiver import LslReceiver, lsl_config
 from tests.waiting import wait_until
@@ -155,8 +155,7 @@ def test_receivers_that_wait_continue_with_all_streams_of_the_next_gateway(tmp_p
 def test_the_doctor_finds_the_streams_of_a_running_gateway(tmp_path: Path) -> None:
     with running(tmp_path) as lab:
         lab.receive("lab_3d")
-        command = [*PROGRAM, "doctor", "--config", str(lab.file), "--json"]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        result = run_command("doctor", "--config", lab.file, "--json")
     found = {
         finding["check"]: finding["result"]
         for finding in json.loads(result.stdout)["findings"]

@@ -23,7 +23,7 @@ from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
 from gateway.service.daemon import Daemon
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import local_source, make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
 from tests.running_gateway import running_gateway
@@ -44,15 +44,8 @@ class SettingsBuilder:
 
     def settings(self, sources: Mapping[str, int], **sections: Any) -> Any:
         """Return settings with sources by name and port; ``sections`` replace the default sections."""
-        return make_settings(
-            sources=tuple(local_source(port, name) for name, port in sources.items()),
-            **{
-                "zenoh": self.zenoh(),
-                "lcm": self.lcm(),
-                "metrics": MetricsSettings(enabled=False),
-                **sections,
-            },
-        )
+        own = {"zenoh": self.zenoh(), "lcm": self.lcm()}
+        return local_settings(*(local_source(port, name) for name, port in sources.items()), **own | sections)
 
     def zenoh(self, **keys: Any) -> ZenohSettings:
         return ZenohSettings(**{"config": zenoh_keys("peer", listen=self.endpoint), **keys})

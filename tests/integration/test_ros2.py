@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.config.settings import MetricsSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.ros2.message_types import ROS_TYPES
@@ -18,7 +17,7 @@ from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import local_source, make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import open_zenoh
 from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
@@ -36,12 +35,11 @@ TYPES: Final = {
 
 def settings_of(router: str, sources: dict[str, int], ros2: Ros2Settings | None = None) -> Any:
     """Return settings with sources by name and port, for ROS on ``router`` only."""
-    return make_settings(
-        sources=tuple(local_source(port, name) for name, port in sources.items()),
+    return local_settings(
+        *(local_source(port, name) for name, port in sources.items()),
         zenoh=ZenohSettings(enabled=False),
         lcm=LcmSettings(enabled=False),
         ros2=ros2 or Ros2Settings(enabled=True, connect=router),
-        metrics=MetricsSettings(enabled=False),
     )
 
 

@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import MetricsSettings
 from gateway.gateway import Gateway
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
-from tests.configurations import local_source, make_settings
+from tests.configurations import local_settings, local_source
 from tests.needs import need
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
@@ -33,13 +32,12 @@ async def served(servers: Mapping[str, int], *, port: int = 0, **settings: Any) 
     ``settings`` are those of each source.
     """
     port = port or free_port()
-    sources = tuple(
+    sources = (
         local_source(server_port, name, parameters_interval_s=0.1, **settings)
         for name, server_port in servers.items()
     )
     output = VrpnOutput(VrpnSettings(enabled=True, port=port))
-    given = make_settings(sources=sources, metrics=MetricsSettings(enabled=False))
-    async with running_gateway(Gateway(given, [output])):
+    async with running_gateway(Gateway(local_settings(*sources), [output])):
         await wait_until_async(lambda: output.health().connected)
         yield port
 
