@@ -7,8 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import yaml
 import zenoh
 
+from tests.configurations import write_config
 from tests.gateway_process import program, simulator
 from tests.networks import free_port
 from tests.waiting import wait_until
@@ -72,15 +74,10 @@ def run_gateway_with_simulator(
     """Run a simulator and a gateway with ``zenoh_config``, as YAML; yield its log file once frames arrive."""
     log = folder / "gateway.log"
     with simulator("--rate", "50") as (port, _), log.open("wb") as output:
-        (folder / "gateway.yaml").write_text(
-            f"sources: [{{name: lab, host: 127.0.0.1, port: {port}}}]\n"
-            f"zenoh: {{config: {zenoh_config}}}\n"
-            "lcm: {enabled: false}\n"
-            f"spool: {{directory: {folder}/spool}}\n"
-            "metrics: {enabled: false}\n",
-            encoding="utf-8",
-        )
-        arguments = ("run", "--config", str(folder / "gateway.yaml"), "--log-level", "debug")
+        zenoh = {"config": yaml.safe_load(zenoh_config)}
+        spool = {"directory": str(folder / "spool")}
+        config = write_config(folder / "gateway.yaml", port, zenoh=zenoh, spool=spool)
+        arguments = ("run", "--config", str(config), "--log-level", "debug")
         with program(*arguments, environ=environ, stdout=output, stderr=output):
             wait_until(lambda: "→ streaming" in log.read_text())
             yield log

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.command_process import run_command
+from tests.configurations import write_config
 from tests.networks import free_port
 from tests.secure_zenoh import SecureRouter, run_gateway_with_simulator
 from tests.waiting import wait_until
@@ -37,8 +38,7 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
         assert result.status == 2
         assert f"Zenoh does not accept the file {file}" in result.stderr
         assert "Traceback" not in result.stderr
-    config = tmp_path / "gateway.yaml"
-    config.write_text("sources: [{name: lab, host: 127.0.0.1, port: 9}]\nmetrics: {enabled: false}\n")
+    config = write_config(tmp_path / "gateway.yaml", 9, zenoh={}, lcm={})
     link = doctor(config, "--zenoh-config", str(file))["link"]
     assert link["found"].startswith(f"Zenoh does not accept the file {file}")
     assert (link["result"], link["remedy"]) == ("red", "Correct this file.")
@@ -65,11 +65,7 @@ def test_the_doctor_works_with_the_gateways_and_with_a_viewers_certificate(
     """The gateway's certificate may publish only: a viewer's is needed to see the gateway."""
     (tmp_path / "gateway.json5").write_text(secured.client("gateway"), encoding="utf-8")
     (tmp_path / "viewer.json5").write_text(secured.client("viewer"), encoding="utf-8")
-    config = tmp_path / "gateway.yaml"
-    config.write_text(
-        "sources: [{name: lab, host: 127.0.0.1, port: 9}]\n"
-        "zenoh: {config: gateway.json5}\nlcm: {enabled: false}\nmetrics: {enabled: false}\n"
-    )
+    config = write_config(tmp_path / "gateway.yaml", 9, zenoh={"config": "gateway.json5"})
     findings = doctor(config)
     assert findings["link"]["found"] == "the session is open and connected to a router"
     assert findings["gateway"]["result"] == "not tested"
