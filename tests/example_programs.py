@@ -15,15 +15,17 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
+from tests.configurations import write_config
+from tests.gateway_process import program, simulator
 from tests.needs import need
-from tests.networks import free_port
+from tests.networks import free_endpoint, zenoh_keys
+from tests.waiting import wait_until
 
 ROOT: Final = Path(__file__).parents[1]
 EXAMPLES: Final = ROOT / "examples"
@@ -148,23 +150,10 @@ def run_gateway(folder: Path, *simulated: str, ready: str) -> Iterator[str]:
 
     Yields the gateway's Zenoh endpoint when it has logged ``ready``.
     """
-    port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
-    config = folder / "gateway.yaml"
-    config.write_text(
-        f"""
-        sources: [{{name: lab, host: 127.0.0.1, port: {port}}}]
-        zenoh:
-          config: {{listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}
-        """
-    )
-    program = (sys.executable, "-m", "gateway")
-    simulate = (*program, "simulate", "--port", str(port), *simulated)
-    run = (*program, "run", "--config", str(config), "--log-level", "debug")
-    with (
-        run_program(*simulate, ready="RTC3D server on") as simulator,
-        run_program(*run, ready=ready) as gateway,
-    ):
-        for process in (simulator, gateway):
-            assert process.stdout is not None
-            threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop it
-        yield endpoint
+    endpoint, log = free_endpoint(), folder / "gateway.log"
+    with simulator(*simulated) as (port, _), log.open("wb") as stderr:
+        zenoh = {"config": zenoh_keys("peer", listen=endpoint)}
+        config = write_config(folder / "gateway.yaml", port, zenoh=zenoh, lcm={"url": LCM_URL})
+        with program("run", "--config", str(config), "--log-level", "debug", stderr=stderr):
+            wait_until(lambda: ready in log.read_text())
+            yield endpoint

@@ -45,20 +45,18 @@ class Findings:
 
 async def run_doctor(
     *sources: SourceSettings,
-    zenoh_settings: ZenohSettings | None = None,
-    lcm: LcmSettings | None = None,
     metrics: MetricsSettings | None = None,
     seconds: float = SECONDS,
     connects: bool = True,
 ) -> Findings:
     """Return the findings for ``sources``.
 
-    By default, Zenoh is disabled, LCM stays in memory, and no running gateway is asked.
+    Zenoh is disabled, LCM stays in memory, and by default no running gateway is asked.
     """
     settings = make_settings(
         sources=sources,
-        zenoh=zenoh_settings or ZenohSettings(enabled=False),
-        lcm=lcm or LcmSettings(url="memq://"),
+        zenoh=ZenohSettings(enabled=False),
+        lcm=LcmSettings(url="memq://"),
         metrics=metrics or MetricsSettings(enabled=False),
     )
     checks = run_checks(settings, "lab.yaml", seconds, connects=connects)

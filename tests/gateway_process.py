@@ -13,10 +13,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import yaml
 import zenoh
 
 from gateway.messages.decode import decode
+from tests.configurations import write_config
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
@@ -115,21 +115,17 @@ def gateway_process(
     ``lcm_url``, it also publishes on LCM.
     """
     endpoint = free_endpoint()
-    configuration = {
-        "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, **source}],
+    sections = {
         "zenoh": {"config": zenoh_keys("peer", connect=endpoint)},
         "lcm": {"enabled": lcm_url is not None, "url": lcm_url},
-        "metrics": {"enabled": False},
     }
-    (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
+    config = write_config(folder / "gateway.yaml", port, source=source, **sections)
     log = folder / "gateway.log"
     with contextlib.ExitStack() as stack:
         session = open_zenoh(hub, listen=endpoint)
         stack.callback(session.close)
         file = stack.enter_context(log.open("wb"))
-        process = stack.enter_context(
-            program("run", "--config", str(folder / "gateway.yaml"), environ=environ, stderr=file)
-        )
+        process = stack.enter_context(program("run", "--config", str(config), environ=environ, stderr=file))
         gateway = GatewayProcess(process, log, endpoint)
         session.declare_subscriber("mocap/lab/*", gateway.receive)
         yield gateway

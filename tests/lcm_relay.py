@@ -18,12 +18,10 @@ _RECEIVE_BUFFER_BYTES: Final = 4096
 class LcmRelay:
     """Relays between all clients of one port, which stays the same over ``close`` and ``open``.
 
-    One that does not welcome accepts connections and never answers. ``stop_reading`` leaves the connections
-    open and reads nothing more until ``read_again``.
+    ``stop_reading`` leaves the connections open and reads nothing more until ``read_again``.
     """
 
-    def __init__(self, *, welcomes: bool = True) -> None:
-        self._welcomes = welcomes
+    def __init__(self) -> None:
         self._port = 0
         self.num_published = 0
         self._reads = threading.Event()
@@ -84,8 +82,7 @@ class LcmRelay:
         try:
             with client, client.makefile("rb") as stream:
                 assert stream.read(len(_HELLO)) in (_HELLO, b"")
-                if self._welcomes:
-                    client.sendall(_WELCOME)
+                client.sendall(_WELCOME)
                 while header := stream.read(4):
                     self._reads.wait()
                     self._handle(client, int.from_bytes(header), _text(stream), stream)

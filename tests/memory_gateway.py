@@ -4,11 +4,10 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.memory import MemoryOutput
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
 
@@ -42,20 +41,8 @@ async def run_gateway(port: int, **settings: Any) -> AsyncIterator[MemoryGateway
     It reconnects at once, and waits so long for replies and frames that only a defect ends a connection.
     ``settings`` replaces settings of the source.
     """
-    source: dict[str, Any] = {
-        "name": "lab",
-        "host": "127.0.0.1",
-        "port": port,
-        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-        "reply_timeout_s": 60.0,
-        "stall_timeout_s": 60.0,
-    }
+    timeouts = {"reply_timeout_s": 60.0, "stall_timeout_s": 60.0}
     output = MemoryOutput()
-    gateway = Gateway(
-        make_settings(
-            sources=(SourceSettings(**(source | settings)),), metrics=MetricsSettings(enabled=False)
-        ),
-        [output],
-    )
+    gateway = Gateway(local_settings(local_source(port, **(timeouts | settings))), [output])
     async with running_gateway(gateway):
         yield MemoryGateway(gateway, output)

@@ -99,10 +99,6 @@ class FuzzingProxy:
         if self._tasks:
             await asyncio.wait(self._tasks)
 
-    @property
-    def num_connections(self) -> int:
-        return len(self._connections)
-
     def cut(self, *, reset: bool = False) -> None:
         """Close all connections between two bytes: with FIN after all sent bytes, or with RST."""
         for connection in list(self._connections):

@@ -9,17 +9,16 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, SpoolSettings
+from gateway.config.settings import SpoolSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
-from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from tests.configurations import make_settings
-from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
+from tests.configurations import local_settings, local_source
+from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.running_gateway import running_gateway
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 from tests.spec_parameters import in_root, spec_xml
@@ -50,9 +49,6 @@ class ParameterServer:
         """The prefixes of the commands that get no reply."""
         self.has_measurement = True
         self.client: Client | None = None
-        self.may_answer = asyncio.Event()
-        """Replies wait until it is set."""
-        self.may_answer.set()
 
     async def script(self, client: Client) -> None:
         self.client = client
@@ -65,7 +61,6 @@ class ParameterServer:
             self.commands.append(command)
             if command == "Bye":
                 return
-            await self.may_answer.wait()
             reply = self.answer(command)
             if reply is not None:
                 client.send(reply)
@@ -123,51 +118,31 @@ async def run_gateway(
     queries_url: str | None = None,
     spool: Path | None = None,
     tool_poses: bool = False,
-    max_rate_hz: dict[ComponentType, float] | None = None,
     takes: TakesSettings | None = None,
     **source: Any,
 ) -> AsyncIterator[Gateway]:
     """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
 
-    On Zenoh, it is a peer that listens at an endpoint, or a client of a router, and ``max_rate_hz`` applies
-    there. On LCM, it uses the URLs.
+    On Zenoh, it is a peer that listens at an endpoint, or a client of a router. On LCM, it uses the URLs.
     ``source`` replaces settings of the source.
     """
-    defaults: dict[str, Any] = {
-        "name": "lab",
-        "host": "127.0.0.1",
-        "port": port,
-        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-        "reply_timeout_s": 5.0,
-        "query_timeout_s": 10.0,
-        "stall_timeout_s": 60.0,
-    }
+    timeouts = {"reply_timeout_s": 5.0, "query_timeout_s": 10.0, "stall_timeout_s": 60.0}
     # The configuration does not accept 0. It sends every fresh query to the server.
-    lab = SourceSettings(**(defaults | source)).model_copy(
+    lab = local_source(port, **(timeouts | source)).model_copy(
         update={} if "fresh_interval_s" in source else {"fresh_interval_s": 0.0}
     )
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)
-    settings = make_settings(
-        sources=(lab,),
-        zenoh=ZenohSettings(
-            enabled=bool(listen or router), config=keys, tool_poses=tool_poses, max_rate_hz=max_rate_hz or {}
-        ),
+    settings = local_settings(
+        lab,
+        zenoh=ZenohSettings(enabled=bool(listen or router), config=keys, tool_poses=tool_poses),
         lcm=LcmSettings(
             enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url, tool_poses=tool_poses
         ),
         takes=takes or TakesSettings(),
         spool=SpoolSettings(directory=None if spool is None else str(spool)),
-        metrics=MetricsSettings(enabled=False),
     )
     async with running_gateway(Gateway(settings)) as gateway:
         yield gateway
-
-
-def output_queries(gateway: Gateway) -> Any:
-    """Return the object that answers queries on the only output of the gateway."""
-    queries = [queries for output in gateway.outputs if (queries := getattr(output.output, "_queries", None))]
-    [only] = queries
-    return only
 
 
 async def wait_until_cached(gateway: Gateway) -> None:
@@ -251,14 +226,3 @@ async def gateway_with_server(
         await wait_until_cached(gateway)
         with zenoh_peer(endpoint) as peer:
             yield QuerySetup(server, listening.port, gateway, peer)
-
-
-@asynccontextmanager
-async def gateway_without_server(**settings: Any) -> AsyncIterator[tuple[int, zenoh.Session]]:
-    """Run a gateway that has failed to connect to the yielded port, and a Zenoh peer."""
-    endpoint, port = free_endpoint(), free_port()
-    async with run_gateway(port, listen=endpoint, **settings) as gateway:
-        [status] = gateway.sources[0].statuses
-        await wait_until_async(lambda: status.last_error)
-        with zenoh_peer(endpoint) as peer:
-            yield port, peer

@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from typing import Final
 
 from gateway.gateway import Gateway
+from gateway.monitoring.server import MonitoringServer
 
 _STOP_TIMEOUT_S: Final = 60.0
 
@@ -21,3 +22,15 @@ async def running_gateway(gateway: Gateway) -> AsyncIterator[Gateway]:
         stop.set()
         async with asyncio.timeout(_STOP_TIMEOUT_S):
             await task
+
+
+@asynccontextmanager
+async def monitored_gateway(gateway: Gateway) -> AsyncIterator[Gateway]:
+    """Run a gateway, and the server of its metrics and its health, during the block."""
+    monitoring = MonitoringServer(gateway.settings.metrics, gateway)
+    async with running_gateway(gateway):
+        await monitoring.start()
+        try:
+            yield gateway
+        finally:
+            await monitoring.close()

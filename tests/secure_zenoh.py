@@ -1,16 +1,17 @@
 """A router that requires certificates, with certificates made by the recipe in docs/how-to/secure.md."""
 
-import os
 import re
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import yaml
 import zenoh
 
+from tests.configurations import write_config
+from tests.gateway_process import program, simulator
 from tests.networks import free_port
 from tests.waiting import wait_until
 
@@ -67,49 +68,19 @@ def open_session(text: str) -> Iterator[zenoh.Session]:
 
 
 @contextmanager
-def run_program(*arguments: str, log: Path, environ: Mapping[str, str] | None = None) -> Iterator[None]:
-    """Run rtc3d-gateway until the end of the block, with its output in ``log``."""
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "gateway", *arguments],
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, **(environ or {})},
-        )
-        try:
-            yield
-        finally:
-            process.terminate()
-            process.wait(timeout=20)
-
-
-@contextmanager
 def run_gateway_with_simulator(
     folder: Path, zenoh_config: str, environ: Mapping[str, str] | None = None
 ) -> Iterator[Path]:
     """Run a simulator and a gateway with ``zenoh_config``, as YAML; yield its log file once frames arrive."""
-    with ExitStack() as stack:
-        simulator_log, log = folder / "simulator.log", folder / "gateway.log"
-        stack.enter_context(run_program("simulate", "--port", "0", "--rate", "50", log=simulator_log))
-        wait_until(lambda: "127.0.0.1:" in simulator_log.read_text())
-        [port] = re.findall(r"127\.0\.0\.1:(\d+)", simulator_log.read_text())
-        (folder / "gateway.yaml").write_text(
-            f"sources: [{{name: lab, host: 127.0.0.1, port: {port}}}]\n"
-            f"zenoh: {{config: {zenoh_config}}}\n"
-            "lcm: {enabled: false}\n"
-            f"spool: {{directory: {folder}/spool}}\n"
-            "metrics: {enabled: false}\n",
-            encoding="utf-8",
-        )
-        stack.enter_context(
-            run_program(
-                *("run", "--config", str(folder / "gateway.yaml"), "--log-level", "debug"),
-                log=log,
-                environ=environ,
-            )
-        )
-        wait_until(lambda: "→ streaming" in log.read_text())
-        yield log
+    log = folder / "gateway.log"
+    with simulator("--rate", "50") as (port, _), log.open("wb") as output:
+        zenoh = {"config": yaml.safe_load(zenoh_config)}
+        spool = {"directory": str(folder / "spool")}
+        config = write_config(folder / "gateway.yaml", port, zenoh=zenoh, spool=spool)
+        arguments = ("run", "--config", str(config), "--log-level", "debug")
+        with program(*arguments, environ=environ, stdout=output, stderr=output):
+            wait_until(lambda: "→ streaming" in log.read_text())
+            yield log
 
 
 class SecureRouter(NamedTuple):
@@ -130,5 +101,6 @@ def run_secure_router(folder: Path, certificates: Path) -> Iterator[SecureRouter
         "zenoh-acl.json5", ("tls/[::]:7447", f"tls/127.0.0.1:{port}"), (FOLDER, str(certificates))
     )
     (folder / "zenoh-mtls.json5").write_text(client_file(port, certificates, "gateway"), encoding="utf-8")
-    with open_session(router_file), run_gateway_with_simulator(folder, "zenoh-mtls.json5"):
+    with open_session(router_file), run_gateway_with_simulator(folder, "zenoh-mtls.json5") as log:
+        wait_until(lambda: "the session is open" in log.read_text())
         yield SecureRouter(port, certificates)

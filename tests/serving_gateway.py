@@ -4,14 +4,13 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Protocol
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.gateway import Gateway
 from gateway.outputs.contract import Output
 from gateway.outputs.rtc3d.live_server import LiveServer
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.simulator.simulator import Simulator
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
 from tests.unit.rtc3d_server.counting_scene import CountingScene
@@ -19,14 +18,11 @@ from tests.waiting import wait_until_async
 
 
 class Server(Protocol):
-    host: str
     port: int
 
 
 class ServingGateway:
-    """A running gateway with the source "lab", whose clients connect to ``host`` and ``port``."""
-
-    host = "127.0.0.1"
+    """A running gateway with the source "lab", whose clients connect to ``port`` of this host."""
 
     def __init__(self, gateway: Gateway, output: Rtc3dOutput, port: int) -> None:
         self.gateway = gateway
@@ -45,16 +41,11 @@ class ServingGateway:
         return server
 
 
-def serving_settings(port: int, **settings: Any) -> Rtc3dSettings:
-    return Rtc3dSettings(enabled=True, ports={"lab": port}, **settings)
-
-
 @asynccontextmanager
 async def serving_gateway(
     server: Server,
     *,
     outputs: Sequence[Output] = (),
-    rtc3d: dict[str, Any] | None = None,
     is_streaming: bool = True,
     **source: Any,
 ) -> AsyncIterator[ServingGateway]:
@@ -63,19 +54,8 @@ async def serving_gateway(
     Wait until frames arrive, if ``is_streaming``; otherwise only until clients can connect.
     """
     port = free_port()
-    output = Rtc3dOutput(serving_settings(port, **(rtc3d or {})))
-    defaults: dict[str, Any] = {
-        "name": "lab",
-        "host": server.host,
-        "port": server.port,
-        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-    }
-    gateway = Gateway(
-        make_settings(
-            sources=(SourceSettings(**(defaults | source)),), metrics=MetricsSettings(enabled=False)
-        ),
-        [output, *outputs],
-    )
+    output = Rtc3dOutput(Rtc3dSettings(enabled=True, ports={"lab": port}))
+    gateway = Gateway(local_settings(local_source(server.port, **source)), [output, *outputs])
     async with running_gateway(gateway):
         served = ServingGateway(gateway, output, port)
         await wait_until_async(lambda: output.health().connected)

@@ -23,8 +23,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import yaml
-
+from tests.configurations import write_config
 from tests.gateway_process import PROGRAM, simulator
 from tests.networks import free_endpoint, lcm_url, zenoh_keys
 
@@ -116,14 +115,12 @@ def run_stops(count: int, folder: Path) -> Iterator[Stop]:
         )
         stack.callback(load_process.kill)
         load = Load(load_process)
-        config = folder / "gateway.yaml"
-        configuration = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
-            "zenoh": {"config": zenoh_keys("peer", listen=endpoint), "tool_poses": True},
-            "lcm": {"url": url, "queries_url": queries_url},
-            "metrics": {"enabled": False},
-        }
-        config.write_text(yaml.safe_dump(configuration))
+        config = write_config(
+            folder / "gateway.yaml",
+            port,
+            zenoh={"config": zenoh_keys("peer", listen=endpoint), "tool_poses": True},
+            lcm={"url": url, "queries_url": queries_url},
+        )
         signals = itertools.cycle((signal.SIGTERM, signal.SIGTERM, signal.SIGINT))
         for number in itertools.islice(signals, count):
             yield _stop(load, config, folder / "gateway.log", number)

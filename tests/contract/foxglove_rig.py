@@ -9,34 +9,26 @@ from typing import Any
 from gateway.outputs.contract import Output
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from tests.contract.frame_rigs import SOURCES, FrameRig, Received
+from tests.contract.frame_rigs import SOURCES, ListeningRig
 from tests.foxglove_viewer import Viewer, client_frame, upgrade_request
 from tests.networks import free_port
 
 TOPICS = tuple(f"/{source}/tools" for source in SOURCES)
 
 
-class Rig(FrameRig):
+class Rig(ListeningRig):
     remedies = ("choose another foxglove.port",)
-    listens = True
 
     def __init__(self) -> None:
-        self._port = self.tcp_port = free_port()
-        self.output = self.create()
+        self._port = free_port()
+        super().__init__(self._port)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
         self._viewers: list[Viewer] = []
-        self._received: list[Received] = []
-        self._stalled: list[socket.socket] = []
-        self._other_program: socket.socket | None = None
 
     def create(self) -> Output:
         return FoxgloveOutput(FoxgloveSettings(enabled=True, port=self._port))
-
-    @property
-    def received(self) -> list[Received]:
-        return self._received
 
     def _receive(self, topic: str, transforms: Any) -> None:
         assert topic in TOPICS
@@ -60,6 +52,7 @@ class Rig(FrameRig):
         self._viewers.append(viewer)
 
     def unsubscribe(self) -> None:
+        super().unsubscribe()
         while self._viewers:
             self._run(self._viewers.pop().__aexit__(None, None, None))
 
@@ -68,19 +61,10 @@ class Rig(FrameRig):
         connection.sendall(upgrade_request(b"AAAAAAAAAAAAAAAAAAAAAA==", "foxglove.sdk.v1"))
         wanted = [{"id": number, "channelId": number} for number in range(100)]
         connection.sendall(client_frame(json.dumps({"op": "subscribe", "subscriptions": wanted}).encode()))
-        self._stalled.append(connection)
-
-    def cut(self) -> None:
-        self._other_program = socket.create_server(("127.0.0.1", self._port))
-
-    def restore(self) -> None:
-        assert self._other_program is not None
-        self._other_program.close()
+        self.clients.append(connection)
 
     def close(self) -> None:
-        self.unsubscribe()
-        for connection in (*self._stalled, *([self._other_program] if self._other_program else [])):
-            connection.close()
+        super().close()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()

@@ -5,7 +5,9 @@ frames, test_frame_*.py, then run with it. Every number that the tests send is t
 tool in view, so a rig has to recognise nothing else in what its peer receives.
 """
 
+import contextlib
 import math
+import socket
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -96,10 +98,12 @@ class FrameRig(ABC):
     def create(self) -> Output:
         """Return a further output with the settings of ``output``, not started."""
 
+    _received: list[Received]
+
     @property
-    @abstractmethod
     def received(self) -> list[Received]:
         """The positions of tools in view that the peers of ``subscribe`` received so far, oldest first."""
+        return self._received
 
     @abstractmethod
     def subscribe(self) -> None:
@@ -124,6 +128,42 @@ class FrameRig(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the peers and the network. ``output`` is closed already."""
+
+
+class ListeningRig(FrameRig):
+    """An output with a port of its own, which another program takes at ``cut``.
+
+    The sockets in ``clients`` are closed with the peers.
+    """
+
+    listens = True
+
+    def __init__(self, port: int) -> None:
+        self.tcp_port = port
+        self._received: list[Received] = []
+        self.clients: list[socket.socket] = []
+        self._other_program: socket.socket | None = None
+        self.output = self.create()
+
+    def unsubscribe(self) -> None:
+        while self.clients:
+            client = self.clients.pop()
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+            client.close()
+
+    def cut(self) -> None:
+        assert self.tcp_port is not None
+        self._other_program = socket.create_server(("127.0.0.1", self.tcp_port))
+
+    def restore(self) -> None:
+        assert self._other_program is not None
+        self._other_program.close()
+
+    def close(self) -> None:
+        self.unsubscribe()
+        if self._other_program is not None:
+            self._other_program.close()
 
 
 class NoQueries:
@@ -283,10 +323,6 @@ class ExampleRig(FrameRig):
 
     def create(self) -> Output:
         return _ExampleOutput(self._settings)
-
-    @property
-    def received(self) -> list[Received]:
-        return self._received
 
     def _receive(self, name: str, message: bytes) -> None:
         source, _, key = name.rpartition("/")

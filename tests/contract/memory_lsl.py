@@ -43,10 +43,6 @@ class MemoryRig(FrameRig):
     def create(self) -> Output:
         return LslOutput(LslSettings(enabled=True))
 
-    @property
-    def received(self) -> list[Received]:
-        return self._received
-
     def subscribe(self) -> None:
         self._num_peers += 1
 

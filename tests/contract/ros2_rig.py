@@ -43,10 +43,6 @@ class Rig(FrameRig):
     def create(self) -> Output:
         return Ros2Output(Ros2Settings(enabled=True, connect=self._endpoint))
 
-    @property
-    def received(self) -> list[Received]:
-        return self._received
-
     def subscribe(self) -> None:
         node = open_zenoh("client", connect=self._endpoint)
         self._nodes.append(node)

@@ -12,7 +12,7 @@ from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from tests.contract.frame_rigs import HALL, LAB, FrameRig, Received
+from tests.contract.frame_rigs import HALL, LAB, ListeningRig
 from tests.networks import free_port
 from tests.unit.rtc3d_server.wire import DATA, command
 from tests.waiting import wait_until
@@ -20,27 +20,18 @@ from tests.waiting import wait_until
 HEADER: Final = struct.Struct(">II")
 
 
-class Rig(FrameRig):
+class Rig(ListeningRig):
     """Clients of both ports. They get what the server sent, in its unit: the tests send mm."""
 
     remedies: ClassVar[tuple[str, ...]] = ("rtc3d.ports",)
-    listens: ClassVar[bool] = True
     converts: ClassVar[bool] = False
 
     def __init__(self) -> None:
         self._ports = {LAB: free_port(), HALL: free_port()}
-        self.tcp_port = self._ports[LAB]
-        self._received: list[Received] = []
-        self._clients: list[socket.socket] = []
-        self._other_program: socket.socket | None = None
-        self.output = self.create()
+        super().__init__(self._ports[LAB])
 
     def create(self) -> Output:
         return Rtc3dOutput(Rtc3dSettings(enabled=True, ports=self._ports))
-
-    @property
-    def received(self) -> list[Received]:
-        return self._received
 
     def subscribe(self) -> None:
         for source in self._ports:
@@ -48,7 +39,7 @@ class Rig(FrameRig):
 
     def _connect(self, source: str) -> socket.socket:
         client = self._connection(self._ports[source])
-        self._clients.append(client)
+        self.clients.append(client)
         client.sendall(command("SetByteOrder BigEndian") + command("StreamFrames AllFrames"))
         return client
 
@@ -76,25 +67,6 @@ class Rig(FrameRig):
                         xs = component.items()["x"].tolist()
                         self._received += [(source, x / 1000) for x in xs if not math.isnan(x)]
 
-    def unsubscribe(self) -> None:
-        while self._clients:
-            client = self._clients.pop()
-            with contextlib.suppress(OSError):
-                client.shutdown(socket.SHUT_RDWR)
-            client.close()
-
     def stall(self) -> None:
         for source in self._ports:
             self._connect(source)
-
-    def cut(self) -> None:
-        self._other_program = socket.create_server(("127.0.0.1", self._ports[HALL]))
-
-    def restore(self) -> None:
-        assert self._other_program is not None
-        self._other_program.close()
-
-    def close(self) -> None:
-        self.unsubscribe()
-        if self._other_program is not None:
-            self._other_program.close()

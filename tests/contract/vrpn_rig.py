@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 from gateway.outputs.contract import Output
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
-from tests.contract.frame_rigs import FrameRig, Received
+from tests.contract.frame_rigs import ListeningRig
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE
 
@@ -17,32 +17,24 @@ HEADER: Final = struct.Struct(">IIIiiI")
 BODY: Final = struct.Struct(">ii7d")
 
 
-class Rig(FrameRig):
+class Rig(ListeningRig):
     """Clients that connect over TCP. With several sources, a tracker is called SOURCE/TOOL."""
 
     remedies: ClassVar[tuple[str, ...]] = ("stop the program that uses the port",)
-    listens: ClassVar[bool] = True
 
     def __init__(self) -> None:
-        self._port = self.tcp_port = self.udp_port = free_port()
-        self._received: list[Received] = []
-        self.output = self.create()
-        self._clients: list[socket.socket] = []
-        self._other_program: socket.socket | None = None
+        self._port = self.udp_port = free_port()
+        super().__init__(self._port)
 
     def create(self) -> Output:
         return VrpnOutput(VrpnSettings(enabled=True, port=self._port, tracker_names="source/tool"))
-
-    @property
-    def received(self) -> list[Received]:
-        return self._received
 
     def subscribe(self) -> None:
         threading.Thread(target=self._read, args=(self._connect(),), daemon=True).start()
 
     def _connect(self) -> socket.socket:
         client = socket.create_connection(("127.0.0.1", self._port))
-        self._clients.append(client)
+        self.clients.append(client)
         client.sendall(COOKIE)
         return client
 
@@ -59,24 +51,5 @@ class Rig(FrameRig):
                 elif message_type == 0:
                     self._received.append((names[number].partition("/")[0], BODY.unpack(body)[2]))
 
-    def unsubscribe(self) -> None:
-        while self._clients:
-            client = self._clients.pop()
-            with contextlib.suppress(OSError):
-                client.shutdown(socket.SHUT_RDWR)
-            client.close()
-
     def stall(self) -> None:
         self._connect()
-
-    def cut(self) -> None:
-        self._other_program = socket.create_server(("127.0.0.1", self._port))
-
-    def restore(self) -> None:
-        assert self._other_program is not None
-        self._other_program.close()
-
-    def close(self) -> None:
-        self.unsubscribe()
-        if self._other_program is not None:
-            self._other_program.close()

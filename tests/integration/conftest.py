@@ -1,11 +1,12 @@
 """Fixtures of several integration tests."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from tests.integration.served import Served, directly, through_a_gateway
 from tests.networks import free_endpoint, open_zenoh
+from tests.secure_zenoh import SecureRouter, make_certificates, run_secure_router
 
 
 @pytest.fixture
@@ -17,8 +18,13 @@ def router() -> Iterator[str]:
     session.close()
 
 
-@pytest.fixture(params=[directly, through_a_gateway])
-def served(request: pytest.FixtureRequest) -> Served:
-    """How clients reach a simulator."""
-    serve: Served = request.param
-    return serve
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_certificates(tmp_path_factory.mktemp("ours") / "tls")
+
+
+@pytest.fixture(scope="module")
+def secured(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iterator[SecureRouter]:
+    """A router with access control, and a gateway that streams through it."""
+    with run_secure_router(tmp_path_factory.mktemp("lab"), certificates) as running:
+        yield running

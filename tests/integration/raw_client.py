@@ -57,11 +57,6 @@ class RawClient:
         async with asyncio.timeout(TIMEOUT_S):
             return await self.reader.read()
 
-    async def ask_while_streaming(self, text: str) -> bytes:
-        """Return the body of the reply to a command; discard the frames before it."""
-        self.send(command(text))
-        return (await self.reply())[1]
-
     def pause(self) -> None:
         """Read nothing more from the socket."""
         self.writer.transport.pause_reading()  # type: ignore[attr-defined] # a StreamWriter's is a Transport

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -10,13 +9,14 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import pytest
-import yaml
 import zenoh
 
 from gateway.live.live_data import LiveData
 from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.event_log import EventLogReader
-from tests.gateway_process import PROGRAM, program, simulator
+from tests.command_process import run_command
+from tests.configurations import write_config
+from tests.gateway_process import program, simulator
 from tests.networks import free_endpoint, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
@@ -25,7 +25,7 @@ COMPONENTS: Final = {"3d", "6d", "analog", "force", "event"}
 
 
 class Lab(NamedTuple):
-    """A gateway with two sources, of which ``lazy`` streams on demand, and a peer of it.
+    """A gateway and a peer of it.
 
     ``everything`` has the keys of all that is published, also of JSON: a careless program asks for it.
     """
@@ -43,30 +43,21 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     everything: Counter[str] = Counter()
     with ExitStack() as stack:
         port, _ = stack.enter_context(simulator(*SCENE))
-        server = {"host": "127.0.0.1", "port": port}
-        configuration = {
-            "sources": [
-                {"name": "lab", "remote_control": True, **server},
-                {"name": "lazy", **server, "streams": [{"components": ["3d"], "on_demand": True}]},
-            ],
-            "zenoh": {"tool_poses": True, "config": zenoh_keys("router", listen=endpoint)},
-            "lcm": {"enabled": False},
-            "takes": {"enabled": True, "directory": str(folder / "takes")},
-            "metrics": {"enabled": False},
-        }
-        (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
+        config = write_config(
+            folder / "gateway.yaml",
+            port,
+            source={"remote_control": True},
+            zenoh={"tool_poses": True, "config": zenoh_keys("router", listen=endpoint)},
+            takes={"enabled": True, "directory": str(folder / "takes")},
+        )
         log = stack.enter_context((folder / "gateway.log").open("wb"))
-        stack.enter_context(program("run", "--config", str(folder / "gateway.yaml"), stderr=log))
+        stack.enter_context(program("run", "--config", str(config), stderr=log))
         peer = wait_for_zenoh(endpoint)
         stack.callback(peer.close)
         peer.declare_subscriber("mocap/lab/**", lambda sample: everything.update([str(sample.key_expr)]))
         wait_until(lambda: all(everything[f"mocap/lab/{key}/json"] > 1 for key in COMPONENTS))
         wait_until(lambda: any(key.startswith("mocap/lab/6d/") for key in everything))
         yield Lab(endpoint, folder / "takes", peer, everything)
-
-
-def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run([*PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
 def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
@@ -83,13 +74,6 @@ def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
     assert (len(received) - 1) / duration_s < 31
 
 
-def test_a_subscriber_of_json_alone_starts_a_stream_on_demand(lab: Lab) -> None:
-    keys: set[str] = set()
-    with lab.peer.declare_subscriber("mocap/lazy/3d/json", lambda sample: keys.add(str(sample.key_expr))):
-        wait_until(lambda: keys)
-    assert keys == {"mocap/lazy/3d/json"}
-
-
 @pytest.mark.parametrize(
     ("arguments", "shown"),
     [
@@ -102,8 +86,8 @@ def test_a_subscriber_of_json_alone_starts_a_stream_on_demand(lab: Lab) -> None:
     ],
 )
 def test_commands_show_messages_and_no_json(lab: Lab, arguments: str, shown: list[str]) -> None:
-    done = run(*arguments.split(), "--source", "lab", "--connect", lab.endpoint)
-    assert (done.returncode, done.stderr) == (0, "")
+    done = run_command(*arguments.split(), "--source", "lab", "--connect", lab.endpoint)
+    assert (done.status, done.stderr) == (0, "")
     assert [text for text in shown if text not in done.stdout] == []
     assert "/json" not in done.stdout
 
@@ -115,10 +99,10 @@ def channels_in(file: Path) -> set[str]:
 def test_recordings_have_messages_and_no_json(lab: Lab, tmp_path: Path) -> None:
     """What ``record`` writes, and the gateway's own take of the same time."""
     file = tmp_path / "take.lcmlog"
-    assert run("take", "start", "one", "--source", "lab", "--connect", lab.endpoint).returncode == 0
-    done = run("record", str(file), "--seconds", "3", "--source", "lab", "--connect", lab.endpoint)
-    assert run("take", "stop", "--source", "lab", "--connect", lab.endpoint).returncode == 0
-    assert done.returncode == 0
+    assert run_command("take", "start", "one", "--source", "lab", "--connect", lab.endpoint).status == 0
+    done = run_command("record", str(file), "--seconds", "3", "--source", "lab", "--connect", lab.endpoint)
+    assert run_command("take", "stop", "--source", "lab", "--connect", lab.endpoint).status == 0
+    assert done.status == 0
     assert "left out" not in done.stdout + done.stderr
     for channels in (channels_in(file), channels_in(lab.takes / "lab" / "one.lcmlog")):
         assert {"MOCAP_LAB_3D", "MOCAP_LAB_6D"} <= channels

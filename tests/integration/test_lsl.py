@@ -1,19 +1,19 @@
 """LSL as its users see it: pylsl's inlets in another process, and the file that LabRecorder writes."""
 
 import json
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pytest
 import pyxdf
-import yaml
 
-from tests.gateway_process import PROGRAM, program, simulator
+from tests.command_process import run_command
+from tests.configurations import write_config
+from tests.gateway_process import program, simulator
 from tests.integration.test_host_clock import WallClock
 from tests.lsl_receiver import LslReceiver, lsl_config
 from tests.waiting import wait_until
@@ -38,16 +38,9 @@ class Lab:
 
     def __init__(self, folder: Path, port: int) -> None:
         self.config = lsl_config(folder)
-        self.file = folder / "gateway.yaml"
+        lsl = {"enabled": True, "config": str(self.config)}
+        self.file = write_config(folder / "gateway.yaml", port, lsl=lsl)
         self.log_file = folder / "gateway.log"
-        self.configuration: dict[str, Any] = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
-            "zenoh": {"enabled": False},
-            "lcm": {"enabled": False},
-            "metrics": {"enabled": False},
-            "lsl": {"enabled": True, "config": str(self.config)},
-        }
-        self.file.write_text(yaml.safe_dump(self.configuration))
         self._exit = ExitStack()
         self._gateway = self._exit.enter_context(ExitStack())
 
@@ -162,8 +155,7 @@ def test_receivers_that_wait_continue_with_all_streams_of_the_next_gateway(tmp_p
 def test_the_doctor_finds_the_streams_of_a_running_gateway(tmp_path: Path) -> None:
     with running(tmp_path) as lab:
         lab.receive("lab_3d")
-        command = [*PROGRAM, "doctor", "--config", str(lab.file), "--json"]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        result = run_command("doctor", "--config", lab.file, "--json")
     found = {
         finding["check"]: finding["result"]
         for finding in json.loads(result.stdout)["findings"]

@@ -1,16 +1,16 @@
-"""Monitoring of a running gateway: HTTP, Prometheus' text format, dashboard, alerts and log."""
+"""Monitoring of a running gateway: its metrics, and the dashboard and the alerts that use them."""
 
 import asyncio
-import contextlib
 import json
 import logging
 import re
+import socket
+import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from http.client import HTTPConnection
+import urllib.request
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pytest
 import uvloop
@@ -20,13 +20,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from gateway.config.settings import (
     MetricsSettings,
-    ReconnectSettings,
-    SourceSettings,
     StreamSettings,
 )
 from gateway.gateway import Gateway
-from gateway.monitoring.health import health_page
-from gateway.monitoring.server import MonitoringServer
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
@@ -34,15 +30,14 @@ from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from tests.configurations import make_settings
-from tests.losses import amounts
-from tests.memory_gateway import run_gateway
+from tests.configurations import local_source, make_settings
+from tests.documents import ROOT
+from tests.needs import need_programs
 from tests.networks import free_port, zenoh_keys
-from tests.running_gateway import running_gateway
-from tests.servers import ScriptedServer, markers_frame, ok, packet
+from tests.running_gateway import monitored_gateway
 from tests.waiting import wait_until_async
 
-ROOT = Path(__file__).parents[2]
+RULES: Final = ROOT / "config/prometheus/rtc3d-gateway.yaml"
 OPERATIONS = (ROOT / "docs/operations.md").read_text()
 REFERENCE = (ROOT / "docs/reference/metrics.md").read_text()
 DASHBOARD: dict[str, Any] = json.loads((ROOT / "config/grafana/rtc3d-gateway.json").read_text())
@@ -54,60 +49,31 @@ PROMETHEUS_LABELS = {"job", "instance"}
 """Labels that Prometheus adds."""
 
 
-class Lab:
-    """A gateway for the source "lab", with Zenoh, LCM and the monitoring server."""
-
-    def __init__(self, server_port: int, port: int) -> None:
-        self.port = port
-        reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
-        source: dict[str, Any] = {"name": "lab", "host": "127.0.0.1", "port": server_port, "streams": STREAMS}
-        self.gateway = Gateway(
-            make_settings(
-                sources=(SourceSettings(**source, reconnect=reconnect, stall_timeout_s=60.0),),
-                zenoh=ZenohSettings(config=zenoh_keys("peer")),
-                lcm=LcmSettings(url="memq://"),
-                metrics=MetricsSettings(port=port),
-            )
+def lab(server_port: int, port: int) -> Gateway:
+    """Return a gateway for the source "lab" on Zenoh and LCM."""
+    return Gateway(
+        make_settings(
+            sources=(local_source(server_port, streams=STREAMS, stall_timeout_s=60.0),),
+            zenoh=ZenohSettings(config=zenoh_keys("peer")),
+            lcm=LcmSettings(url="memq://"),
+            metrics=MetricsSettings(port=port),
         )
-        self.source = self.gateway.sources[0]
-
-    async def get(self, path: str) -> tuple[int, str]:
-        """Return the HTTP status and the body of a page."""
-
-        def read() -> tuple[int, str]:
-            with contextlib.closing(HTTPConnection("127.0.0.1", self.port, timeout=30)) as connection:
-                connection.request("GET", path)
-                answer = connection.getresponse()
-                return answer.status, answer.read().decode()
-
-        return await asyncio.to_thread(read)
-
-    async def health(self) -> tuple[int, dict[str, Any]]:
-        status, body = await self.get("/healthz")
-        return status, json.loads(body)
-
-    async def until_all(self, condition: Callable[[StreamStatus], object]) -> None:
-        await wait_until_async(lambda: all(condition(status) for status in self.source.statuses))
-
-    async def streaming(self) -> None:
-        await self.until_all(lambda status: status.state is StreamState.STREAMING)
+    )
 
 
-@asynccontextmanager
-async def running_lab(server_port: int, port: int | None = None) -> AsyncIterator[Lab]:
-    lab = Lab(server_port, port or free_port())
-    monitoring = MonitoringServer(lab.gateway.settings.metrics, lab.gateway)
-    async with running_gateway(lab.gateway):
-        await monitoring.start()
-        try:
-            yield lab
-        finally:
-            await monitoring.close()
+async def until_all(gateway: Gateway, condition: Callable[[StreamStatus], object]) -> None:
+    await wait_until_async(lambda: all(condition(status) for status in gateway.sources[0].statuses))
 
 
-def simulator(port: int = 0) -> Simulator:
+def read_metrics(port: int) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30) as page:
+        text: str = page.read().decode()
+    return text
+
+
+def simulator() -> Simulator:
     scene = SyntheticScene(markers=2, tools=1, analog=2, plates=0, rate_hz=100, analog_rate_hz=200)
-    return Simulator(scene, port=port)
+    return Simulator(scene)
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +81,13 @@ def families() -> dict[str, Metric]:
     """Return the metrics, by name, of a gateway that has streamed long enough for a valid clock."""
 
     async def run() -> dict[str, Metric]:
-        async with simulator() as server, running_lab(server.port) as lab:
-            await lab.until_all(lambda status: status.clock.has_clock)
-            await wait_until_async(lambda: all(s.messages["status"] for _, s in lab.source.fan_out.outputs))
-            status, body = await lab.get("/metrics")
-            assert status == 200
-            return {family.name: family for family in text_string_to_metric_families(body)}
+        port = free_port()
+        async with simulator() as server, monitored_gateway(lab(server.port, port)) as gateway:
+            await until_all(gateway, lambda status: status.clock.has_clock)
+            outputs = gateway.sources[0].fan_out.outputs
+            await wait_until_async(lambda: all(status.messages["status"] for _, status in outputs))
+            page = await asyncio.to_thread(read_metrics, port)
+            return {family.name: family for family in text_string_to_metric_families(page)}
 
     return uvloop.run(run())
 
@@ -188,11 +155,7 @@ QUERIES = [
     *(target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]),
     *(each["definition"] for each in DASHBOARD["templating"]["list"] if each["type"] == "query"),
 ]
-ALERTS = [
-    rule
-    for group in yaml.safe_load((ROOT / "config/prometheus/rtc3d-gateway.yaml").read_text())["groups"]
-    for rule in group["rules"]
-]
+ALERTS = [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
 
 
 def selected(query: str) -> list[tuple[str, str]]:
@@ -281,52 +244,74 @@ async def test_the_log_format_option_selects_the_format() -> None:
     assert all(line["logger"].startswith("gateway.rtc3d_server") for line in lines)
 
 
-# A running gateway ---------------------------------------------------------------------------
-
-
-async def test_health_depends_on_the_servers_state() -> None:
-    async with simulator() as server:
-        port = server.port
-    async with running_lab(port) as lab:
-        await lab.until_all(lambda status: status.last_error)
-        status, body = await lab.health()
-        assert (status, body["healthy"]) == (503, False)
-        assert [each["stream"] for each in body["streams"]] == ["3d 6d", "analog"]
-        assert all(f"refused by 127.0.0.1:{port}" in each["problem"] for each in body["streams"])
-        async with simulator(port) as server:
-            await lab.streaming()
-            assert (await lab.health())[0] == 200
-            server.stop_measurement()
-            await lab.until_all(lambda status: status.state is StreamState.NO_MEASUREMENT)
-            assert (await lab.health())[0] == 200
-
-
 async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.LogCaptureFixture) -> None:
-    async with simulator() as server, running_lab(server.port) as first:
-        caplog.clear()
-        async with running_lab(server.port, first.port) as second:
-            await second.streaming()
-        [warning] = [record for record in caplog.records if record.name == "gateway.monitoring.server"]
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        async with simulator() as server, monitored_gateway(lab(server.port, port)) as gateway:
+            await until_all(gateway, lambda status: status.state is StreamState.STREAMING)
+    [warning] = [record for record in caplog.records if record.name == "gateway.monitoring.server"]
     assert warning.levelno == logging.WARNING
-    assert re.search(f"port {first.port}: .*metrics.port", warning.message)
+    assert re.search(f"port {port}: .*metrics.port", warning.message)
 
 
-async def test_frames_that_the_server_numbered_and_did_not_send_are_counted() -> None:
-    numbers = (*range(1, 301), *range(351, 401))
+# Alerts, with promtool ------------------------------------------------------------------------
 
-    def answer(command: str) -> bytes:
-        if command.startswith("SendParameters"):
-            return packet(2, b"<RT_Parameters Ver='1.00'/>")
-        is_stream = command.startswith("StreamFrames") and "Stop" not in command
-        frames = (markers_frame(number, (0.0, 0.0, 0.0)) for number in numbers if is_stream)
-        return ok(f"OK-{command}") + b"".join(frames)
+_SOURCE: Final = 'instance="a",source="lab",stream="3d"'
+_STREAMING: Final = {f'rtc3d_gateway_stream_state{{{_SOURCE},state="streaming"}}': "1+0x30"}
+_DROPS: Final = 'instance="a",source="lab",cause="x"'
 
-    async with (
-        ScriptedServer(lambda client: client.commands(answer)) as server,
-        run_gateway(server.port) as gateway,
-    ):
-        await gateway.wait_until(gateway.status.losses.report)
-        assert amounts(gateway.status.losses.report()) == {"not sent by the server": (50, 50)}
-        assert json.loads(health_page(gateway.gateway).body)["status"] == "degraded"
-        messages = await gateway.wait_for("3d", len(numbers))
-        assert [message.sequence for message in messages] == list(range(len(numbers)))
+CASES: Final[list[tuple[str, str, str, str, bool]]] = [
+    # alert, series, its values each minute if it fires, and if it does not, whether a stream is streaming
+    ("GatewayDown", 'up{job="rtc3d-gateway",instance="a"}', "0+0x30", "1+0x30", False),
+    ("OutputDown", 'rtc3d_gateway_output_connected{output="zenoh"}', "0+0x30", "1+0x30", False),
+    ("TakesNotWritten", 'rtc3d_gateway_output_connected{output="takes"}', "0+0x30", "1+0x30", False),
+    (
+        "TakesNotWritten",
+        f'rtc3d_gateway_output_drops_total{{{_DROPS},output="takes"}}',
+        "0+1x30",
+        "7+0x30",
+        False,
+    ),
+    ("SourceSilent", f"rtc3d_gateway_last_frame_timestamp_seconds{{{_SOURCE}}}", "0+0x30", "0+60x30", True),
+    ("ServerAway", f'rtc3d_gateway_stream_state{{{_SOURCE},state="idle"}}', "0+0x30", "1+0x30", False),
+    ("ConnectionUnsteady", f"rtc3d_gateway_sessions_total{{{_SOURCE}}}", "0+1x30", "1+0x30", False),
+    ("FramesDropped", f"rtc3d_gateway_stream_drops_total{{{_DROPS}}}", "0+1x30", "7+0x30", False),
+    (
+        "FramesDropped",
+        f'rtc3d_gateway_output_drops_total{{{_DROPS},output="lcm"}}',
+        "0+1x30",
+        "7+0x30",
+        False,
+    ),
+    ("FramesLate", f"rtc3d_gateway_lag_seconds{{{_SOURCE}}}", "0.1+0x30", "0.01+0x30", True),
+    ("NoClock", f"rtc3d_gateway_clock_valid{{{_SOURCE}}}", "0+0x30", "1+0x30", True),
+    ("EventLoopSlow", 'rtc3d_gateway_loop_delay_max_seconds{instance="a"}', "0.2+0x30", "0.01+0x30", False),
+    ("NoSubscriber", 'rtc3d_gateway_source_subscribed{instance="a",source="lab"}', "0+0x30", "1+0x30", True),
+    ("Defect", 'rtc3d_gateway_defects_total{instance="a"}', "0+1x30", "3+0x30", False),
+    ("HostClockSet", 'rtc3d_gateway_host_clock_steps_total{instance="a"}', "0+1x30", "1+0x30", False),
+]
+
+
+def test_there_is_a_case_for_each_alert() -> None:
+    assert {rule["alert"] for rule in ALERTS} == {alert for alert, *_ in CASES}
+
+
+@pytest.mark.parametrize("does_fire", [True, False], ids=["fire", "do not fire"])
+def test_alerts_fire_when_they_should_and_only_then(does_fire: bool, tmp_path: Path) -> None:
+    """After 20 minutes with these values, one a minute."""
+    need_programs("promtool", packages="prometheus")
+    tests = []
+    for alert, series, fires, rests, is_streaming in CASES:
+        values = {series: fires if does_fire else rests} | (_STREAMING if is_streaming else {})
+        query = {
+            "expr": f'count(ALERTS{{alertname="{alert}",alertstate="firing"}})',
+            "eval_time": "20m",
+            "exp_samples": [{"labels": "{}", "value": 1}] if does_fire else [],
+        }
+        inputs = [{"series": name, "values": value} for name, value in values.items()]
+        tests.append({"interval": "1m", "input_series": inputs, "promql_expr_test": [query]})
+    file = tmp_path / "test.yaml"
+    file.write_text(yaml.safe_dump({"rule_files": [str(RULES)], "tests": tests}))
+    for command in (("check", "rules", str(RULES)), ("test", "rules", str(file))):
+        done = subprocess.run(["promtool", *command], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr

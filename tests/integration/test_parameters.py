@@ -1,6 +1,5 @@
 """Parameters and names as present and late subscribers on Zenoh and LCM get them, without a query."""
 
-import asyncio
 import json
 import logging
 from collections.abc import AsyncIterator, Iterator
@@ -26,7 +25,6 @@ from tests.queried_gateway import (
     ParameterServer,
     parameters_xml,
     query,
-    query_all,
     run_gateway,
     wait_until_cached,
     zenoh_peer,
@@ -216,57 +214,3 @@ async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(
         if record.levelno == logging.WARNING and "were renamed" in record.message
     ]
     assert "3d 'Marker 1' to 'Left Marker 1', 'Marker 2' to 'Left Marker 2'; 6d 'Tool 1' to" in warning
-
-
-async def test_a_server_that_gives_no_parameters_any_more_makes_them_void_for_everyone(
-    router: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lcm_parameters, "REPEAT_S", 0.05)
-    server, url = ParameterServer(), lcm_url()
-    with listeners(router, url) as (on_zenoh, on_lcm):
-        async with gateway_with_cache(server, router, url):
-            await on_zenoh.wait_for_frame(1)
-            await on_lcm.wait_for_frame(1)
-            server.refused_commands = ("SendParameters",)  # another program on the same port
-            assert server.client is not None
-            server.client.cut()
-            for listener in (on_zenoh, on_lcm):
-                await listener.wait_for_frame(2)
-                assert (listener.xml[-1], listener.early_versions) == (b"", set())
-            repeats = len(on_lcm.xml)
-            await wait_until_async(lambda: len(on_lcm.xml) > repeats + 1)
-            assert set(on_lcm.xml[repeats:]) == {b""}
-            assert await late_parameters(router) == b""
-            with zenoh_peer(router) as peer:
-                reply = await query(peer, KEY)
-            assert reply.code == "refused"
-            assert "the parameters of its earlier connections are void" in reply.error
-            server.refused_commands = ()
-            server.client.cut()
-            await on_zenoh.wait_for_frame(3)
-            assert on_zenoh.xml[-1] == server.xml
-
-
-async def test_no_frame_is_lost_while_two_hundred_queries_are_answered(router: str) -> None:
-    scene = SyntheticScene(markers=10, tools=2, analog=4, plates=1, rate_hz=200, analog_rate_hz=200)
-    sequences: list[int] = []
-    async with Simulator(scene) as simulator:
-        simulator.stop_measurement()
-        async with run_gateway(simulator.port, router=router) as gateway:
-            [source] = gateway.sources
-            await wait_until_async(lambda: source.statuses[0].state.value == "no measurement")
-            with zenoh_peer(router) as peer:
-                peer.declare_subscriber(
-                    "mocap/lab/3d",
-                    lambda sample: sequences.append(decode(sample.payload.to_bytes()).sequence),
-                )
-                await wait_until_async(lambda: source.fan_out.has_subscribers(source.queries.components))
-                simulator.start_measurement()
-                keys = ("parameters?fresh=true", "parameters/3d", "6d", "*?format=json")
-                for _ in range(10):
-                    answers = await asyncio.gather(*(query_all(peer, f"mocap/lab/{key}") for key in keys * 5))
-                    assert all(replies and not any(each.error for each in replies) for replies in answers)
-                await wait_until_async(lambda: len(sequences) > 50)
-                simulator.stop_measurement()
-                await wait_until_async(lambda: len(sequences) >= simulator.components_sent["3d"])
-    assert sequences == list(range(simulator.components_sent["3d"]))

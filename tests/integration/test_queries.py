@@ -1,12 +1,12 @@
-"""Queries of programs on Zenoh and LCM to a whole gateway, with and without a server."""
+"""Queries of programs on Zenoh and LCM to a whole gateway with its server."""
 
 import asyncio
 import json
-import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rtc3d
@@ -14,31 +14,25 @@ import zenoh
 
 from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
-from gateway.messages.decode import to_json
-from gateway.outputs.contract import Answer, KeyPath, ServerParameters
-from gateway.outputs.zenoh import queries as zenoh_queries
-from gateway.outputs.zenoh.queries import ZenohQueries
-from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.messages.decode import decode, to_json
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.queries.questions import SCHEMA_TYPES
-from gateway.queries.service import SourceQueryService
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from tests.integration.lcm_peer import LcmPeer
-from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
+from tests.networks import free_endpoint, lcm_url
 from tests.queried_gateway import (
     ParameterServer,
     ServerOfSections,
     gateway_with_server,
-    gateway_without_server,
-    output_queries,
     query,
     query_all,
     run_gateway,
     wait_until_cached,
     zenoh_peer,
 )
-from tests.servers import ScriptedServer, c3d_file, markers_frame, packet
-from tests.spec_parameters import BY_SECTION, spec_xml
+from tests.servers import ScriptedServer, c3d_file, packet
+from tests.spec_parameters import BY_SECTION, in_root, spec_xml
 from tests.waiting import wait_until_async
 
 # Parameters ----------------------------------------------------------------------------------
@@ -60,162 +54,82 @@ async def test_on_zenoh_parameters_are_the_servers_xml_or_json() -> None:
             assert bool(reply.attachment["recovered"]) == (section in {"force", "events"})
 
 
+class LcmPeer:
+    """A program on LCM that sends requests about the source lab, and receives all replies."""
+
+    def __init__(self, url: str) -> None:
+        self._lcm = open_lcm(url)
+        self.replies: list[rtc3d.parameters_reply_t] = []
+        self._subscriber = LcmSubscriber(
+            self._lcm, "MOCAP_LAB_PARAMETERS_REPLY", lambda _, data: self.replies.append(decode(data))
+        )
+
+    def send(self, number: int, *sections: str, requester: str = "test", fresh: bool = False) -> None:
+        message = rtc3d.parameters_request_t()
+        message.request_id, message.requester, message.fresh = number, requester, fresh
+        message.sections, message.num_sections = list(sections), len(sections)
+        self._lcm.publish("MOCAP_LAB_PARAMETERS_REQUEST", message.encode())
+
+    async def request(self, number: int, *sections: str, fresh: bool = False) -> bytes:
+        """Send a request and return the XML of its only reply."""
+        self.send(number, *sections, fresh=fresh)
+        await wait_until_async(lambda: number in [reply.request_id for reply in self.replies])
+        [reply] = [reply for reply in self.replies if reply.request_id == number]
+        return bytes(reply.xml.encode())
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+
 @pytest.mark.netns
-async def test_only_queries_for_fresh_parameters_reach_the_server() -> None:
-    url, endpoint = lcm_url(), free_endpoint()
-    server = ParameterServer()
+async def test_on_lcm_parameters_are_the_servers_xml() -> None:
+    """Requests have a URL of their own; those on the URL for data are ignored."""
+    server, url, queries_url = ServerOfSections(), lcm_url(), lcm_url()
+    server.sections["3d force"] = both = in_root("<The_3D/>", "<Force/>")
     async with (
         ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, listen=endpoint, lcm_url=url) as gateway,
+        run_gateway(listening.port, lcm_url=url, queries_url=queries_url) as gateway,
     ):
         await wait_until_cached(gateway)
-        on_lcm, before = LcmPeer(url), list(server.commands)
-        server.xml = server.xml.replace(b">100<", b">250<")
-        with zenoh_peer(endpoint) as peer:
-            parameters = (await query(peer, "mocap/lab/parameters?format=json;fresh=false")).json
-            assert (list(parameters), parameters["3d"]["frequency_hz"]) == (list(SECTIONS), 100)
-            assert b">100<" in (await query(peer, "mocap/lab/parameters/3d")).payload
-            assert ">100<" in (await on_lcm.request(1, ["3d"])).xml
-            assert server.commands == before
-            fresh = await query(peer, "mocap/lab/parameters/3d?fresh=true;format=json")
-            assert fresh.json["frequency_hz"] == 250
-            assert ">250<" in (await on_lcm.request(2, ["3d"], fresh=True)).xml
-        assert server.count("SendParameters") == 3
-        on_lcm.close()
+        with closing(LcmPeer(queries_url)) as peer, closing(LcmPeer(url)) as wrong_url_peer:
+            wrong_url_peer.send(99)
+            peer.send(-(2**63), requester="Käfig, 2")
+            await wait_until_async(lambda: peer.replies)
+            [reply] = peer.replies
+            assert (reply.request_id, reply.requester) == (-(2**63), "Käfig, 2")
+            assert (reply.xml.encode(), reply.error, reply.error_code) == (server.xml, "", "")
+            assert 0 <= reply.age_s < 60
+            for number, section in enumerate(SECTIONS):
+                assert await peer.request(number, section) == spec_xml(section)
+            assert await peer.request(10, "force", "3d", "3d") == both
+            assert server.commands[-1] == "SendParameters 3D Force"
+            num_requests = server.count("SendParameters")
+            assert await peer.request(11, "3d", "force") == both
+            assert server.count("SendParameters") == num_requests
+            assert await peer.request(12, "3d", "force", fresh=True) == both
+            assert server.count("SendParameters") > num_requests
+            assert 99 not in [reply.request_id for reply in peer.replies]
+            assert not wrong_url_peer.replies
 
 
-async def test_without_a_connection_stale_parameters_are_answered_with_their_age() -> None:
-    server, endpoint = ParameterServer(), free_endpoint()
-    async with ScriptedServer(server.script) as listening:
-        context = run_gateway(listening.port, listen=endpoint)
-        gateway = await context.__aenter__()
-        await wait_until_cached(gateway)
-    try:
-        [status] = gateway.sources[0].statuses
-        await wait_until_async(lambda: "refused" in status.last_error)
-        with zenoh_peer(endpoint) as peer:
-            assert (await query(peer, "mocap/lab/parameters")).code == "no-connection"
-            reply = await query(peer, "mocap/lab/parameters?stale=ok")
-            assert (reply.payload, reply.attachment["stale"]) == (server.xml, True)
-            assert (reply.attachment["session"], reply.attachment["age_s"] > 0) == (1, True)
-            reply = await query(peer, "mocap/lab/parameters/3d?stale=ok;format=json;fresh=true")
-            assert reply.json["markers"]
-    finally:
-        await context.__aexit__(None, None, None)
-
-
-async def test_a_failure_of_the_server_or_the_connection_is_the_answer() -> None:
-    lab = gateway_with_server(reply_timeout_s=0.3)
-    async with lab as (server, port, _, peer):
-        server.sections["3d"] = b"It is 3 o'clock."
-        server.xml = b"<RT_Parameters Ver='1.00'/>"
-        assert (await query(peer, "mocap/lab/parameters/3d?fresh=true")).payload == b"It is 3 o'clock."
-        reply = await query(peer, "mocap/lab/parameters/3d?fresh=true;format=json")
-        assert reply.code == "unreadable"
-        assert "ask without format=json" in reply.error
-        server.refused_commands = ("SendParameters",)
-        reply = await query(peer, "mocap/lab/parameters?fresh=true")
-        assert (reply.code, reply.error.partition(": ")[0]) == ("refused", "source 'lab'")
-        server.refused_commands, server.ignored_commands = (), ("SendParameters",)
-        reply = await query(peer, "mocap/lab/parameters?fresh=true")
-        assert reply.code == "timeout"
-        assert reply.error == f"source 'lab': 127.0.0.1:{port} did not answer SendParameters within 0.3 s"
-        server.may_answer.clear()
-        before = server.count("SendParameters")
-        asked = asyncio.create_task(query(peer, "mocap/lab/parameters?fresh=true"))
-        await wait_until_async(lambda: server.count("SendParameters") > before)
-        assert server.client is not None
-        server.client.cut()
-        assert (await asked).code == "no-connection"
-        server.may_answer.set()
-
-
-@pytest.mark.netns
-async def test_without_a_connection_every_answer_says_why() -> None:
-    url, endpoint, port = lcm_url(), free_endpoint(), free_port()
-    async with run_gateway(port, listen=endpoint, lcm_url=url, remote_control=True) as gateway:
-        [status] = gateway.sources[0].statuses
-        await wait_until_async(lambda: status.last_error)
-        reason = f"source 'lab' has no connection: refused by 127.0.0.1:{port}, tried "
-        with zenoh_peer(endpoint) as peer:
-            for key in ("lab/parameters", "lab/parameters?stale=ok", "lab/event", "*/3d"):
-                reply = await query(peer, f"mocap/{key}")
-                assert reply.encoding == "text/plain;no-connection"
-                assert reply.error.startswith(reason)
-                assert reply.error.endswith(" s ago; is the RT server running, and is this its port?")
-            assert (await query(peer, "mocap/lab/recording?set=start")).code == "no-connection"
-        on_lcm = LcmPeer(url)
-        reply = await on_lcm.request()
-        assert (reply.error_code, reply.xml, reply.age_s) == ("no-connection", "", 0)
-        assert reply.error.startswith(reason)
-        on_lcm.close()
-
-
-# Frames, status and schemas ------------------------------------------------------------------
+# Frames, schemas and the coordinate frame -----------------------------------------------------
 
 
 async def until_a_frame(gateway: Gateway) -> None:
     await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
 
 
-@pytest.mark.netns
-async def test_the_newest_frame_is_answered_even_if_pacing_leaves_it_out() -> None:
-    server, endpoint = ParameterServer(), free_endpoint()
-    pace = {ComponentType.MARKERS: 0.001}
-    async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, listen=endpoint, lcm_url=lcm_url(), max_rate_hz=pace) as gateway,
-    ):
-        fan_out = gateway.sources[0].fan_out
-        await until_a_frame(gateway)
-        with zenoh_peer(endpoint) as peer:
-            first = await query(peer, "mocap/lab/3d")
-            for number in range(8, 20):
-                server.send(markers_frame(number, (1.0, 2.0, 3.0)))
-            await wait_until_async(lambda: fan_out.frames[ComponentType.MARKERS] == 13)
-            newest = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
-        sent = {output.name: status.messages["3d"] for output, status in fan_out.outputs}
-    assert first.encoding == "application/x-lcm;rtc3d.markers_t"
-    assert (rtc3d.markers_t.decode(first.payload).frame_number, newest.frame_number) == (7, 19)
-    # Zenoh published the first frame only. LCM published all, and has other numbers.
-    assert (sent, newest.sequence) == ({"zenoh": 1, "lcm": 13}, 0)
-    assert server.count("SendCurrentFrame") == 0
-
-
-async def test_without_a_running_stream_the_current_frame_is_requested() -> None:
-    async with gateway_with_server() as (server, _, gateway, peer):
-        await until_a_frame(gateway)
-        event = await query(peer, "mocap/lab/event")
-        expected = "no event has arrived from source 'lab' in this session"
-        assert (event.code, event.error) == ("nothing-yet", expected)
-        server.has_measurement = False
-        assert server.client is not None
-        server.client.cut()
+async def test_without_frames_the_current_frame_is_requested() -> None:
+    """It is no part of the stream, so it has no number of its own."""
+    server = ParameterServer()
+    server.has_measurement = False
+    async with gateway_with_server(server) as (_, _, gateway, peer):
         [status] = gateway.sources[0].statuses
-        await wait_until_async(lambda: status.session == 2 and status.state.value == "no measurement")
-        reply = await query(peer, "mocap/lab/3d")  # the frame of the earlier connection is not current
-        assert (reply.code, reply.error) == ("nothing-yet", "source 'lab': no measurement runs")
+        await wait_until_async(lambda: status.state.value == "no measurement")
         server.has_measurement = True
         message = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
-        assert (message.frame_number, message.sequence, message.session) == (7, -1, 2)
-        server.refused_commands = ("SendCurrentFrame ",)
-        assert (await query(peer, "mocap/lab/3d?format=json")).json["frame_number"] == 7
-        assert server.commands[-2:] == ["SendCurrentFrame 3D", "SendCurrentFrame"]
-
-
-async def test_the_status_counts_the_queries_about_the_source_by_result() -> None:
-    async with gateway_with_server() as (_, port, gateway, peer):
-        assert (await query(peer, "mocap/lab/nowhere")).code == "bad-request"
-        [output] = gateway.outputs
-        await wait_until_async(lambda: output.query_results == {"lab": {"bad-request": 1}})
-        gateway.sources[0].publish_status()
-        reply = await query(peer, "mocap/lab/status")
-        assert reply.encoding == "application/x-lcm;rtc3d.status_t"
-        status = rtc3d.status_t.decode(reply.payload)
-        [on_zenoh] = status.outputs
-        assert [(count.name, count.count) for count in on_zenoh.queries] == [("bad-request", 1)]
-        assert (status.source, status.host) == ("lab", socket.gethostname())
-        assert (await query(peer, "mocap/lab/status?format=json")).json["server"] == f"127.0.0.1:{port}"
+        assert (message.frame_number, message.sequence, message.session) == (7, -1, 1)
+        assert server.commands[-1] == "SendCurrentFrame 3D"
 
 
 USE_SCHEMAS = """
@@ -260,6 +174,48 @@ async def test_a_decoder_made_from_a_queried_schema_alone_reads_a_queried_frame(
     )
 
 
+Y_UP = {"scale": 2.0, "up": "y", "translation_m": [10.0, 0.0, 1.0]}
+HALF = 0.5**0.5
+FRAME = {
+    "frame_id": "world",
+    "metres_per_unit": 0.002,
+    "rotation_xyzw": [HALF, 0.0, 0.0, HALF],
+    "translation_m": [10.0, 0.0, 1.0],
+}
+
+
+@pytest.mark.netns
+async def test_receivers_on_zenoh_and_lcm_learn_the_frame() -> None:
+    """The frame of poses is in the answers to queries, with the parameters and in the status."""
+    endpoint, url = free_endpoint(), lcm_url()
+    lcm: dict[str, Any] = {"lcm_url": url, "queries_url": url}
+    replies: list[rtc3d.command_reply_t] = []
+    async with (
+        ScriptedServer(ParameterServer().script) as server,
+        run_gateway(server.port, listen=endpoint, frame_id="world", transform=Y_UP, **lcm) as gateway,
+    ):
+        await wait_until_cached(gateway)
+        with zenoh_peer(endpoint) as peer:
+            reply = await query(peer, "mocap/lab/frame")
+            parameters = await query(peer, "mocap/lab/parameters")
+            status = decode((await query(peer, "mocap/lab/status")).payload)
+        connection = open_lcm(url)
+        subscriber = LcmSubscriber(
+            connection, "MOCAP_LAB_COMMAND_REPLY", lambda _, message: replies.append(decode(message))
+        )
+        request = rtc3d.command_request_t()
+        request.requester, request.command = "test", "frame"
+        connection.publish("MOCAP_LAB_COMMAND_REQUEST", request.encode())
+        await wait_until_async(lambda: replies)
+        subscriber.close()
+    expected = {**FRAME, "names": {}}
+    assert (reply.json, reply.encoding) == (expected, "application/json")
+    assert json.loads(replies[0].content) == expected
+    assert parameters.attachment["frame"] == FRAME
+    in_status = {name: getattr(status, name) for name in FRAME}
+    assert in_status == {key: tuple(each) if isinstance(each, list) else each for key, each in FRAME.items()}
+
+
 # Files and recordings ------------------------------------------------------------------------
 
 
@@ -282,16 +238,6 @@ async def test_a_c3d_file_is_stored_announced_and_answered(tmp_path: Path) -> No
         assert (await query(peer, "mocap/*/c3d")).payload == second
 
 
-async def test_recording_control_is_off_by_default_and_the_error_says_how_to_switch_it_on() -> None:
-    async with gateway_with_server() as (server, _, _, peer):
-        reply = await query(peer, "mocap/lab/recording?set=start")
-        assert reply.code == "refused"
-        assert "remote control is off for source 'lab'" in reply.error
-        assert "remote_control: true" in reply.error
-        await query(peer, "mocap/lab/parameters?fresh=true")
-        assert server.received == []
-
-
 RECORDING = "0000003c 00000003 00000001 00000030 00000005 ffffffff 0000000000000000 00000001 {} "
 RECORDING += "0000000000000000 ffffffff ffffffff ffffffff"
 """A data packet with one event component of 48 bytes (30h), frame -1; {} is the id (field note 16)."""
@@ -299,9 +245,6 @@ RECORDING += "0000000000000000 ffffffff ffffffff ffffffff"
 
 async def test_recordings_are_started_and_stopped_for_a_single_source() -> None:
     async with gateway_with_server(remote_control=True) as (server, _, _, peer):
-        assert "accepted: set=start;name=NAME, set=stop" in (await query(peer, "mocap/lab/recording")).error
-        assert "accepted: start, stop" in (await query(peer, "mocap/lab/recording?set=pause")).error
-        assert (await query(peer, "mocap/*/recording?set=start")).code == "bad-request"
         await query_all(peer, "mocap/**?set=start")
         await query(peer, "mocap/lab/parameters?fresh=true")
         assert server.received == []
@@ -321,6 +264,7 @@ async def test_recordings_are_started_and_stopped_for_a_single_source() -> None:
 
 
 # Selectors -----------------------------------------------------------------------------------
+
 
 BAD_SELECTORS = [
     ("", ["accepted below mocap/lab/: parameters, "]),
@@ -345,7 +289,7 @@ BAD_SELECTORS = [
 
 async def test_the_error_for_a_bad_query_lists_what_is_accepted() -> None:
     streams = (StreamSettings(components=(ComponentType.MARKERS, ComponentType.EVENT)),)
-    async with gateway_without_server(streams=streams) as (_, peer):
+    async with gateway_with_server(streams=streams) as (_, _, _, peer):
         for selector, accepted in BAD_SELECTORS:
             reply = await query(peer, f"mocap/lab{selector}")
             assert reply.encoding == "text/plain;bad-request", selector
@@ -389,54 +333,3 @@ async def test_through_a_router_a_wildcard_for_sources_is_answered_by_every_sour
 
 
 # Limits and failures -------------------------------------------------------------------------
-
-
-async def test_queries_beyond_the_limit_are_refused_as_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zenoh_queries, "MAX_PENDING", 2)
-    async with gateway_with_server() as (server, _, gateway, peer):
-        queries = output_queries(gateway)
-        server.may_answer.clear()
-        waiting = [asyncio.create_task(query(peer, "mocap/lab/parameters?fresh=true")) for _ in range(2)]
-        await wait_until_async(lambda: queries._admission.num_pending == 2)
-        reply = await query(peer, "mocap/lab/status")
-        assert (reply.code, reply.error) == ("busy", "the gateway has too many queries; try again")
-        server.may_answer.set()
-        assert {reply.payload for reply in await asyncio.gather(*waiting)} == {server.xml}
-        assert (await query(peer, "mocap/lab/status")).payload
-        # A reply can arrive before it is counted.
-        await wait_until_async(lambda: queries.results == {"lab": {"busy": 1, "ok": 3}})
-
-
-class SilentService(SourceQueryService):
-    """Serves the source "lab" and never answers."""
-
-    def __init__(self) -> None:
-        self.received_query = asyncio.Event()
-
-    def serves(self, source: str) -> bool:
-        return source == "lab"
-
-    async def answer(self, _source: str, _path: KeyPath, _options: Mapping[str, str]) -> Answer:
-        self.received_query.set()
-        never: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-        return await never
-
-
-async def test_when_zenoh_closes_queries_end_at_once_and_nothing_is_published(router: str) -> None:
-    service, loop = SilentService(), asyncio.get_running_loop()
-    queries = ZenohQueries(ZenohSettings(), service, loop)
-    session = open_zenoh("client", connect=router)
-    queries.open(session, ["lab"])
-    with zenoh_peer(router) as peer:
-        ended = asyncio.Event()
-        replies: list[zenoh.Reply] = []
-        end = zenoh.handlers.Callback(replies.append, drop=lambda: loop.call_soon_threadsafe(ended.set))
-        peer.get("mocap/lab/status", end, timeout=60)
-        await service.received_query.wait()
-        await queries.close()
-        async with asyncio.timeout(120):
-            await ended.wait()
-        assert replies == []
-    session.close()
-    queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
-    queries.announce_file("lab", {"name": "a.c3d"})

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
+from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.outputs.lcm.settings import LcmSettings
@@ -24,7 +24,7 @@ from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import free_endpoint, lcm_url, zenoh_keys
 from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
@@ -55,11 +55,10 @@ async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
     endpoint, url = free_endpoint(), f"{lcm_url()}&recv_buf_size=2000000"
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
-        settings = make_settings(
-            sources=(SourceSettings(name="lab", host="127.0.0.1", port=simulator.port, streams=streams),),
+        settings = local_settings(
+            local_source(simulator.port, streams=streams),
             zenoh=ZenohSettings(config=zenoh_keys("peer", listen=endpoint)),
             lcm=LcmSettings(url=url),
-            metrics=MetricsSettings(enabled=False),
         )
         async with running_gateway(Gateway(settings)) as gateway:
             await gateway.opened.wait()

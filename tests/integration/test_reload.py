@@ -11,12 +11,7 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import (
-    MetricsSettings,
-    ReconnectSettings,
-    Settings,
-    SourceSettings,
-)
+from gateway.config.settings import MetricsSettings, Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
@@ -28,7 +23,7 @@ from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
 from gateway.service.daemon import Daemon
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
 from tests.running_gateway import running_gateway
@@ -37,9 +32,7 @@ from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-
-def simulator(tools: int = 0) -> Simulator:
-    return Simulator(SyntheticScene(markers=1, tools=tools, analog=0, plates=0, rate_hz=200))
+SCENE = SyntheticScene(markers=1, tools=2, analog=0, plates=0, rate_hz=200)
 
 
 class SettingsBuilder:
@@ -51,19 +44,8 @@ class SettingsBuilder:
 
     def settings(self, sources: Mapping[str, int], **sections: Any) -> Any:
         """Return settings with sources by name and port; ``sections`` replace the default sections."""
-        reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
-        return make_settings(
-            sources=tuple(
-                SourceSettings(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
-                for name, port in sources.items()
-            ),
-            **{
-                "zenoh": self.zenoh(),
-                "lcm": self.lcm(),
-                "metrics": MetricsSettings(enabled=False),
-                **sections,
-            },
-        )
+        own = {"zenoh": self.zenoh(), "lcm": self.lcm()}
+        return local_settings(*(local_source(port, name) for name, port in sources.items()), **own | sections)
 
     def zenoh(self, **keys: Any) -> ZenohSettings:
         return ZenohSettings(**{"config": zenoh_keys("peer", listen=self.endpoint), **keys})
@@ -80,14 +62,13 @@ async def running(settings: Settings) -> AsyncIterator[Gateway]:
 
 
 class ReceivedMarkers:
-    """The (session, sequence) of received marker messages, in order, by key or channel."""
+    """The sequence numbers of received marker messages, in order, by key or channel."""
 
     def __init__(self) -> None:
-        self.numbers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+        self.numbers: defaultdict[str, list[int]] = defaultdict(list)
 
     def append(self, name: str, message: bytes) -> None:
-        markers = decode(message)
-        self.numbers[name].append((markers.session, markers.sequence))
+        self.numbers[name].append(decode(message).sequence)
 
     async def wait_for_more(self, name: str, count: int = 20) -> None:
         """Wait for ``count`` more messages on a key or channel."""
@@ -95,7 +76,7 @@ class ReceivedMarkers:
         await wait_until_async(lambda: len(self.numbers[name]) >= wanted)
 
     def assert_gapless(self, name: str) -> None:
-        sequences = [sequence for _, sequence in self.numbers[name]]
+        sequences = self.numbers[name]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
 
 
@@ -111,50 +92,6 @@ def subscribed(builder: SettingsBuilder) -> Iterator[ReceivedMarkers]:
     finally:
         lcm_subscriber.close()
         session.close()
-
-
-async def test_a_changed_source_keeps_its_numbering_and_other_sources_are_not_affected() -> None:
-    builder = SettingsBuilder()
-    async with (
-        simulator() as kept,
-        simulator() as first,
-        simulator() as second,
-        running(builder.settings({"kept": kept.port, "moved": first.port})) as gateway,
-    ):
-        with subscribed(builder) as received:
-            names = ("mocap/kept/3d", "MOCAP_KEPT_3D", "mocap/moved/3d", "MOCAP_MOVED_3D")
-            for name in names:
-                await received.wait_for_more(name)
-            changes = await gateway.reload(builder.settings({"kept": kept.port, "moved": second.port}))
-            assert changes == ["source moved changed"]
-            assert not first.connections
-            for name in names:
-                await received.wait_for_more(name)
-                received.assert_gapless(name)
-            assert {session for session, _ in received.numbers["mocap/kept/3d"]} == {1}
-            assert [session for session, _ in received.numbers["mocap/moved/3d"]][-1] == 2
-
-
-async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> None:
-    builder, server, other = SettingsBuilder(), ParameterServer("of lab"), ParameterServer("of new")
-    async with (
-        ScriptedServer(server.script) as lab_server,
-        ScriptedServer(other.script) as new_server,
-        running(builder.settings({"lab": lab_server.port, "gone": lab_server.port})) as gateway,
-    ):
-        with zenoh_peer(builder.endpoint) as peer:
-            await wait_until_async(lambda: server.count("StreamFrames") >= 2)
-            changes = await gateway.reload(builder.settings({"new": new_server.port, "lab": lab_server.port}))
-            assert changes == ["source gone removed", "source new added"]
-            assert [source.name for source in gateway.sources] == ["new", "lab"]
-            await wait_until_async(lambda: server.count("Bye") == 1)
-            await wait_until_async(lambda: all(source.streams[0].session for source in gateway.sources))
-            assert b"of new" in (await query(peer, "mocap/new/parameters")).payload
-            assert b"of lab" in (await query(peer, "mocap/lab/parameters")).payload
-            assert await query_all(peer, "mocap/gone/parameters") == []
-            alive = await asyncio.to_thread(lambda: list(peer.liveliness().get("mocap/*/alive", timeout=5)))
-            keys = {str(reply.ok.key_expr) for reply in alive if reply.ok}
-            assert keys == {"mocap/lab/alive", "mocap/new/alive"}
 
 
 async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters() -> None:
@@ -208,7 +145,7 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
     output: str, other: str, before: str, kept: str, after: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     builder = SettingsBuilder()
-    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+    async with Simulator(SCENE) as server, running(builder.settings({"lab": server.port})) as gateway:
         with subscribed(builder) as received:
             await received.wait_for_more(before)
             await received.wait_for_more(kept)
@@ -218,7 +155,7 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
             await received.wait_for_more(after)
             await received.wait_for_more(kept)
             received.assert_gapless(kept)
-            assert received.numbers[after][0][1] > received.numbers[before][-1][1]
+            assert received.numbers[after][0] > received.numbers[before][-1]
             assert len(server.connections) == 1
     assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
 
@@ -226,7 +163,7 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing(
 @pytest.mark.parametrize("output", ["lcm", "zenoh"])
 async def test_switching_tool_poses_does_not_reopen_the_output(output: str) -> None:
     builder = SettingsBuilder()
-    async with simulator(tools=2) as server, running(builder.settings({"lab": server.port})) as gateway:
+    async with Simulator(SCENE) as server, running(builder.settings({"lab": server.port})) as gateway:
         with subscribed(builder) as received:
             outputs = list(gateway.outputs)
             for is_on in (True, False, True):

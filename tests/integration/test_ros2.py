@@ -5,22 +5,19 @@ import json
 import sys
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from typing import Any, Final
 
 import zenoh
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.ros2.message_types import ROS_TYPES
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.networks import open_zenoh
 from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
@@ -38,16 +35,11 @@ TYPES: Final = {
 
 def settings_of(router: str, sources: dict[str, int], ros2: Ros2Settings | None = None) -> Any:
     """Return settings with sources by name and port, for ROS on ``router`` only."""
-    reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
-    return make_settings(
-        sources=tuple(
-            SourceSettings(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
-            for name, port in sources.items()
-        ),
+    return local_settings(
+        *(local_source(port, name) for name, port in sources.items()),
         zenoh=ZenohSettings(enabled=False),
         lcm=LcmSettings(enabled=False),
         ros2=ros2 or Ros2Settings(enabled=True, connect=router),
-        metrics=MetricsSettings(enabled=False),
     )
 
 
@@ -125,39 +117,3 @@ async def test_a_reload_adds_and_removes_sources_and_the_output(router: str) -> 
                 await wait_until_async(lambda: "/robots/hall_2/markers" in topics_on(node))
                 assert "/mocap/hall_2/markers" not in topics_on(node)
         await wait_until_async(lambda: not topics_on(node))
-
-
-async def test_topics_belong_to_the_components_that_streams_request(router: str) -> None:
-    """A topic on which nothing comes misleads. A reload adds and removes them, even without the server."""
-    wanted = {"/diagnostics", "/mocap/lab/markers", "/mocap/lab/force_1/wrench"}
-    others = {"/tf", "/mocap/lab/Tool_1/pose", "/mocap/lab/analog"}
-    with open_zenoh("client", connect=router) as node:
-        async with AsyncExitStack() as server:
-            every = settings_of(router, {"lab": await server.enter_async_context(simulated())})
-            [lab] = every.sources
-            streams = (StreamSettings(components=(ComponentType.MARKERS, ComponentType.FORCE)),)
-            some = every.model_copy(update={"sources": (lab.model_copy(update={"streams": streams}),)})
-            async with gateway_of(some) as gateway:
-                await wait_until_async(lambda: topics_on(node) == wanted)
-                await gateway.reload(every)
-                await wait_until_async(lambda: topics_on(node) == wanted | others)
-                await server.aclose()
-                await gateway.reload(some)
-                await wait_until_async(lambda: topics_on(node) == wanted)
-
-
-async def test_frames_are_requested_only_while_ros_wants_them(router: str) -> None:
-    received: list[zenoh.Sample] = []
-    async with simulated() as server:
-        settings = settings_of(router, {"lab": server})
-        stream = StreamSettings(on_demand=True, idle_after_s=0.1)
-        source = settings.sources[0].model_copy(update={"streams": (stream,)})
-        async with gateway_of(settings.model_copy(update={"sources": (source,)})) as gateway:
-            [running] = gateway._sources["lab"]._streams.streams
-            with open_zenoh("client", connect=router) as node:
-                for _ in range(2):
-                    await wait_until_async(lambda: running.status.state is StreamState.IDLE)
-                    received.clear()
-                    subscriber = node.declare_subscriber("0/mocap/lab/markers/**", received.append)
-                    await wait_until_async(lambda: received)
-                    subscriber.undeclare()

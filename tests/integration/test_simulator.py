@@ -4,21 +4,29 @@ import asyncio
 import logging
 import struct
 from collections import Counter
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from gateway.errors import GatewayError
 from gateway.rtc3d.parameters import General
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
+from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
-from tests.integration.served import Served
+from tests.integration.raw_client import (
+    TIMEOUT_S,
+    Listening,
+    RawClient,
+    connected,
+    consecutive,
+    numbers,
+    until,
+)
+from tests.serving_gateway import serving_gateway
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
@@ -40,6 +48,27 @@ from tests.unit.rtc3d_server.wire import (
 KEYS = {MARKERS: "3d", TOOLS: "6d", ANALOG: "analog", FORCE: "force", EVENT: "event"}
 FAST_HZ = 1000.0
 VERSION = (COMMAND, b"OK-Version 1.0")
+
+Served = Callable[..., AbstractAsyncContextManager[Listening]]
+"""Takes a simulator; yields the server that clients connect to."""
+
+
+@asynccontextmanager
+async def directly(simulator: Simulator) -> AsyncIterator[Listening]:
+    yield simulator
+
+
+@asynccontextmanager
+async def through_a_gateway(simulator: Simulator) -> AsyncIterator[Listening]:
+    async with serving_gateway(simulator) as gateway:
+        yield gateway
+
+
+@pytest.fixture(params=[directly, through_a_gateway])
+def served(request: pytest.FixtureRequest) -> Served:
+    """How clients reach a simulator: both must get the same."""
+    serve: Served = request.param
+    return serve
 
 
 @asynccontextmanager
@@ -105,20 +134,6 @@ async def test_commands_can_arrive_in_pieces_or_several_at_once(served: Served) 
         assert sorted(kinds) == [ERROR, *[COMMAND] * 301, DATA]
 
 
-async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open(served: Served) -> None:
-    """A client's mistake must not cost it the frames of its other requests."""
-    async with playing(served, 100) as (_, client):
-        for bad in (
-            *(command("Version 1.1"), command("Fly"), command(""), command("StreamFrames Frequency:fast")),
-            *(packet(ERROR, b"Error"), packet(XML, b"<RT_Parameters/>"), packet(DATA, b"\0\0\0\1")),
-            *(packet(NO_DATA), packet(5, b"c3d"), packet(77, b"?")),
-        ):
-            client.send(bad)
-            packet_type, text = await client.read()
-            assert (packet_type, len(text) > len("Error-")) == (ERROR, True)
-        assert await client.ask("Version 1.0") == VERSION
-
-
 @pytest.mark.parametrize("size", [7, 64 * 1024 + 1])
 async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection(
     served: Served, size: int
@@ -130,6 +145,19 @@ async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection
         assert str(size).encode() in text
 
 
+async def test_names_of_clients_have_brackets_if_the_address_is_one_of_ipv6(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    async with RtServer(CountingScene(), host="::1") as server:
+        reader, writer = await asyncio.open_connection("::1", server.port)
+        writer.write(command("Bye"))
+        await reader.read()
+        writer.close()
+        port = writer.get_extra_info("sockname")[1]
+        await until(lambda: f"[::1]:{port}: disconnected" in caplog.text)
+
+
 async def test_commands_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG", "gateway.rtc3d_server")
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
@@ -139,62 +167,6 @@ async def test_commands_are_logged_as_debug(caplog: pytest.LogCaptureFixture) ->
         await client.read()
     received = [text.split(" received ")[1] for text in caplog.messages if " received " in text]
     assert received == [r"'Version 1.0\x00'", repr("x" * 200), "a packet of type 3 with 4 bytes"]
-
-
-# Streams, by frame numbers and values, without timing ---------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("sent", "gaps"),
-    [
-        ("StreamFrames 3D Analog", [1] * 59),
-        ("StreamFrames FrequencyDivisor:7 3D", [7] * 59),
-        ("StreamFrames Frequency:600 3D", [2, 2, 1] * 19 + [2, 2]),
-    ],
-)
-async def test_frames_are_sent_at_the_requested_rate(served: Served, sent: str, gaps: list[int]) -> None:
-    async with playing(served) as (_, client):
-        await client.ask(sent)
-        assert np.diff(numbers(await client.frames(60))).tolist() == gaps
-
-
-async def test_time_stamps_are_equal_within_a_frame_and_no_event_is_lost_at_a_low_rate(
-    served: Served,
-) -> None:
-    """Each component has the sample of the frame's time; events wait for the next frame."""
-    events = []
-    async with playing(served) as (_, client):
-        await client.ask("StreamFrames FrequencyDivisor:50 3D 6D Events")
-        for components in await client.frames(10):
-            number = components[0].frame_number - 1
-            assert {component.timestamp_us for component in components} == {number * 1000}
-            for component in components:
-                if component.type == EVENT:
-                    events += [event[0] for event in component.items]
-                else:
-                    assert (component.items[0][0], component.frame_number - 1) == (number, number)
-    assert len(events) >= 5
-    assert np.diff(events).tolist() == [1.0] * (len(events) - 1)
-
-
-async def test_each_client_has_its_own_rate_and_byte_order(served: Served) -> None:
-    async with (
-        Simulator(CountingScene(FAST_HZ)) as simulator,
-        served(simulator) as server,
-        connected(server) as big,
-        connected(server) as little,
-    ):
-        await little.ask("SetByteOrder LittleEndian")
-        await big.ask("StreamFrames 3D")
-        await little.ask("StreamFrames FrequencyDivisor:2 6D")
-        for frames, component_type, gap in zip(
-            await asyncio.gather(big.frames(50), little.frames(50, "little")),
-            (MARKERS, TOOLS),
-            (1, 2),
-            strict=True,
-        ):
-            assert {component.type for frame in frames for component in frame} == {component_type}
-            assert np.diff(numbers(frames)).tolist() == [gap] * 49
 
 
 async def test_the_end_and_the_start_of_a_measurement_reach_a_client(served: Served) -> None:
@@ -213,23 +185,6 @@ async def test_the_end_and_the_start_of_a_measurement_reach_a_client(served: Ser
         assert (await client.ask("SendParameters"))[0] == XML
         simulator.start_measurement()
         assert numbers(await client.frames(5)) == [1, 2, 3, 4, 5]
-
-
-async def test_once_all_connections_get_the_scene_from_its_first_frame_to_its_end() -> None:
-    """A gateway has several connections, and plays a recording exactly once."""
-    async with (
-        Simulator(CountingScene(FAST_HZ, num_frames=80), once=True) as simulator,
-        connected(simulator) as first,
-        connected(simulator) as second,
-    ):
-        assert await first.ask("Version 1.0") == VERSION
-        await first.ask("StreamFrames Analog")
-        await second.ask("StreamFrames 3D")
-        assert numbers(await first.frames(800)) == list(range(1, 801))
-        assert numbers(await second.frames(80)) == list(range(1, 81))
-        assert await first.read() == (NO_DATA, b"")
-        assert await first.ask("SendCurrentFrame") == (COMMAND, b"OK-SendCurrentFrame")
-        assert await first.read() == (NO_DATA, b"")
 
 
 # Many clients, statistics and the end --------------------------------------------------------

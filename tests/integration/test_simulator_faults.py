@@ -15,11 +15,10 @@ from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.faults.momentary_faults import Cut
 from gateway.simulator.faults.reply_faults import LateAcknowledgements
-from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Rename, Restart
+from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Restart
 from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Merge, Split
 from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
-from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
@@ -202,19 +201,6 @@ async def test_a_server_crashes_and_comes_back_whatever_it_is_about_to_do(rounds
         assert not simulator.is_listening
         simulator.faults.end(second)
         await until(lambda: simulator.is_listening)
-
-
-async def test_names_can_change_while_frames_continue() -> None:
-    scene = SyntheticScene(markers=1, tools=1, rate_hz=FAST_HZ)
-    async with Simulator(scene) as simulator, connected(simulator) as client:
-        rename = simulator.faults.begin(Rename(prefix="Left "))
-        _, xml = await client.ask("SendParameters 3D 6D")
-        assert b">Left Marker 1<" in xml
-        assert b">Left Tool 1<" in xml
-        await client.ask("StreamFrames 3D")
-        frames = await client.frames(5)
-        simulator.faults.end(rename)
-        assert consecutive(frames + await client.frames(5))
 
 
 # The byte stream ----------------------------------------------------------------------------

@@ -1,95 +1,212 @@
-"""Changes of a stream on one connection: demand, restarts, states."""
+"""Streams of a whole gateway: those of its configuration, and those that ``auto`` chooses."""
 
-from functools import partial
+import asyncio
+from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import pytest
 
 from gateway.config.settings import StreamSettings
+from gateway.rtc3d.commands import FrequencyDivisor
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.packets import Packet, decode_text
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.memory_gateway import run_gateway
-from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
+from tests.memory_gateway import MemoryGateway, run_gateway
 
-START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
-
-
-class Recorder:
-    """A server that sends numbered frames, and records its commands."""
-
-    def __init__(self) -> None:
-        self.commands: list[str] = []
-        self.client: Client | None = None
-
-    async def script(self, client: Client) -> None:
-        self.client = client
-        await client.commands(self._answer)
-
-    def _answer(self, command: str) -> bytes:
-        self.commands.append(command)
-        if command.startswith("SendParameters"):
-            return packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
-        return ok(f"OK-{command}")
-
-    def stream(self, number: int, num_markers: int = 1) -> None:
-        assert self.client is not None
-        self.client.send(markers_frame(number, *[(0.0, 0.0, 0.0)] * num_markers))
-
-    def has(self, command: str, count: int) -> bool:
-        return self.commands.count(command) == count
+ONE_CONNECTION = "analog and force arrive at 200 Hz instead of 2000 Hz: "
+EVERYTHING = "3d 6d analog force event"
+TWO = ["3d 6d event", "analog force"]
+SCENE = SyntheticScene(markers=3, tools=1, analog=2, plates=1, rate_hz=200, analog_rate_hz=2000)
 
 
-async def test_an_on_demand_stream_runs_while_it_has_subscribers() -> None:
-    server = Recorder()
-    stream = StreamSettings(on_demand=True, idle_after_s=0.1)
+class _Filter(ConnectionFilter):
+    """Lets the server handle what its clients do while there is another client."""
+
+    def __init__(self, connection: FilteredConnection, server: "OneClientServer") -> None:
+        super().__init__(connection)
+        self._server = server
+
+    def receive(self, data: bytes) -> None:
+        is_second = any(other.number < self.connection.number for other in self._server.connections)
+        if is_second and self._server.on_second == "close":
+            self.connection.transport.close()
+        else:
+            super().receive(data)
+
+    def answer(self, packet: Packet) -> list[bytes]:
+        text = decode_text(packet.body)
+        self._server.commands.append((self.connection.number, text))
+        replies = super().answer(packet)
+        if text.startswith("StreamFrames") and self._server.num_clients > 1:
+            if self._server.on_second == "close_first":
+                self._server.close_others(self.connection)
+            elif self._server.on_second == "crash":
+                self._server.crash_and_restart()
+        return replies
+
+
+class OneClientServer(RtServer):
+    """A server with field note 21.
+
+    ``on_second`` says what happens to a second client: "serve", "refuse" or "close" it; or when it
+    requests frames: "close_first", "crash".
+    """
+
+    def __init__(self, on_second: str) -> None:
+        super().__init__(SCENE, new_filter=lambda each: _Filter(each, self))
+        self.on_second = on_second
+        self.commands: list[tuple[int, str]] = []
+        self.num_opened = 0
+
+    @property
+    def num_clients(self) -> int:
+        return len(self.connections)
+
+    def connection_opened(self, connection: Any) -> int:
+        self.num_opened += 1
+        if self.on_second == "refuse" and self._server is not None:
+            self._server.close()
+            self._server = None
+        return super().connection_opened(connection)
+
+    @property
+    def is_listening(self) -> bool:
+        return self.on_second == "refuse" or super().is_listening
+
+    def close_others(self, connection: FilteredConnection) -> None:
+        for other in list(self.connections):
+            if other.number != connection.number:
+                other.transport.abort()
+
+    def crash_and_restart(self) -> None:
+        self.crash()
+        asyncio.get_running_loop().call_later(0.1, lambda: asyncio.ensure_future(self.start()))
+
+
+def components(lab: MemoryGateway) -> list[str]:
+    return [status.components for status in lab.source.statuses]
+
+
+def steps(messages: list[Any]) -> set[int]:
+    return {after.frame_number - before.frame_number for before, after in pairwise(messages)}
+
+
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+async def test_every_component_of_the_simulator_is_published(byte_order: str) -> None:
+    scene = SyntheticScene(markers=5, tools=1, analog=3, plates=1, rate_hz=200, analog_rate_hz=200)
+    counts = {"3d": "markers 5", "6d": "tools 1", "analog": "channels 3", "force": "plates 1"}
+    counts["event"] = "events 1"
     async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, streams=(stream,)) as lab,
+        Simulator(scene) as simulator,
+        run_gateway(simulator.port, byte_order=byte_order) as gateway,
     ):
-        for rounds in (1, 2, 3):
-            await lab.wait_until(partial(server.has, START, rounds))
-            server.stream(rounds)
-            await lab.wait_for("3d", rounds)
-            lab.output.has_subscriber = False
-            await lab.wait_until(partial(server.has, STOP, rounds))
-            await lab.wait_until(lambda: lab.status.state is StreamState.IDLE)
-            lab.output.has_subscriber = True
-        assert lab.status.session == 1
+        for component, (kind, count) in ((key, text.split()) for key, text in counts.items()):
+            [message, *_] = await gateway.wait_for(component)
+            assert getattr(message, f"num_{kind}") == int(count)
+        markers = await gateway.wait_for("3d", 20)
+        assert [message.sequence for message in markers] == list(range(len(markers)))
+        for message in markers:
+            # A scene is a function of time; frames are numbered from 1.
+            [items] = scene.items(ComponentType.MARKERS, np.array([message.frame_number - 1]))
+            assert [marker.x for marker in message.markers] == items["x"].tolist()
+            assert message.session == 1
+        status = gateway.status
+        expected = (StreamState.STREAMING, byte_order, "AllFrames")
+        assert (status.state, status.byte_order, status.rate) == expected
 
 
-async def test_another_number_of_markers_requests_the_parameters_and_a_restart_keeps_the_connection() -> None:
-    server = Recorder()
-    async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, fresh_interval_s=0.05) as lab,
-    ):
-        lab.output.has_subscriber = False  # only a stream on demand stops
-        await lab.wait_until(lambda: server.has(START, 1))
-        for number in range(1, 20):
-            server.stream(number)
-            await lab.wait_for("3d", number)
-        assert server.has("SendParameters", 1)
-        server.stream(20, num_markers=2)
-        await lab.wait_until(lambda: server.has("SendParameters", 2))
-        server.stream(1)
-        counts = [message.num_markers for message in await lab.wait_for("3d", 21)]
-        assert counts == [1] * 19 + [2, 1]
-        assert (lab.status.restarts, lab.status.session, server.has(STOP, 0)) == (1, 1, True)
+async def test_each_stream_has_its_own_connection_and_its_configured_rate() -> None:
+    scene = SyntheticScene(markers=2, tools=0, analog=2, plates=0, rate_hz=200, analog_rate_hz=1000)
+    streams = (
+        StreamSettings(components=(ComponentType.MARKERS,), rate=FrequencyDivisor(4)),
+        StreamSettings(components=(ComponentType.ANALOG,)),
+    )
+    async with Simulator(scene) as simulator, run_gateway(simulator.port, streams=streams) as gateway:
+        assert steps(await gateway.wait_for("analog", 100)) == {1}
+        assert steps(await gateway.wait_for("3d", 10)) == {4}
+        assert len(simulator.connections) == 2
+        assert gateway.status.rate == "FrequencyDivisor:4"
 
 
-async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
-    async with Simulator(SyntheticScene(rate_hz=200, analog_rate_hz=200)) as simulator:
-        simulator.stop_measurement()
-        async with run_gateway(simulator.port) as lab:
-            await lab.wait_until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
-            assert not lab.output.streaming
-            simulator.start_measurement()
-            await lab.wait_until(lambda: lab.status.state is StreamState.STREAMING)
-            await lab.wait_until(lambda: lab.output.streaming == {"lab"})
-            simulator.stop_measurement()
-            await lab.wait_until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
-            await lab.wait_until(lambda: not lab.output.streaming)
-            assert lab.status.session == 1
-    for change in ("no measurement → streaming", "streaming → no measurement"):
-        assert sum(change in text for text in caplog.messages) == 1
+async def test_every_component_arrives_at_its_own_rate() -> None:
+    async with OneClientServer("serve") as server, run_gateway(server.port) as lab:
+        analog = await lab.wait_for("analog", 400)
+        markers = await lab.wait_for("3d", 20)
+        await lab.wait_for("event")
+        assert components(lab) == TWO
+        assert (steps(markers), steps(analog), steps(lab.messages("force"))) == ({1}, {1}, {1})
+        assert [message.sequence for message in analog] == list(range(len(analog)))
+        assert [status.limitations for status in lab.source.statuses] == [[], []]
+        assert [command for _, command in server.commands if command.startswith("StreamFrames")] == [
+            "StreamFrames AllFrames 3D 6D Events",
+            "StreamFrames AllFrames Analog Force",
+        ]
+        assert ({each.session for each in markers}, {each.session for each in analog}) == ({1}, {2})
+        assert server.num_opened == 2
+
+
+class _Nameless(_Filter):
+    def answer(self, packet: Packet) -> list[bytes]:
+        text = decode_text(packet.body)
+        if text.startswith("StreamFrames") and text.rstrip("\0\n").endswith(("3D", "6D", "Events", "Force")):
+            return [b"\0\0\0\x0e\0\0\0\0Error-"]
+        return super().answer(packet)
+
+
+async def test_a_server_that_knows_no_component_names_sends_everything_on_one_connection() -> None:
+    server = OneClientServer("serve")
+    server._new_filter = lambda each: _Nameless(each, server)
+    async with server, run_gateway(server.port) as lab:
+        analog = await lab.wait_for("analog", 100)
+        assert steps(analog) == {10}
+        assert components(lab) == [EVERYTHING]
+        assert f"{ONE_CONNECTION}the server does not accept the names of components" in lab.status.limitations
+        assert server.num_opened == 1
+
+
+async def new_steps(lab: MemoryGateway, component: str, count: int) -> set[int]:
+    """Return the steps between ``count`` messages to come, after the first 20 of them."""
+    first = len(lab.messages(component)) + 20
+    return steps((await lab.wait_for(component, first + count))[first:])
+
+
+def assert_continuous(lab: MemoryGateway) -> None:
+    """Check that no message is missing, and that no session comes back."""
+    for component in ("3d", "6d", "analog", "force"):
+        messages = lab.messages(component)
+        assert [each.sequence for each in messages] == list(range(len(messages)))
+        assert all(after.session >= before.session for before, after in pairwise(messages))
+
+
+@pytest.mark.parametrize(
+    ("on_second", "reason"),
+    [
+        ("refuse", "the server accepts one connection only (connection refused by 127.0.0.1:"),
+        ("close", "the server accepts one connection only (the connection to 127.0.0.1:"),
+        ("close_first", "the server ends the first connection when there is a second one"),
+        ("crash", "the server ends the first connection when there is a second one"),
+    ],
+)
+async def test_a_server_for_one_client_sends_everything_on_one_connection(
+    on_second: str, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with OneClientServer(on_second) as server, run_gateway(server.port) as lab:
+        await lab.wait_until(lambda: components(lab) == [EVERYTHING] and lab.status.limitations)
+        [limitation] = lab.status.limitations
+        assert limitation.startswith(ONE_CONNECTION + reason)
+        logged = [text for text in caplog.messages if "instead of 2000 Hz" in text]
+        assert logged == [f"lab ({EVERYTHING}): {limitation}"]
+        await lab.wait_until(lambda: lab.status.state is StreamState.STREAMING and lab.status.limitations)
+        opened = server.num_opened
+        assert (await new_steps(lab, "3d", 60), await new_steps(lab, "analog", 60)) == ({1}, {10})
+        assert_continuous(lab)
+        assert lab.status.limitations == [limitation]
+        assert (server.num_opened, server.num_clients) == (opened, 1)
+        if reason.startswith("the server accepts"):  # and the first connection has streamed all the time
+            requests = [number for number, command in server.commands if command.startswith("StreamFrames")]
+            assert requests == [1, 1]

@@ -8,58 +8,38 @@ import sys
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.gateway import Gateway
-from gateway.messages.decode import decode
-from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
-from gateway.simulator.simulator import Simulator
-from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import make_settings
+from tests.configurations import local_settings, local_source
 from tests.needs import need
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
 from tests.tool_server import ToolServer
-from tests.vrpn_client import VrpnClient
 from tests.waiting import wait_until_async
 
 Poses = dict[str, list[float]]
 
 
-class Served(NamedTuple):
-    """A running gateway with a VRPN server."""
-
-    gateway: Gateway
-    port: int
-    memory: MemoryOutput
-
-
 @contextlib.asynccontextmanager
-async def served(servers: Mapping[str, int], *, port: int = 0, **settings: Any) -> AsyncIterator[Served]:
-    """Run a gateway for these servers, by the source's name. ``settings`` are those of each source."""
+async def served(servers: Mapping[str, int], *, port: int = 0, **settings: Any) -> AsyncIterator[int]:
+    """Run a gateway for these servers, by the source's name; yield the port of its VRPN server.
+
+    ``settings`` are those of each source.
+    """
     port = port or free_port()
-    common: dict[str, Any] = {
-        "host": "127.0.0.1",
-        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
-        "parameters_interval_s": 0.1,
-    }
-    sources = tuple(
-        SourceSettings(**(common | {"name": name, "port": server_port} | settings))
+    sources = (
+        local_source(server_port, name, parameters_interval_s=0.1, **settings)
         for name, server_port in servers.items()
     )
-    memory = MemoryOutput()
     output = VrpnOutput(VrpnSettings(enabled=True, port=port))
-    gateway = Gateway(
-        make_settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output, memory]
-    )
-    async with running_gateway(gateway):
+    async with running_gateway(Gateway(local_settings(*sources), [output])):
         await wait_until_async(lambda: output.health().connected)
-        yield Served(gateway, port, memory)
+        yield port
 
 
 HAS_PROTOCOLS = Path("/etc/protocols").exists()
@@ -110,8 +90,8 @@ async def test_libvrpn_gets_names_metres_and_the_scalar_last_in_the_frame_of_the
     transform = {"up": "y", "translation_m": [10.0, 0.0, 0.0]}
     async with (
         server,
-        served({"lab": server.port}, transform=transform) as gateway,
-        libvrpn(f"{scheme}127.0.0.1:{gateway.port}") as client,
+        served({"lab": server.port}, transform=transform) as port,
+        libvrpn(f"{scheme}127.0.0.1:{port}") as client,
     ):
         await client.wait_for(lambda poses: len(poses) == 2)
     half = math.sqrt(0.5)
@@ -126,8 +106,8 @@ async def test_libvrpn_follows_tools_that_return_change_names_and_are_added() ->
     server.tools[1] = None
     async with (
         server,
-        served({"lab": server.port}) as gateway,
-        libvrpn(f"127.0.0.1:{gateway.port}") as client,
+        served({"lab": server.port}) as port,
+        libvrpn(f"127.0.0.1:{port}") as client,
     ):
         await client.wait_for(lambda poses: "wand" in poses)
         num_lines = client.num_lines
@@ -159,33 +139,3 @@ async def test_libvrpn_connects_again_when_the_gateway_returns() -> None:
                     await each.wait_for(
                         lambda poses: poses.keys() >= {"lab/wand", "stage/wand", "stage/foot"}
                     )
-
-
-async def test_every_visible_pose_is_sent_with_its_capture_time() -> None:
-    scene = SyntheticScene(markers=24, tools=4, analog=8, plates=0, rate_hz=100, analog_rate_hz=500)
-    async with Simulator(scene) as simulator, served({"lab": simulator.port}) as gateway:
-        async with await VrpnClient.connect(gateway.port) as client:
-            await wait_until_async(lambda: len(client.poses) > 150)
-            frames = {
-                message.capture_utime: message.tools
-                for topic, data in list(gateway.memory.messages)
-                if topic.path == ("6d",) and (message := decode(data))
-            }
-        first, last = client.poses[0].utime, client.poses[-1].utime
-        expected = [
-            (f"Tool_{number}", utime)
-            for utime, tools in frames.items()
-            if first < utime < last
-            for number, tool in enumerate(tools, start=1)
-            if not math.isnan(tool.x)
-        ]
-        received = {(pose.name, pose.utime): pose for pose in client.poses if first < pose.utime < last}
-        assert list(received) == expected
-        assert len(expected) > 80
-        for (name, utime), pose in received.items():
-            tool = frames[utime][int(name[-1]) - 1]
-            assert pose.values == pytest.approx(
-                (tool.x / 1e3, tool.y / 1e3, tool.z / 1e3, tool.qx, tool.qy, tool.qz, tool.q0), rel=1e-9
-            )
-            assert pose.sensor == 0
-        assert not any(status.losses for _, status in gateway.gateway.sources[0].fan_out.outputs)

@@ -1,6 +1,5 @@
 """The router and client files in config/, with certificates made by the recipe in docs/how-to/secure.md."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -10,7 +9,6 @@ import zenoh
 import zenoh.ext
 
 from gateway.config.environment import variable_name
-from tests.configurations import load
 from tests.networks import free_port
 from tests.secure_zenoh import (
     GUIDE,
@@ -20,7 +18,6 @@ from tests.secure_zenoh import (
     make_certificates,
     open_session,
     run_gateway_with_simulator,
-    run_secure_router,
     shipped_file,
 )
 from tests.waiting import wait_until
@@ -59,44 +56,24 @@ def alive_tokens(session: zenoh.Session) -> list[str]:
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
-@pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL))
-def test_the_configurations_of_the_guide_are_valid(block: str, tmp_path: Path) -> None:
-    (tmp_path / "zenoh-mtls.json5").write_text(shipped_file("zenoh-mtls.json5"), encoding="utf-8")
-    (tmp_path / "gateway.yaml").write_text(block, encoding="utf-8")
-    environ = {PASSWORD: "geheim7"} if "usrpwd" in block else {}
-    assert load(tmp_path / "gateway.yaml", environ).sources
-    assert f"{PASSWORD}=" in GUIDE
-
-
-@pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_certificates(tmp_path_factory.mktemp("ours") / "tls")
-
-
 @pytest.fixture(scope="module")
 def strange_certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates with the same names, from another authority."""
     return make_certificates(tmp_path_factory.mktemp("strange") / "tls")
 
 
-@pytest.fixture(scope="module")
-def router(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iterator[SecureRouter]:
-    """A router with access control, and a gateway that streams through it."""
-    with run_secure_router(tmp_path_factory.mktemp("lab"), certificates) as secure_router:
-        with open_session(secure_router.client("viewer")) as viewer:
-            Samples(viewer, "mocap/lab/3d").wait_for_more()
-        yield secure_router
-
-
 @pytest.fixture
-def viewer(router: SecureRouter) -> Iterator[zenoh.Session]:
-    with open_session(router.client("viewer")) as opened:
+def viewer(secured: SecureRouter) -> Iterator[zenoh.Session]:
+    with open_session(secured.client("viewer")) as opened:
         yield opened
 
 
 @pytest.fixture
-def viewers(router: SecureRouter) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
-    with open_session(router.client("viewer")) as first, open_session(router.client("viewer")) as second:
+def viewers(secured: SecureRouter) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    with (
+        open_session(secured.client("viewer")) as first,
+        open_session(secured.client("viewer")) as second,
+    ):
         yield first, second
 
 
@@ -113,11 +90,11 @@ def test_a_viewer_receives_data_and_answers_but_controls_nothing(viewer: zenoh.S
         assert list(viewer.get(f"mocap/{key}", timeout=5)) == [], key
 
 
-def test_a_late_viewer_receives_the_parameters(router: SecureRouter, viewer: zenoh.Session) -> None:
+def test_a_late_viewer_receives_the_parameters(secured: SecureRouter, viewer: zenoh.Session) -> None:
     key = "mocap/other/parameters"
     late: list[bytes] = []
     # Publish parameters as the gateway does, but only once.
-    with open_session(router.client("gateway")) as second_gateway:
+    with open_session(secured.client("gateway")) as second_gateway:
         publisher = zenoh.ext.declare_advanced_publisher(
             second_gateway, key, cache=zenoh.ext.CacheConfig(max_samples=1), publisher_detection=True
         )
@@ -132,7 +109,7 @@ def test_a_late_viewer_receives_the_parameters(router: SecureRouter, viewer: zen
 
 
 def test_a_viewer_cannot_publish_or_answer_as_a_gateway_can(
-    router: SecureRouter, viewers: tuple[zenoh.Session, zenoh.Session]
+    secured: SecureRouter, viewers: tuple[zenoh.Session, zenoh.Session]
 ) -> None:
     def reply_with_fake(received: zenoh.Query) -> None:
         with received:
@@ -155,7 +132,7 @@ def test_a_viewer_cannot_publish_or_answer_as_a_gateway_can(
     assert query(other, "mocap/other/status") == []
     assert alive_tokens(other) == ["mocap/lab/alive"]
     token.undeclare()
-    with open_session(router.client("gateway")) as second_gateway:
+    with open_session(secured.client("gateway")) as second_gateway:
         of_gateways = Samples(second_gateway, "mocap/**")
         second_gateway.put("mocap/lab/3d", FAKE)
         wait_until(lambda: FAKE in received.payloads)
@@ -176,20 +153,20 @@ STRANGERS: Final = {
 }
 
 
-def stranger_file(router: SecureRouter, certificates: Path, who: str, *changes: Change) -> str:
+def stranger_file(secured: SecureRouter, certificates: Path, who: str, *changes: Change) -> str:
     """Return the configuration of a stranger that knows the address and the authority of the router."""
     own_changes = tuple((before.format(folder=certificates), after) for before, after in STRANGERS[who])
-    authority = (f"{certificates}/ca.crt", f"{router.certificates}/ca.crt")
-    return client_file(router.port, certificates, "viewer", authority, *own_changes, *changes)
+    authority = (f"{certificates}/ca.crt", f"{secured.certificates}/ca.crt")
+    return client_file(secured.port, certificates, "viewer", authority, *own_changes, *changes)
 
 
 def test_strangers_cannot_connect_and_clients_reject_a_strange_router(
-    router: SecureRouter, strange_certificates: Path
+    secured: SecureRouter, strange_certificates: Path
 ) -> None:
     for text in (
-        *(stranger_file(router, strange_certificates, who) for who in STRANGERS),
-        router.client("viewer", (f"{router.certificates}/ca.crt", f"{strange_certificates}/ca.crt")),
-        router.client("viewer", (f"tls/127.0.0.1:{router.port}", f"tls/127.0.0.2:{router.port}")),
+        *(stranger_file(secured, strange_certificates, who) for who in STRANGERS),
+        secured.client("viewer", (f"{secured.certificates}/ca.crt", f"{strange_certificates}/ca.crt")),
+        secured.client("viewer", (f"tls/127.0.0.1:{secured.port}", f"tls/127.0.0.2:{secured.port}")),
     ):
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             zenoh.open(zenoh.Config.from_json5(text))
@@ -197,7 +174,7 @@ def test_strangers_cannot_connect_and_clients_reject_a_strange_router(
 
 @pytest.mark.parametrize("who", [*STRANGERS, "a valid certificate with an unknown name"])
 def test_a_stranger_receives_no_data_or_answers_and_cannot_publish(
-    router: SecureRouter, viewer: zenoh.Session, strange_certificates: Path, who: str
+    secured: SecureRouter, viewer: zenoh.Session, strange_certificates: Path, who: str
 ) -> None:
     # The session of a peer opens without a link and keeps trying to connect.
     peer: tuple[Change, ...] = (
@@ -205,7 +182,7 @@ def test_a_stranger_receives_no_data_or_answers_and_cannot_publish(
         ("period_init_ms: 200, period_max_ms: 500", "period_init_ms: 20, period_max_ms: 20"),
     )
     is_known = who not in STRANGERS
-    text = router.client("router") if is_known else stranger_file(router, strange_certificates, who, *peer)
+    text = secured.client("router") if is_known else stranger_file(secured, strange_certificates, who, *peer)
     viewer_samples = Samples(viewer, "mocap/**")
     with open_session(text) as stranger:
         stranger_samples = Samples(stranger, "**")
@@ -238,6 +215,7 @@ def test_the_plain_router_serves_everybody(tmp_path: Path) -> None:
 
 
 def test_a_password_from_the_environment_is_used_and_never_shown(tmp_path: Path) -> None:
+    assert f"{PASSWORD}=" in GUIDE
     port = free_port()
     (tmp_path / "users").write_text("gateway:geheim7\n")
     router = (

@@ -9,8 +9,7 @@ import uvloop
 
 from tests.fresh_clones import ROOT, clone_into, files_in
 from tests.networks import free_endpoint
-from tests.systemd.machine import CLONE, DROP_INS, Machine, Service
-from tests.systemd.page import commands
+from tests.systemd.machine import CLONE, DROP_INS, Machine, Service, commands
 
 QUICKLY = "export CC=/run/repository/tests/quick-cc\n" if shutil.which("cc") else ""
 

@@ -1,7 +1,11 @@
-"""A machine for installation tests: a systemd in its own namespaces, with the network of the test run."""
+"""A machine for installation tests: a systemd in its own namespaces, with the network of the test run.
+
+What is typed on it is in docs/how-to/service.md.
+"""
 
 import asyncio
 import json
+import re
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +22,21 @@ DROP_INS: Final = f"/etc/systemd/system/{UNIT}.d"
 CLONE: Final = "/tmp/clone"
 _REPOSITORY: Final = Path("/run/repository")
 _PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+_PAGE: Final = (ROOT / "docs/how-to/service.md").read_text()
+_AS_ROOT: Final = 'sudo() { "$@"; }; set -e\n'
+
+
+def commands(heading: str, number: int = 0) -> str:
+    """Return the commands of a block below a heading, for a shell that runs as root."""
+    [section] = re.findall(rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", _PAGE, re.MULTILINE | re.DOTALL)
+    blocks: list[str] = re.findall(r"^```sh\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
+    return _AS_ROOT + blocks[number]
+
+
+def exposure() -> tuple[str, str]:
+    """Return the exposure level that the page claims, and the version of systemd that it is for."""
+    [(figure, version)] = re.findall(r"gives an exposure of (\d\.\d) with systemd (\d+) ", _PAGE)
+    return figure, version
 
 
 class Outcome(NamedTuple):

@@ -7,8 +7,7 @@ import pytest
 
 from tests.fresh_clones import skip_if_plain
 from tests.networks import free_port, zenoh_keys
-from tests.systemd.machine import CONFIG, UNIT, Machine, Service
-from tests.systemd.page import commands, exposure
+from tests.systemd.machine import CONFIG, UNIT, Machine, Service, commands, exposure
 
 pytestmark = [
     pytest.mark.systemd,

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import FloatRect, Page, WebSocket
+from playwright.sync_api import FloatRect, Page
 
 from gateway.takes.component_rows import Array
 
@@ -81,9 +81,6 @@ class Picture:
     def __init__(self, page: Page, address: str) -> None:
         self.page = page
         page.set_default_timeout(TIMEOUT_MS)
-        self.num_received = 0
-        """How many packages of changes the page has received."""
-        page.on("websocket", self._count)
         page.goto(address)
         page.wait_for_function("window.__viserMutable?.camera")
 
@@ -93,17 +90,6 @@ class Picture:
             f"argument => ({_IS_FITTED})(({_ON_SCREEN})(argument))",
             arg=[node, [*positions]],
         )
-
-    def _count(self, connection: WebSocket) -> None:
-        def receive(_data: str | bytes) -> None:
-            self.num_received += 1
-
-        connection.on("framereceived", receive)
-
-    def wait_for_updates(self, count: int) -> None:
-        """Wait until the page has received ``count`` further packages of changes."""
-        goal = self.num_received + count
-        self.wait_until(lambda: self.num_received >= goal)
 
     def wait_until(self, condition: Callable[[], object]) -> None:
         """Wait until a condition holds, while the page goes on."""

@@ -36,8 +36,6 @@ class PublishedScene:
     def __init__(self, session: zenoh.Session, endpoint: str, name: str = "lab") -> None:
         self.markers: list[Position] = []
         """In mm."""
-        self.step_mm = 0.0
-        """How far all markers move from frame to frame, back and forth, along each axis."""
         self.is_blinking = False
         """Whether the last marker is missing in all frames but every tenth."""
         self.is_sending = True
@@ -87,7 +85,7 @@ class PublishedScene:
 
     def _frame(self, number: int) -> bytes:
         items = np.zeros(len(self.markers), ITEM_DTYPES[ComponentType.MARKERS])
-        positions = np.reshape(self.markers, (-1, 3)) + self.step_mm * (number % 2)
+        positions = np.array(self.markers, float).reshape(-1, 3)
         if self.is_blinking and number % 10:
             positions[-1] = MISSING
         items["x"], items["y"], items["z"] = positions.T

@@ -36,7 +36,6 @@ class Shown:
     def __init__(self, server: ViewServer) -> None:
         self.lab = Lab()
         self.address = f"http://127.0.0.1:{server.get_port()}"
-        self.is_sending = True
         self.value = 1.0
         """Of the second analog channel."""
         self._panel = Panel(server, server.gui.add_tab_group(), self.lab.live)
@@ -73,10 +72,9 @@ class Shown:
             if self._ends[1].wait(0.02):
                 return
             if number % 50 == 0:
-                self.lab.send_status(stream(state="streaming" if self.is_sending else "no measurement"))
-            if self.is_sending:
-                self.lab.send_markers(True, number % 2 == 0)
-                self.lab.send(ComponentType.ANALOG, [0.5, self.value])
+                self.lab.send_status(stream())
+            self.lab.send_markers(True, number % 2 == 0)
+            self.lab.send(ComponentType.ANALOG, [0.5, self.value])
 
 
 @pytest.fixture
@@ -119,17 +117,6 @@ def test_labels_are_text_wherever_they_are_shown(page: Page) -> None:
     first_plot = page.locator(".u-title").first
     expect(first_plot).to_have_text(f"lab analog 1: {HOSTILE[0]} (mV)", timeout=TIMEOUT_MS)
     assert not page.locator("img[src=x], a[href*='192.0.2.1']").count()
-
-
-def test_a_stop_is_said_with_its_reason_until_data_come_again(page: Page, shown: Shown) -> None:
-    banner, stopped = page.locator(".gateway").first, page.locator(".gateway .stopped")
-    expect(banner).to_contain_text("● live lab", timeout=TIMEOUT_MS)
-    shown.is_sending = False
-    expect(stopped).to_contain_text("lab: no data for", timeout=TIMEOUT_MS)
-    expect(stopped).to_contain_text("no measurement running", timeout=TIMEOUT_MS)
-    shown.is_sending = True
-    expect(banner).to_contain_text("● live lab", timeout=TIMEOUT_MS)
-    expect(stopped).to_have_count(0, timeout=TIMEOUT_MS)
 
 
 def test_the_page_says_that_it_gets_nothing_any_more(page: Page, shown: Shown) -> None:

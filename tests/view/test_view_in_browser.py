@@ -134,18 +134,6 @@ def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene,
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
 
 
-def test_several_browsers_see_the_same_until_they_go_away(
-    scene: PublishedScene, picture: Picture, view: ViewProcess, new_page: NewPage
-) -> None:
-    others = [Picture(new_page(viewport={"width": 400, "height": 200}), view.address) for _ in range(2)]
-    for other in others:
-        other.wait_for_points(MARKERS, [LEFT, RIGHT, TOP])
-    others.pop().page.close()
-    scene.markers = [LEFT, FREE]
-    for each in (picture, *others):
-        each.wait_for_points(MARKERS, [LEFT, FREE])
-
-
 def test_a_source_that_is_lost_and_comes_back(tmp_path: Path, new_page: NewPage) -> None:
     port = free_port()
     with ExitStack() as stack:

@@ -49,11 +49,6 @@ def test_large_messages_are_charged_per_datagram() -> None:
     [
         ("zenoh", ZenohSettings(), True),
         ("zenoh", ZenohSettings(config={"scouting": {"multicast": {"enabled": False}}}), True),  # listens
-        ("zenoh", ZenohSettings(config=zenoh_keys("peer")), False),
-        ("zenoh", ZenohSettings(config=zenoh_keys("peer", listen="tcp/127.0.0.1:7447")), False),
-        ("zenoh", ZenohSettings(config=zenoh_keys("peer", listen="tcp/[::]:7447")), True),
-        ("zenoh", ZenohSettings(config=zenoh_keys("client", connect="tls/localhost:7447")), False),
-        ("zenoh", ZenohSettings(config=zenoh_keys("client", connect="tcp/192.0.2.10:7447")), True),
         ("lcm", LcmSettings(url=f"{GROUP}?ttl=0"), False),
         ("lcm", LcmSettings(url=f"{GROUP}?ttl=1"), True),
         ("lcm", LcmSettings(url=GROUP), False),

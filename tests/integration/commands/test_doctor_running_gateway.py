@@ -12,7 +12,6 @@ from gateway.config.settings import MetricsSettings
 from gateway.doctor.all_checks import run_checks
 from gateway.findings import Finding, Result
 from gateway.gateway import Gateway
-from gateway.monitoring.server import MonitoringServer
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.stream.state import StreamState
@@ -21,6 +20,7 @@ from tests.command_process import run
 from tests.configurations import make_settings
 from tests.findings import MARKERS_XML, Findings, lab, parameters, replying, run_doctor, streaming
 from tests.networks import free_port
+from tests.running_gateway import monitored_gateway
 from tests.servers import ScriptedServer, markers_frame, packet
 from tests.waiting import wait_until_async
 
@@ -49,19 +49,11 @@ async def running_gateway(
     port: int, condition: Callable[[Any], object] = is_streaming
 ) -> AsyncIterator[MetricsSettings]:
     """Run a gateway for a server; yield where its health page is, when the state of its stream is so."""
-    metrics, stop = MetricsSettings(port=free_port()), asyncio.Event()
-    gateway = Gateway(settings(metrics, port))
-    monitoring = MonitoringServer(metrics, gateway)
-    task = asyncio.create_task(gateway.run(stop))
-    await monitoring.start()
-    try:
+    metrics = MetricsSettings(port=free_port())
+    async with monitored_gateway(Gateway(settings(metrics, port))) as gateway:
         await gateway.opened.wait()
         await wait_until_async(lambda: condition(gateway.sources[0].statuses[0]))
         yield metrics
-    finally:
-        await monitoring.close()
-        stop.set()
-        await task
 
 
 async def test_the_state_of_each_stream_and_output_is_read_from_the_running_gateway() -> None:

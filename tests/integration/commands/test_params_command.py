@@ -17,9 +17,10 @@ from gateway.outputs.lcm import parameters as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
+from tests.command_in_process import run_in_process
 from tests.command_process import Completed, run
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
-from tests.queried_gateway import ParameterServer, ServerOfSections, run_gateway, wait_until_cached
+from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
 from tests.servers import ScriptedServer
 from tests.spec_parameters import spec_xml
 from tests.waiting import wait_until_async
@@ -97,20 +98,6 @@ async def test_parameters_are_printed_as_lines_as_json_and_fresh_as_xml() -> Non
             requests = at.server.count("SendParameters")
 
 
-async def test_the_malformed_xml_of_the_specification_is_printed_unchanged() -> None:
-    async with lab(ServerOfSections()) as at:
-        for section in ("force", "events"):
-            xml = spec_xml(section).decode().rstrip() + "\n"
-            assert await at.params(section, "--xml") == [(0, xml, "")] * 2
-
-
-async def test_no_gateway_is_status_3() -> None:
-    for done in await Lab(ParameterServer(), free_endpoint(), lcm_url()).run("params"):
-        assert (done.status, done.stdout) == (3, "")
-        assert "gateway" in done.stderr
-        assert done.stderr.count("\n") == 1
-
-
 @pytest.mark.parametrize("is_late", [False, True], ids=["no gateway", "an answer that comes too late"])
 async def test_a_router_without_a_gateway_is_status_3(is_late: bool) -> None:
     """Also with a busy router: the query ends with Zenoh's own error."""
@@ -173,14 +160,13 @@ async def test_fresh_parameters_that_do_not_come(
     ("arguments", "text"),
     [
         (["4d"], "unknown section '4d'; known sections: general, 3d, 6d, analog, force, events"),
-        (["--zenoh", "--lcm"], "--zenoh or --lcm"),
         (["--json", "--xml"], "--json or --xml"),
         (["--timeout", "0"], "--timeout"),
     ],
 )
-async def test_a_wrong_command_line_is_status_2(arguments: list[str], text: str) -> None:
-    done = await run("params", *arguments)
-    assert (done.status, done.stdout) == (2, "")
+def test_a_wrong_command_line_is_status_2(arguments: list[str], text: str) -> None:
+    done = run_in_process("params", *arguments)
+    assert (done.returncode, done.stdout) == (2, "")
     assert text in " ".join(done.stderr.replace("│", " ").split())
 
 

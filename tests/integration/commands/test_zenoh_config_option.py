@@ -2,36 +2,22 @@
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.command_process import run_command
+from tests.configurations import write_config
 from tests.networks import free_port
-from tests.secure_zenoh import SecureRouter, make_certificates, run_gateway_with_simulator, run_secure_router
+from tests.secure_zenoh import SecureRouter, run_gateway_with_simulator
 from tests.waiting import wait_until
 
 
-@pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_certificates(tmp_path_factory.mktemp("ours") / "tls")
-
-
-@pytest.fixture(scope="module")
-def router(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iterator[SecureRouter]:
-    """A router with access control, and a gateway that streams through it."""
-    folder = tmp_path_factory.mktemp("lab")
-    with run_secure_router(folder, certificates) as secure_router:
-        wait_until(lambda: "the session is open" in (folder / "gateway.log").read_text())
-        yield secure_router
-
-
-def test_connect_replaces_the_address_in_the_file(router: SecureRouter, tmp_path: Path) -> None:
+def test_connect_replaces_the_address_in_the_file(secured: SecureRouter, tmp_path: Path) -> None:
     """With a viewer's certificate, every command works."""
     file = tmp_path / "viewer.json5"
-    file.write_text(router.client("viewer", (f"tls/127.0.0.1:{router.port}", "tls/127.0.0.1:9")))
-    config, connect = ("--zenoh-config", str(file)), ("--connect", f"tls/127.0.0.1:{router.port}")
+    file.write_text(secured.client("viewer", (f"tls/127.0.0.1:{secured.port}", "tls/127.0.0.1:9")))
+    config, connect = ("--zenoh-config", str(file)), ("--connect", f"tls/127.0.0.1:{secured.port}")
     assert run_command("params", *config, "--timeout", "2").status == 3
     params = run_command("params", "3d", *config, *connect, "--json")
     assert (params.status, params.stderr) == (0, "")
@@ -52,8 +38,7 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
         assert result.status == 2
         assert f"Zenoh does not accept the file {file}" in result.stderr
         assert "Traceback" not in result.stderr
-    config = tmp_path / "gateway.yaml"
-    config.write_text("sources: [{name: lab, host: 127.0.0.1, port: 9}]\nmetrics: {enabled: false}\n")
+    config = write_config(tmp_path / "gateway.yaml", 9, zenoh={}, lcm={})
     link = doctor(config, "--zenoh-config", str(file))["link"]
     assert link["found"].startswith(f"Zenoh does not accept the file {file}")
     assert (link["result"], link["remedy"]) == ("red", "Correct this file.")
@@ -75,16 +60,12 @@ def doctor(config: Path, *arguments: str) -> dict[str, dict[str, str]]:
 
 
 def test_the_doctor_works_with_the_gateways_and_with_a_viewers_certificate(
-    router: SecureRouter, tmp_path: Path
+    secured: SecureRouter, tmp_path: Path
 ) -> None:
     """The gateway's certificate may publish only: a viewer's is needed to see the gateway."""
-    (tmp_path / "gateway.json5").write_text(router.client("gateway"), encoding="utf-8")
-    (tmp_path / "viewer.json5").write_text(router.client("viewer"), encoding="utf-8")
-    config = tmp_path / "gateway.yaml"
-    config.write_text(
-        "sources: [{name: lab, host: 127.0.0.1, port: 9}]\n"
-        "zenoh: {config: gateway.json5}\nlcm: {enabled: false}\nmetrics: {enabled: false}\n"
-    )
+    (tmp_path / "gateway.json5").write_text(secured.client("gateway"), encoding="utf-8")
+    (tmp_path / "viewer.json5").write_text(secured.client("viewer"), encoding="utf-8")
+    config = write_config(tmp_path / "gateway.yaml", 9, zenoh={"config": "gateway.json5"})
     findings = doctor(config)
     assert findings["link"]["found"] == "the session is open and connected to a router"
     assert findings["gateway"]["result"] == "not tested"

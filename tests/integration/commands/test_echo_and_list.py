@@ -1,21 +1,25 @@
-"""``rtc3d-gateway echo`` as a program of its own: what does not exist, silence, single tools and rates."""
+"""``echo`` and ``list`` as programs, and what all commands say if there is no gateway or no such source."""
 
 import asyncio
+import contextlib
 import json
+import os
 import subprocess
 import sys
 from collections.abc import AsyncIterator
 
 import pytest
 import pytest_asyncio
+import zenoh
 
 from gateway.config.settings import StreamSettings
+from gateway.outputs.lcm.connection import open_lcm
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.command_process import run
-from tests.integration.commands.test_params_command import Lab
+from tests.integration.commands.test_params_command import SIDES, Lab, lab_without_server
 from tests.networks import free_endpoint, lcm_url, open_zenoh
 from tests.pseudo_terminals import in_terminal
 from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
@@ -46,11 +50,42 @@ async def lab() -> AsyncIterator[Lab]:
         yield place
 
 
+# Without a gateway or a source ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", SIDES)
+async def test_without_a_gateway_all_commands_say_the_same(side: str) -> None:
+    """Scripts see a status and one line with what to check; only echo waits for a gateway."""
+    place = Lab(ParameterServer(), free_endpoint(), lcm_url())
+    commands = ("list", "params", "top", "top --once", "top --once --json", "echo --seconds 8", "list --json")
+    router = await asyncio.to_thread(open_zenoh, "router", listen=place.endpoint)
+    with contextlib.closing(router):
+        ended = await asyncio.gather(*(run(*each.split(), *place.options(side)) for each in commands))
+    assert [done.status for done in ended] == [3, 3, 3, 3, 3, 0, 3]
+    assert {done.stdout for done in ended[:-1]} == {""}
+    assert json.loads(ended[-1].stdout) == {"sources": [], "num_left_out": 0}
+    [sentence] = {done.stderr for done in ended}
+    assert sentence.startswith("no gateway found on ")
+    assert sentence.count("\n") == 1
+
+
+async def test_a_source_that_nobody_serves_is_named_with_those_that_exist(lab: Lab) -> None:
+    """A typing error is told apart from a gateway that does not run."""
+    commands = [(side, name) for side in SIDES for name in ("list", "echo")]
+    commands += [("zenoh", "top --once"), ("zenoh", "params --timeout 3")]
+    ended = await asyncio.gather(
+        *(run(*name.split(), *lab.options(side), "--source", "hall") for side, name in commands)
+    )
+    assert set(ended) == {(3, "", "no gateway serves source 'hall'; sources found: lab\n")}
+
+
+# echo ----------------------------------------------------------------------------------------
+
+
 async def test_what_does_not_exist_is_an_error_with_what_exists(lab: Lab) -> None:
     """A typing error in an option must not look like silence; the message helps to correct it."""
     no_force = "no force from lab; accepted for --component: 3d, 6d, event, status, clock or parameters\n"
     cases = {
-        ("--source", "hall"): "no gateway serves source 'hall'; sources found: lab\n",
         ("--component", "force"): no_force,
         ("--component", "force", "--hz"): no_force,
         ("--component", "6d/Nothing"): "no gateway has a tool 'Nothing'; tools found: Tool 1, Tool 2\n",
@@ -68,8 +103,7 @@ async def test_silence_of_a_source_is_said_once_with_its_state(lab: Lab) -> None
         assert done.stderr.count("\n") == 1
 
 
-async def test_without_a_gateway_the_sentence_of_params_is_said_and_later_messages_are_printed() -> None:
-    """Both commands describe the same state alike, and echo goes on."""
+async def test_echo_prints_the_messages_of_a_gateway_that_starts_later() -> None:
     endpoint = free_endpoint()
     router = await asyncio.to_thread(open_zenoh, "router", listen=endpoint)
     process = await asyncio.create_subprocess_exec(
@@ -80,25 +114,13 @@ async def test_without_a_gateway_the_sentence_of_params_is_said_and_later_messag
     )
     try:
         assert process.stderr is not None
-        said = await asyncio.wait_for(process.stderr.readline(), 60)
-        params = await run("params", "--connect", endpoint, "--timeout", "0.5")
-        assert said.decode() == params.stderr
+        assert (await asyncio.wait_for(process.stderr.readline(), 60)).startswith(b"no gateway found")
         async with run_gateway(1, router=endpoint):
             stdout, stderr = await asyncio.wait_for(process.communicate(), 60)
     finally:
         router.close()
     assert (process.returncode, stderr) == (0, b"")
     assert stdout.count(b"mocap/lab/status") == 2
-
-
-async def test_on_lcm_the_sentence_is_that_of_params_too() -> None:
-    """On LCM only silence shows that there is no gateway."""
-    url = lcm_url()
-    echo, params = await asyncio.gather(
-        run("echo", "--lcm", "--url", url, "--seconds", "8"), run("params", "--lcm", "--url", url)
-    )
-    assert (echo.status, echo.stdout) == (0, "")
-    assert echo.stderr == params.stderr != ""
 
 
 async def test_the_poses_of_one_tool_are_printed(lab: Lab) -> None:
@@ -148,3 +170,66 @@ async def test_fewer_messages_than_count_are_status_1_with_hz_too(lab: Lab) -> N
     done = await run("echo", "--hz", *arguments)
     assert done.status == 1
     assert "of 1000 messages arrived within 1 s" in done.stderr
+
+
+# list ----------------------------------------------------------------------------------------
+
+
+async def test_a_source_is_listed_with_its_server_and_state(lab: Lab) -> None:
+    """Scripts read columns or JSON; both name the source, its server and its state."""
+    listed, as_json = await asyncio.gather(lab.run("list"), lab.run("list", "--json"))
+    for side, done, objects in zip(SIDES, listed, as_json, strict=True):
+        assert (done.status, done.stderr, done.stdout.count("\n")) == (0, "", 1)
+        name, state, components, server, host, version = done.stdout.rstrip("\n").split("\t")
+        assert (name, components, host) == ("lab", "3d 6d event", os.uname().nodename)
+        assert server.partition(":")[0] == "127.0.0.1"
+        assert state.startswith("streaming ")
+        assert version
+        [source] = json.loads(objects.stdout)["sources"]
+        assert (source["source"], source["server"], source["problem"]) == ("lab", server, "")
+        assert bool(source["gateway"]) is (side == "zenoh")
+
+
+async def test_a_source_without_its_server_has_the_words_of_the_status_line() -> None:
+    async with lab_without_server() as (port, alone):
+        for done in await alone.run("list"):
+            assert done.status == 0
+            assert done.stdout.split("\t")[1].startswith(f"waiting for 127.0.0.1:{port}")
+
+
+async def test_hostile_or_missing_answers_do_not_hide_a_gateway(lab: Lab) -> None:
+    """Other programs can neither hide a gateway nor write to the terminal; one that hangs is listed, too."""
+    payloads = {"evil0": b"\x1b[2J", "evil1": bytes(3_000_000), "evil2": b""}
+
+    def answer(query: zenoh.Query) -> None:
+        for name, payload in payloads.items():
+            query.reply(f"mocap/{name}/status", payload)
+
+    evil = await asyncio.to_thread(open_zenoh, "client", connect=lab.endpoint)
+    with contextlib.closing(evil):
+        tokens = [evil.liveliness().declare_token(f"mocap/{name}/alive") for name in (*payloads, "ghost")]
+        evil.declare_queryable("mocap/*/status", answer)
+        done = await run("list", *lab.options("zenoh"))
+        for token in tokens:
+            token.undeclare()
+    assert done.status == 0
+    lines = dict(line.split("\t", 1) for line in done.stdout.splitlines())
+    assert list(lines) == ["evil0", "evil1", "evil2", "ghost", "lab"]
+    assert lines["evil0"].startswith("its status is of another version of rtc3d-gateway")
+    assert lines["evil1"].startswith("its status is too long: 3000000 bytes")
+    assert lines["ghost"].startswith("its gateway does not answer\t")
+    assert lines["lab"].startswith("streaming ")
+    assert "\x1b" not in done.stdout
+
+
+async def test_messages_of_other_programs_on_lcm_are_listed_as_unreadable(lab: Lab) -> None:
+    """A gateway of another version is seen although its status cannot be read."""
+    other = open_lcm(lab.url)
+    task = asyncio.create_task(run("list", *lab.options("lcm")))
+    while not task.done():
+        other.publish("MOCAP_OLD_STATUS", b"another version")
+        other.publish("MOCAP_HALL_LAB_STATUS_X", b"no status")
+        await asyncio.sleep(0.05)
+    lines = dict(line.split("\t", 1) for line in (await task).stdout.splitlines())
+    assert sorted(lines) == ["lab", "old"]
+    assert lines["old"].startswith("its status is of another version of rtc3d-gateway")
