@@ -9,6 +9,7 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm import requests
 from gateway.outputs.lcm.queries import LcmQueries
+from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
@@ -191,3 +192,17 @@ async def test_an_error_is_the_reply_and_a_defect_is_logged(
     assert (received.error, received.error_code) == (error, code)
     assert lab.output.query_results == {"lab": {code: 1}}
     assert [record.message for record in caplog.records if record.exc_info] == logged == caplog.messages
+
+
+def test_messages_on_other_channels_leave_room_for_requests() -> None:
+    """On udpm://, the gateway's own messages arrive, too: they must not delay the replies."""
+    receiver = LcmReceiver("udpm://", "MOCAP", None, 64, lambda: None)
+    receiver._received = bucket = TokenBucket(100.0, monotonic=Clock(0.0))
+    requests: list[bytes] = []
+    receiver.add("MOCAP_LAB_COMMAND_REQUEST", requests.append)
+    for _ in range(100):
+        receiver._handle("MOCAP_LAB_3D", b"message")
+    assert bucket.left == pytest.approx(95.0)
+    receiver._handle("MOCAP_LAB_COMMAND_REQUEST", b"request")
+    assert bucket.left == pytest.approx(94.0)
+    assert requests == [b"request"]

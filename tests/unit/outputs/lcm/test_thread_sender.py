@@ -10,7 +10,6 @@ from gateway.errors import OutputError
 from gateway.outputs.lcm import thread_sender
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN
 from gateway.outputs.lcm.thread_sender import LcmThreadSender
-from tests.lcm_relay import LcmRelay
 from tests.waiting import wait_until
 
 URL = "tcpq://192.0.2.9:7700"
@@ -278,25 +277,3 @@ def test_what_opens_only_after_closing_is_not_used(lcm: FakeLcm) -> None:
     wait_until(lambda: not sender._thread.is_alive())
     assert (opened, sender.problem) == ([], CLOSED)
     assert refusal(sender).cause == "not open"
-
-
-# With a real relay ---------------------------------------------------------------------------
-
-
-def test_a_relay_that_reads_again_gets_every_message_that_was_accepted() -> None:
-    relay = LcmRelay()
-    sender = LcmThreadSender(relay.url, lambda: None)
-    sender.open()
-    wait_until(lambda: not sender.problem)
-    relay.stop_reading()
-    accepted = 0
-    while not sender.problem:
-        try:
-            send(sender, bytes(100_000))
-        except OutputError:
-            break
-        accepted += 1
-    relay.read_again()
-    wait_until(lambda: relay.num_published == accepted)
-    sender.close()
-    relay.close()

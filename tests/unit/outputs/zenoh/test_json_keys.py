@@ -18,7 +18,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
 from gateway.outputs.zenoh.json_keys import MAX_DESCRIPTION_CHARACTERS, JsonKeys
 from gateway.outputs.zenoh.publisher import ZenohPublisher
-from gateway.rtc3d.components import MISSING, WIRE_ORDER, ComponentType
+from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from tests.spec_parameters import ALL as SPEC_PARAMETERS
 from tests.takes import START_UTIME, frame, markers
@@ -26,29 +26,6 @@ from tests.unit.outputs.zenoh.lab import Lab, with_settings
 from tests.waiting import wait_until
 
 JSON = "mocap/lab/*/json"
-ITEMS: dict[ComponentType, list[Any]] = {
-    ComponentType.MARKERS: [(1.5, 2, 3, 0.1), (MISSING, MISSING, MISSING, 999)],
-    ComponentType.TOOLS: [(1, 0, 0, 0, 10, 20, 30, 0.2), (MISSING,) * 8],
-    ComponentType.ANALOG: [0.25, float("inf"), MISSING],
-    ComponentType.FORCE: [(1, 2, 3, 4, 5, 6)],
-    ComponentType.EVENT: [(0x123456, 5000, 1, 2, 3), (9, 5000, 1, 2, 3)],
-}
-LABELS = {
-    "3d": ["marker 1", "marker 2"],
-    "6d": ["tool 1", "tool 2"],
-    "analog": ["EMG1", "channel 2", "channel 3"],
-    "force": ["First force plate"],
-    "event": ["Button", ""],
-}
-"""Of the specification's parameters."""
-
-UNITS: dict[str, dict[str, Any]] = {
-    "3d": {"units": ["mm", "mm"]},
-    "6d": {"units": ["mm", "mm"]},
-    "analog": {"units": ["mV", "mV", "mV"]},
-    "force": {"units": ["N"], "moment_unit": ""},  # it describes no moments
-    "event": {},
-}
 
 
 class JsonLab(Lab):
@@ -92,20 +69,35 @@ def event(sequence: int) -> bytes:
 # Content ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("component", WIRE_ORDER, ids=lambda component: component.key)
+@pytest.mark.parametrize(
+    ("component", "items", "description"),
+    [
+        (
+            ComponentType.MARKERS,
+            [(1.5, 2, 3, 0.1), (MISSING, MISSING, MISSING, 999)],
+            {"labels": ["marker 1", "marker 2"], "units": ["mm", "mm"]},
+        ),
+        (ComponentType.ANALOG, [0.25, MISSING], {"labels": ["EMG1", "channel 2"], "units": ["mV", "mV"]}),
+        (
+            ComponentType.FORCE,
+            [(1, 2, 3, 4, 5, 6)],
+            {"labels": ["First force plate"], "units": ["N"], "moment_unit": ""},  # no moments are described
+        ),
+        (
+            ComponentType.EVENT,
+            [(0x123456, 5000, 1, 2, 3), (9, 5000, 1, 2, 3)],
+            {"labels": ["Button", ""]},
+        ),
+    ],
+    ids=lambda each: each.key if isinstance(each, ComponentType) else "",
+)
 def test_a_component_as_json_has_the_fields_of_its_message_and_labels_and_units(
-    lab: JsonLab, component: ComponentType
+    lab: JsonLab, component: ComponentType, items: list[Any], description: dict[str, Any]
 ) -> None:
     lab.set_parameters(SPEC_PARAMETERS)
     lab.subscribe(JSON)
-    _, message = frame(component, ITEMS[component])
-    received = lab.received_of(lab.publisher(component), message)
-    description = {"labels": LABELS[component.key], **UNITS[component.key]}
-    assert received == {**to_json(decode(message)), **description}
-    if component is ComponentType.MARKERS:
-        assert received["markers"][1] == {"x": None, "y": None, "z": None, "reliability": 999}
-    if component is ComponentType.ANALOG:
-        assert received["voltages"] == [0.25, None, None]
+    _, message = frame(component, items)
+    assert lab.received_of(lab.publisher(component), message) == {**to_json(decode(message)), **description}
     [sample] = lab.samples
     assert str(sample.key_expr) == f"mocap/lab/{component.key}/json"
     assert str(sample.encoding) == "application/json"

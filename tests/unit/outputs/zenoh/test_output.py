@@ -45,8 +45,6 @@ def tokens(lab: Lab, keys: str) -> list[str]:
 @pytest.mark.parametrize(
     ("parts", "type_name", "key"),
     [
-        (("3d",), "rtc3d.markers_t", "mocap/lab/3d"),
-        (("6d",), "rtc3d.tools_t", "mocap/lab/6d"),
         (("status",), "rtc3d.status_t", "mocap/lab/status"),
         (("6d", "a/b *?"), "rtc3d.tool_pose_t", "mocap/lab/6d/a%2Fb%20%2A%3F"),
     ],
@@ -146,52 +144,34 @@ def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: L
 # Liveliness ----------------------------------------------------------------------------------
 
 
-def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
-    lab.output.announce("early")
-    lab.output.withdraw("early")
-    lab.output.announce("lab")
+@pytest.mark.parametrize("name", ["alive", "server"])
+def test_tokens_show_sources_and_their_servers_until_the_output_closes(lab: Lab, name: str) -> None:
+    """A source is alive from announcement to withdrawal, its server while its frames flow."""
+
+    def show(source: str, is_shown: bool = True) -> None:
+        for _ in range(2):
+            if name == "server":
+                lab.output.show_streaming(source, is_shown)
+            else:
+                (lab.output.announce if is_shown else lab.output.withdraw)(source)
+
+    def wait_for(*sources: str) -> None:
+        expected = [f"mocap/{source}/{name}" for source in sources]
+        wait_until(lambda: tokens(lab, f"mocap/*/{name}") == expected)
+
+    show("early")
+    show("early", False)
+    show("lab")
     lab.open()
-    seen: list[tuple[str, str]] = []
-
-    def alive() -> list[str]:
-        return tokens(lab, "mocap/*/alive")
-
-    watching = lab.peer.liveliness().declare_subscriber(
-        "mocap/*/alive", lambda sample: seen.append((str(sample.key_expr), str(sample.kind))), history=True
-    )
-    wait_until(lambda: alive() == ["mocap/lab/alive"])
-    lab.output.announce("hall-2")
-    wait_until(lambda: alive() == ["mocap/hall-2/alive", "mocap/lab/alive"])
-    lab.output.withdraw("lab")
-    wait_until(lambda: alive() == ["mocap/hall-2/alive"])
+    wait_for("lab")
+    show("hall-2")
+    wait_for("hall-2", "lab")
+    show("lab", False)
+    wait_for("hall-2")
+    show("lab")
+    wait_for("hall-2", "lab")
     lab.output.close()
-    wait_until(lambda: alive() == [])
-    born = [("mocap/lab/alive", "SampleKind.PUT"), ("mocap/hall-2/alive", "SampleKind.PUT")]
-    gone = {(key, "SampleKind.DELETE") for key, _ in born}
-    wait_until(lambda: gone <= set(seen))
-    watching.undeclare()
-    # Zenoh may tell of a token twice: from history, and as it comes.
-    told = list(dict.fromkeys(seen))
-    assert (told[:2], set(told[2:])) == (born, gone)
-
-
-def test_a_server_is_shown_while_its_frames_flow(lab: Lab) -> None:
-    def shown() -> list[str]:
-        return tokens(lab, "mocap/*/server")
-
-    lab.output.show_streaming("lab", True)
-    lab.open()
-    wait_until(lambda: shown() == ["mocap/lab/server"])
-    lab.output.show_streaming("hall-2", True)
-    lab.output.show_streaming("hall-2", True)
-    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
-    lab.output.show_streaming("lab", False)
-    lab.output.show_streaming("lab", False)
-    wait_until(lambda: shown() == ["mocap/hall-2/server"])
-    lab.output.show_streaming("lab", True)
-    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
-    lab.output.close()
-    wait_until(lambda: shown() == [])
+    wait_for()
 
 
 # Opening -------------------------------------------------------------------------------------
