@@ -42,8 +42,7 @@ def test_a_channel_given_up_is_free_and_one_in_use_is_not(output: LcmOutput) -> 
 async def test_without_queries_nothing_is_received() -> None:
     lab = Lab(queries=False)
     lab.open()
-    assert lab.output._queries is not None
-    assert not lab.output._queries._receiver._thread.is_alive()
+    assert not lab.queries._receiver._thread.is_alive()
     await lab.output.stop_queries()
 
 

@@ -116,12 +116,6 @@ def test_only_the_schemes_that_block_send_from_a_thread(url: str, sender_class: 
     assert type(new_sender(url, None, lambda: None)) is sender_class
 
 
-@pytest.mark.parametrize("url", [BAD_URL, "tcpq://127.0.0.1:9"])
-def test_a_url_that_does_not_open_is_an_error_with_the_remedy(url: str) -> None:
-    text = f"LCM does not open {url}: Couldn't create LCM; check lcm.url"
-    assert refusal(lambda: open_lcm(url)) == (text, "not open")
-
-
 # Failures ------------------------------------------------------------------------------------
 
 
@@ -146,11 +140,6 @@ def test_a_missing_route_is_the_reason_of_every_failure(url: str) -> None:
     assert multicast_problem(url) == text
     assert refusal(lambda: open_lcm(url)) == (text, "not open")
     assert send_problem(url, OSError("of the test")) == text
-
-
-def test_other_failures_to_send_have_the_reason_of_lcm() -> None:
-    text = "LCM did not send to memq://: of the test; check lcm.url"
-    assert send_problem("memq://", OSError("of the test")) == text
 
 
 @pytest.mark.netns

@@ -62,6 +62,13 @@ def lab(settings: dict[str, Any]) -> Iterator[JsonLab]:
     lab.close()
 
 
+@pytest.fixture
+def publisher(lab: JsonLab) -> ZenohPublisher:
+    """The publisher of the markers, whose JSON is wanted."""
+    lab.subscribe(JSON)
+    return lab.publisher()
+
+
 def event(sequence: int) -> bytes:
     return frame(ComponentType.EVENT, [(7, sequence, 1, 2, 3)], sequence)[1]
 
@@ -115,9 +122,9 @@ def test_the_pose_of_a_tool_is_on_a_key_of_its_own_and_has_its_label(lab: JsonLa
     assert received["position_m"] == [None] * 3
 
 
-def test_labels_are_those_of_the_parameters_that_describe_the_frame(lab: JsonLab) -> None:
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
+def test_labels_are_those_of_the_parameters_that_describe_the_frame(
+    lab: JsonLab, publisher: ZenohPublisher
+) -> None:
     named = Parameters(markers=Parameters3D(markers=(Marker("1", "C7"), Marker("2", "C7"))))
 
     def labels(num_markers: int, sequence: int, version: int) -> list[str] | None:
@@ -148,9 +155,7 @@ def test_labels_may_have_any_characters(lab: JsonLab) -> None:
     assert lab.received_of(publisher, markers(1, 20)[1])["labels"] == ["marker 1"]
 
 
-def test_labels_that_are_too_long_together_are_left_out(lab: JsonLab) -> None:
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
+def test_labels_that_are_too_long_together_are_left_out(lab: JsonLab, publisher: ZenohPublisher) -> None:
     num_labels = MAX_DESCRIPTION_CHARACTERS // 200 + 1
     many = tuple(Marker(str(at), f"{at:0200}") for at in range(num_labels))
     lab.set_parameters(Parameters(markers=Parameters3D(markers=many)))
@@ -205,9 +210,7 @@ def test_a_rate_of_0_switches_it_off(lab: JsonLab) -> None:
     assert publisher.json is None
 
 
-def test_a_closed_publisher_is_not_wanted_and_sends_nothing(lab: JsonLab) -> None:
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
+def test_a_closed_publisher_is_not_wanted_and_sends_nothing(lab: JsonLab, publisher: ZenohPublisher) -> None:
     publisher.close()
     lab.output.maintain()
     assert not publisher.wanted
@@ -218,10 +221,10 @@ def test_a_closed_publisher_is_not_wanted_and_sends_nothing(lab: JsonLab) -> Non
 
 
 @with_settings(json_max_rate_hz=400.0)
-def test_frames_are_left_out_at_even_intervals_of_their_capture(lab: JsonLab) -> None:
+def test_frames_are_left_out_at_even_intervals_of_their_capture(
+    lab: JsonLab, publisher: ZenohPublisher
+) -> None:
     """Of 1000 frames per second, those that the pacer picks; nothing is lost."""
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
     pacer = Pacer(400.0)
     expected = []
     for number in range(200):
@@ -236,10 +239,8 @@ def test_frames_are_left_out_at_even_intervals_of_their_capture(lab: JsonLab) ->
 
 
 @with_settings(json_max_rate_hz=20.0)
-def test_a_fast_replay_makes_no_more_json_per_second(lab: JsonLab) -> None:
+def test_a_fast_replay_makes_no_more_json_per_second(lab: JsonLab, publisher: ZenohPublisher) -> None:
     """These messages were captured within 100 s."""
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
     begun_s = time.monotonic()
     for number in range(10_000):
         publisher.publish(markers(1, number)[1])
@@ -252,9 +253,7 @@ def test_a_fast_replay_makes_no_more_json_per_second(lab: JsonLab) -> None:
 
 
 @with_settings(json_max_rate_hz=1000.0)
-def test_what_waits_is_replaced_by_the_newest_frame(lab: JsonLab) -> None:
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
+def test_what_waits_is_replaced_by_the_newest_frame(lab: JsonLab, publisher: ZenohPublisher) -> None:
     for number in range(200):
         publisher.publish(markers(100, number)[1])
     wait_until(lambda: any(received["sequence"] == 199 for received in lab.received))
@@ -328,9 +327,9 @@ def test_events_that_come_faster_than_they_can_be_converted_are_counted(lab: Jso
     assert lab.lost["json queue full"][0] > 100
 
 
-def test_after_a_full_queue_the_next_frame_is_sent(lab: JsonLab, monkeypatch: pytest.MonkeyPatch) -> None:
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
+def test_after_a_full_queue_the_next_frame_is_sent(
+    lab: JsonLab, publisher: ZenohPublisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as full:
         full.setattr(lab.output._json, "offer", lambda *_: False)
         publisher.publish(markers(1)[1])
@@ -354,9 +353,7 @@ def test_a_frame_that_is_too_long_is_counted_and_published_without_json(lab: Jso
     wait_until(lambda: "mocap/lab/3d/json" in {str(sample.key_expr) for sample in lab.samples})
 
 
-def test_a_message_that_cannot_be_decoded_is_counted(lab: JsonLab) -> None:
-    lab.subscribe(JSON)
-    publisher = lab.publisher()
+def test_a_message_that_cannot_be_decoded_is_counted(lab: JsonLab, publisher: ZenohPublisher) -> None:
     publisher.publish(b"no message")
     wait_until(lambda: lab.lost == {"json failed": (1, 0)})
     assert lab.received_of(publisher, markers(1)[1])
