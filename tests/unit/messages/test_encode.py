@@ -101,17 +101,8 @@ def test_another_sequence_number_changes_nothing_else() -> None:
     assert message_timestamp_us(message) == MARKERS.timestamp_us
 
 
-def test_names_of_lcm_types() -> None:
-    """They are the encoding of Zenoh samples."""
-    names = {component.key: lcm_type_name(lcm_type) for component, lcm_type in MESSAGE_TYPES.items()}
-    types = {
-        "3d": "markers_t",
-        "6d": "tools_t",
-        "analog": "analog_t",
-        "force": "forces_t",
-        "event": "events_t",
-    }
-    assert names == {key: f"rtc3d.{name}" for key, name in types.items()}
+def test_the_name_of_an_lcm_type_is_its_encoding_on_zenoh() -> None:
+    assert lcm_type_name(rtc3d.markers_t) == "rtc3d.markers_t"
 
 
 @pytest.mark.parametrize(

@@ -141,20 +141,6 @@ def test_labels_are_those_of_the_parameters_that_describe_the_frame(
     assert labels(2, 40, 3) == ['a"\\', "marker 2"]
 
 
-def test_labels_may_have_any_characters(lab: JsonLab) -> None:
-    lab.subscribe(JSON)
-    labels = ["\x00\x1b[2J", '"\\', "a\u2028</script>", "左足 🦶", "\ud800", "é" * 100]
-    items = tuple(Marker(str(at), label) for at, label in enumerate(labels[:4] + labels[5:]))
-    lab.set_parameters(Parameters(markers=Parameters3D(markers=items)))
-    publisher = lab.publisher()
-    assert lab.received_of(publisher, markers(5)[1])["labels"] == labels[:4] + labels[5:]
-    lab.set_parameters(Parameters(markers=Parameters3D(markers=(Marker("1", labels[4]),))))
-    publisher.publish(markers(1, 10)[1])
-    wait_until(lambda: lab.lost == {"json failed": (1, 0)})  # no UTF-8: XML cannot have it
-    lab.set_parameters(Parameters())
-    assert lab.received_of(publisher, markers(1, 20)[1])["labels"] == ["marker 1"]
-
-
 def test_labels_that_are_too_long_together_are_left_out(lab: JsonLab, publisher: ZenohPublisher) -> None:
     num_labels = MAX_DESCRIPTION_CHARACTERS // 200 + 1
     many = tuple(Marker(str(at), f"{at:0200}") for at in range(num_labels))
