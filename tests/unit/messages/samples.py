@@ -59,18 +59,6 @@ def unknown_clock() -> bytes:
     return encoded
 
 
-def parameter_messages() -> list[bytes]:
-    """Return the parameters, a request and a reply, as on LCM."""
-    parameters, request, reply = (
-        rtc3d.parameters_t(),
-        rtc3d.parameters_request_t(),
-        rtc3d.parameters_reply_t(),
-    )
-    parameters.xml = reply.xml = "<RT_Parameters/>"
-    request.requester = reply.requester = "viewer"
-    return [parameters.encode(), request.encode(), reply.encode()]
-
-
 def command_messages() -> list[bytes]:
     """Return a command and its reply, as on LCM."""
     request, reply = rtc3d.command_request_t(), rtc3d.command_reply_t()
@@ -79,22 +67,3 @@ def command_messages() -> list[bytes]:
     request.command, request.options, request.num_options = "take", ["set=start", "name=walk-1"], 2
     reply.content = '{"source":"lab","name":"walk-1"}'
     return [request.encode(), reply.encode()]
-
-
-def take_message() -> bytes:
-    """Return the description of a take."""
-    message = rtc3d.take_t()
-    message.utime = 1_700_000_000_000_000
-    message.name, message.source, message.channels = "walk-1", "lab", "MOCAP_LAB"
-    message.server, message.gateway_version = "192.0.2.20:3020", "1.0.0"
-    message.recorder, message.host = "rtc3d-gateway 1.0.0", "analysis-pc"
-    encoded: bytes = message.encode()
-    return encoded
-
-
-def take_end_message() -> bytes:
-    """Return the end of a take."""
-    message = rtc3d.take_end_t()
-    message.utime, message.source, message.messages_lost = 1_700_000_000_000_000, "lab", 505
-    encoded: bytes = message.encode()
-    return encoded

@@ -1,9 +1,8 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zenoh
@@ -14,7 +13,6 @@ from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.command_session import command_config
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.networks import free_endpoint, zenoh_keys
 from tests.unit.outputs.zenoh.lab import Lab
@@ -98,34 +96,6 @@ def test_a_message_for_a_closed_publisher_is_refused_with_its_key(lab: Lab) -> N
         publisher.publish(b"message")
     text = "Zenoh key mocap/lab/3d is closed; ask for a new publisher"
     assert (str(caught.value), caught.value.cause) == (text, "closed")
-
-
-def test_a_message_is_refused_as_not_open_while_the_session_opens() -> None:
-    """The gateway publishes from its own thread while another one declares everything on the new session."""
-    refused: list[OutputError] = []
-
-    class Queries:
-        """Publishes at the moment when the session is set and messages cannot be sent yet."""
-
-        def __getattr__(self, _name: str) -> Callable[..., None]:
-            def publish(*_: object) -> None:
-                with pytest.raises(OutputError) as caught:
-                    publisher.publish(b"message")
-                refused.append(caught.value)
-
-            return publish
-
-    output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=free_endpoint())))
-    output._queries = cast(ZenohQueries, Queries())
-    publisher = output.publisher(MARKERS)
-    try:
-        output.start()
-        wait_until(lambda: refused)
-        assert refused[0].cause == "not open"
-        assert str(refused[0]).startswith("the Zenoh session is not open yet; ")
-    finally:
-        output._queries = None
-        output.close()
 
 
 def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: Lab) -> None:

@@ -48,6 +48,7 @@ class Lab:
         if self.defects:
             raise self.defects.pop()
         self.declared.append(session)
+        self.while_declaring = (self.holder.is_cut_off, self.holder.refusal.cause)
 
     def open(self) -> None:
         """Do what the opening thread does."""
@@ -152,8 +153,10 @@ def test_what_cannot_be_declared_is_declared_on_the_next_session(
 
 
 def test_a_peer_needs_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But nothing is sent before everything is declared: the gateway publishes from its own thread."""
     lab = Lab(monkeypatch, mode="peer")
     lab.open()
+    assert lab.while_declaring == (True, "not open")
     assert not lab.holder.is_cut_off
     lab.holder.maintain()
     assert lab.holder.health.connected
