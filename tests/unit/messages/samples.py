@@ -34,19 +34,20 @@ def tool_pose_messages() -> list[bytes]:
     return tool_poses(received(TOOLS), STAMP, [41, 42], CoordinateFrame("lab"))
 
 
-def status_of(**stream: Any) -> bytes:
-    """Return a status message of one stream with these counters, and of two outputs."""
-    outputs = [
-        (OutputStatus("zenoh"), OutputHealth(True), {"ok": 3}),
-        (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add"), {}),
-    ]
-    streams = [(StreamStatus("3d 6d", **stream), 59.96)]
+OUTPUTS = (
+    (OutputStatus("zenoh"), OutputHealth(True), {"ok": 3}),
+    (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add"), {}),
+)
+
+
+def status_of(stream: StreamStatus | None = None, *outputs: Any) -> bytes:
+    """Return a status message of a stream, and of two outputs unless others are given."""
     message = status_message(
         source="lab",
         server="192.0.2.20:3020",
         sequence=17,
-        streams=streams,
-        outputs=outputs,
+        streams=[(stream or StreamStatus("3d 6d"), 59.96)],
+        outputs=outputs or OUTPUTS,
         stall_timeout_s=2.0,
         frame=CoordinateFrame("lab"),
     )
