@@ -136,9 +136,9 @@ def test_labels_are_those_of_the_parameters_that_describe_the_frame(
     lab.set_parameters(named, 2)
     assert labels(2, 10, 2) == ["C7", "C7_2"]
     assert labels(1, 20, 2) == ["C7"]
-    lab.set_parameters(Parameters(markers=Parameters3D(markers=(Marker("1", 'a"\\\n'),))), 3)
+    lab.set_parameters(Parameters(markers=Parameters3D(markers=(Marker("1", '足"\\\n'),))), 3)
     assert labels(2, 30, 2) is None
-    assert labels(2, 40, 3) == ['a"\\', "marker 2"]
+    assert labels(2, 40, 3) == ['足"\\', "marker 2"]
 
 
 def test_labels_that_are_too_long_together_are_left_out(lab: JsonLab, publisher: ZenohPublisher) -> None:
