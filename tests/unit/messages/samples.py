@@ -34,19 +34,20 @@ def tool_pose_messages() -> list[bytes]:
     return tool_poses(received(TOOLS), STAMP, [41, 42], CoordinateFrame("lab"))
 
 
-def status_of(**stream: Any) -> bytes:
-    """Return a status message of one stream with these counters, and of two outputs."""
-    outputs = [
-        (OutputStatus("zenoh"), OutputHealth(True), {"ok": 3}),
-        (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add"), {}),
-    ]
-    streams = [(StreamStatus("3d 6d", **stream), 59.96)]
+OUTPUTS = (
+    (OutputStatus("zenoh"), OutputHealth(True), {"ok": 3}),
+    (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add"), {}),
+)
+
+
+def status_of(stream: StreamStatus | None = None, *outputs: Any) -> bytes:
+    """Return a status message of a stream, and of two outputs unless others are given."""
     message = status_message(
         source="lab",
         server="192.0.2.20:3020",
         sequence=17,
-        streams=streams,
-        outputs=outputs,
+        streams=[(stream or StreamStatus("3d 6d"), 59.96)],
+        outputs=outputs or OUTPUTS,
         stall_timeout_s=2.0,
         frame=CoordinateFrame("lab"),
     )
@@ -59,18 +60,6 @@ def unknown_clock() -> bytes:
     return encoded
 
 
-def parameter_messages() -> list[bytes]:
-    """Return the parameters, a request and a reply, as on LCM."""
-    parameters, request, reply = (
-        rtc3d.parameters_t(),
-        rtc3d.parameters_request_t(),
-        rtc3d.parameters_reply_t(),
-    )
-    parameters.xml = reply.xml = "<RT_Parameters/>"
-    request.requester = reply.requester = "viewer"
-    return [parameters.encode(), request.encode(), reply.encode()]
-
-
 def command_messages() -> list[bytes]:
     """Return a command and its reply, as on LCM."""
     request, reply = rtc3d.command_request_t(), rtc3d.command_reply_t()
@@ -79,31 +68,3 @@ def command_messages() -> list[bytes]:
     request.command, request.options, request.num_options = "take", ["set=start", "name=walk-1"], 2
     reply.content = '{"source":"lab","name":"walk-1"}'
     return [request.encode(), reply.encode()]
-
-
-def take_message() -> bytes:
-    """Return the description of a take."""
-    message = rtc3d.take_t()
-    message.utime = 1_700_000_000_000_000
-    message.name, message.source, message.channels = "walk-1", "lab", "MOCAP_LAB"
-    message.server, message.gateway_version = "192.0.2.20:3020", "1.0.0"
-    message.recorder, message.host = "rtc3d-gateway 1.0.0", "analysis-pc"
-    encoded: bytes = message.encode()
-    return encoded
-
-
-def take_details_message() -> bytes:
-    """Return what a take is about."""
-    message = rtc3d.take_details_t()
-    message.utime, message.source = 1_700_000_000_000_000, "lab"
-    message.subject, message.session, message.note = "S01", "baseline", "left knee"
-    encoded: bytes = message.encode()
-    return encoded
-
-
-def take_end_message() -> bytes:
-    """Return the end of a take."""
-    message = rtc3d.take_end_t()
-    message.utime, message.source, message.messages_lost = 1_700_000_000_000_000, "lab", 505
-    encoded: bytes = message.encode()
-    return encoded

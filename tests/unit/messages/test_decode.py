@@ -9,23 +9,13 @@ from gateway.errors import ProtocolError
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, to_json
 from gateway.messages.json_text import json_text
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
-from tests.unit.messages.samples import (
-    command_messages,
-    component_message,
-    parameter_messages,
-    status_of,
-    take_details_message,
-    take_end_message,
-    take_message,
-    tool_pose_messages,
-    unknown_clock,
-)
-from tests.vectors import COMPONENTS, LONG_EVENTS, MARKERS
+from tests.message_vectors import VECTORS
+from tests.unit.messages.samples import component_message, tool_pose_messages
+from tests.vectors import LONG_EVENTS, MARKERS
 
 MISSING = [None] * 3
-PUBLISHED = [*map(component_message, COMPONENTS), *tool_pose_messages(), status_of(), unknown_clock()]
-IN_FILES = [take_message(), take_details_message(), take_end_message()]
-EVERY_MESSAGE = [*PUBLISHED, *parameter_messages(), *command_messages(), *IN_FILES]
+EVERY_MESSAGE = [vector.data for vector in VECTORS]
+"""Of each type that the gateway publishes or receives."""
 
 
 def test_every_message_is_decoded_by_its_fingerprint_and_can_be_written_as_json() -> None:

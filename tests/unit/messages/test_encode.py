@@ -1,4 +1,4 @@
-"""LCM messages, against the test vectors in lcm_types/vectors/ and against lcm-gen's types."""
+"""Keys and channels, and LCM messages against lcm_types/vectors/ and lcm-gen's types."""
 
 from typing import Any
 
@@ -19,6 +19,7 @@ from gateway.messages.encode import (
 from gateway.messages.limits import encode_within_limits
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
+from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, zenoh_key
 from gateway.rtc3d.components import ComponentType
 from tests.message_vectors import FOLDER, VECTORS, MessageVector, difference, to_vector_values
 from tests.unit.messages.samples import received
@@ -100,17 +101,8 @@ def test_another_sequence_number_changes_nothing_else() -> None:
     assert message_timestamp_us(message) == MARKERS.timestamp_us
 
 
-def test_names_of_lcm_types() -> None:
-    """They are the encoding of Zenoh samples."""
-    names = {component.key: lcm_type_name(lcm_type) for component, lcm_type in MESSAGE_TYPES.items()}
-    types = {
-        "3d": "markers_t",
-        "6d": "tools_t",
-        "analog": "analog_t",
-        "force": "forces_t",
-        "event": "events_t",
-    }
-    assert names == {key: f"rtc3d.{name}" for key, name in types.items()}
+def test_the_name_of_an_lcm_type_is_its_encoding_on_zenoh() -> None:
+    assert lcm_type_name(rtc3d.markers_t) == "rtc3d.markers_t"
 
 
 @pytest.mark.parametrize(
@@ -126,3 +118,49 @@ def test_a_number_beyond_its_field_becomes_the_nearest_one(number: int, limited:
     decoded = rtc3d.clock_t.decode(encode_within_limits(clock))
     assert (decoded.utime, decoded.clock.offset_us, decoded.components) == (limited, limited, r"a\x1bb")
     assert decoded.clock.uncertainty_us >= 3e38
+
+
+# Keys and channels --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "key", "channel"),
+    [
+        (("3d",), "mocap/lab/3d", "MOCAP_LAB_3D"),
+        (("status",), "mocap/lab/status", "MOCAP_LAB_STATUS"),
+        (("6d", "Probe"), "mocap/lab/6d/Probe", "MOCAP_LAB_6D_PROBE"),
+        (("6d", "tool 1"), "mocap/lab/6d/tool%201", "MOCAP_LAB_6D_TOOL_1"),
+    ],
+)
+def test_keys_and_channels_are_as_documented(path: tuple[str, ...], key: str, channel: str) -> None:
+    assert (zenoh_key("mocap", "lab", *path), lcm_channel("MOCAP", "lab", *path)) == (key, channel)
+
+
+@pytest.mark.parametrize(
+    ("label", "chunk", "channel"),
+    [
+        ("Probe_1.a-b~", "Probe_1.a-b~", "PROBE_1_A_B"),
+        *(("a/b", "a%2Fb", "A_B"), ("*", "%2A", "_"), ("a$*b", "a%24%2Ab", "A_B"), ("", "%", "_")),
+        *(("what?#1", "what%3F%231", "WHAT_1"), ("100%", "100%25", "100"), ("@adv", "%40adv", "ADV")),
+        *(("Fuß links", "Fu%C3%9F%20links", "FUSS_LINKS"), ("膝", "%E8%86%9D", "_")),
+        ("(left) -- foot!", "%28left%29%20--%20foot%21", "LEFT_FOOT"),
+    ],
+)
+def test_characters_that_are_refused_in_a_label_are_replaced(label: str, chunk: str, channel: str) -> None:
+    """Zenoh's are percent-escaped, LCM's become one underscore."""
+    assert escape_key_chunk(label) == chunk
+    assert lcm_channel("MOCAP", "lab", "6d", label) == f"MOCAP_LAB_6D_{channel}"
+
+
+@pytest.mark.parametrize(
+    ("taken", "suffix"),
+    [(set(), ""), ({"PROB"}, ""), ({"PROBE"}, "_2"), ({"PROBE", "PROBE_2", "PROBE_4"}, "_3")],
+)
+def test_a_taken_name_gets_the_first_free_number(taken: set[str], suffix: str) -> None:
+    assert unique_name("PROBE", taken) == "PROBE" + suffix
+
+
+def test_a_long_name_is_cut_so_that_its_number_fits() -> None:
+    assert unique_name(70 * "A", set()) == 63 * "A"
+    assert unique_name(70 * "A", {63 * "A"}) == 61 * "A" + "_2"
+    assert unique_name("ABCDE", {"ABCDE"}, max_length=5) == "ABC_2"

@@ -6,12 +6,10 @@ import pytest
 import rtc3d
 
 from gateway.losses import Losses
-from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.messages.parameters_text import xml_bytes, xml_text
 from gateway.messages.summary import summarise
 from gateway.outputs.status import OutputHealth, OutputStatus
-from gateway.publish.status_messages import status_message
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.unit.messages.samples import (
@@ -25,7 +23,7 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentV
 
 LAB = "#17 lab at 192.0.2.20:3020: [3d 6d] "
 OUTPUTS = "; outputs: zenoh ok; lcm no multicast: ip route add"
-STREAMING = status_of(state=StreamState.STREAMING, frames_in=600, reconnects=1, last_error="gone")
+STREAMING = StreamStatus("3d 6d", state=StreamState.STREAMING, frames_in=600, reconnects=1, last_error="gone")
 
 
 @pytest.mark.parametrize(
@@ -50,7 +48,10 @@ STREAMING = status_of(state=StreamState.STREAMING, frames_in=600, reconnects=1, 
         (command_messages()[0], "command 7 from 'remote': take set=start name=walk-1"),
         (command_messages()[1], """reply 7 to 'remote': {"source":"lab","name":"walk-1"}"""),
         (unknown_clock(), "#17 the server's time stamps cannot be used as a clock (3d 6d)"),
-        (STREAMING, f"{LAB}streaming 60.0 Hz, 600 frames, 1 reconnects, last error: gone{OUTPUTS}"),
+        (
+            status_of(STREAMING),
+            f"{LAB}streaming 60.0 Hz, 600 frames, 1 reconnects, last error: gone{OUTPUTS}",
+        ),
         (status_of(), f"{LAB}waiting to reconnect 60.0 Hz, 0 frames, 0 reconnects{OUTPUTS}"),
     ],
     ids=lambda each: each if isinstance(each, str) else "",  # messages have the time
@@ -66,17 +67,9 @@ def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
     status.file_lost("the disk is full")
     losses = Losses(logging.getLogger("tests"), "lab to zenoh")
     losses.lost("no router", "start it", messages=5, frames=1)
-    message = status_message(
-        source="lab",
-        server="192.0.2.20:3020",
-        sequence=17,
-        streams=[(status, 0.0)],
-        outputs=[(OutputStatus("zenoh", losses=losses.report()), OutputHealth(True), {})],
-        stall_timeout_s=2.0,
-        frame=CoordinateFrame("lab"),
-    )
-    assert summarise(decode(message.encode())) == (
-        "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 0.0 Hz, 0 frames, 0 reconnects, "
+    message = status_of(status, (OutputStatus("zenoh", losses=losses.report()), OutputHealth(True), {}))
+    assert summarise(decode(message)) == (
+        "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 60.0 Hz, 0 frames, 0 reconnects, "
         "lost 1 message (C3D file), 872 messages of 436 frames (skipped while behind); "
         "outputs: zenoh ok, lost 5 messages of 1 frame (no router)"
     )

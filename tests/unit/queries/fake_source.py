@@ -30,6 +30,9 @@ def parameters_xml(unit: str, frames_sent: int = 1) -> bytes:
     )
 
 
+MM, CM = parameters_xml("mm"), parameters_xml("cm")
+
+
 class FakeServer:
     """Receives commands. Those in ``replies`` are answered at once, others one by one with ``answer``."""
 
@@ -174,6 +177,12 @@ class FakeSource:
         """Read all parameters, as at the start of the first connection."""
         await self._do_handshake(self.connection, xml)
         self.server.commands.clear()
+
+    async def refresh(self, xml: bytes | Exception | None = None) -> None:
+        """Read all parameters again; with ``xml``, the server answers with it from now on."""
+        if xml is not None:
+            self.server.replies["SendParameters"] = xml
+        await self.queries.parameters.refresh()
 
     async def parameters(self, *sections: str, fresh: bool = False, stale_ok: bool = False) -> ServerAnswer:
         return await self.queries.parameters.get(sections, fresh=fresh, stale_ok=stale_ok)

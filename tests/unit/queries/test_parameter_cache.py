@@ -13,9 +13,8 @@ from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.parameters import LONG_XML_BYTES, XmlThread
 from tests.spec_parameters import in_root
-from tests.unit.queries.fake_source import FakeSource, parameters_xml
+from tests.unit.queries.fake_source import CM, MM, FakeSource, parameters_xml
 
-MM, CM = parameters_xml("mm"), parameters_xml("cm")
 SILENCE = ReplyTimeoutError("192.0.2.1:3020 did not answer SendParameters within 2 s")
 GARBAGE = b"It is 3 o'clock."
 
@@ -34,9 +33,9 @@ def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
 # At each connection --------------------------------------------------------------------------
 
 
-async def test_parameters_are_announced_at_every_connection_and_statistics_are_no_change() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_parameters_are_announced_at_every_connection_and_statistics_are_no_change(
+    source: FakeSource,
+) -> None:
     other = parameters_xml("mm", frames_sent=7)
     for xml in (MM, other, CM):
         await source.connect(xml)
@@ -46,10 +45,8 @@ async def test_parameters_are_announced_at_every_connection_and_statistics_are_n
 
 @no_parameters
 async def test_a_server_without_parameters_makes_the_former_ones_void(
-    reply: bytes | Exception, caplog: pytest.LogCaptureFixture
+    source: FakeSource, reply: bytes | Exception, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
     with pytest.raises((ServerError, ReplyTimeoutError, ParametersError)):
         await source.connect(reply)
     assert source.announced == [(MM, 1), (None, 2)]
@@ -62,9 +59,7 @@ async def test_a_server_without_parameters_makes_the_former_ones_void(
     assert source.announced[2:] == [(MM, 3)]
 
 
-async def test_a_lost_connection_keeps_the_parameters() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_a_lost_connection_keeps_the_parameters(source: FakeSource) -> None:
     with pytest.raises(ClosedError):
         await source.connect(ClosedError("closed"))
     source.disconnect()
@@ -79,9 +74,9 @@ async def test_a_lost_connection_keeps_the_parameters() -> None:
         (SILENCE, "timeout", "did not answer SendParameters within 2 s; the parameters of its earlier"),
     ],
 )
-async def test_peers_are_told_that_the_parameters_are_void(reply: Exception, code: str, text: str) -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_peers_are_told_that_the_parameters_are_void(
+    source: FakeSource, reply: Exception, code: str, text: str
+) -> None:
     with pytest.raises(type(reply)):
         await source.connect(reply)
     for sections in ((), ("3d",)):
@@ -99,9 +94,7 @@ async def test_xml_that_cannot_be_read_is_given_to_peers_as_it_is() -> None:
     assert source.server.commands == ["SendParameters"]
 
 
-async def test_a_reload_continues_the_version() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_a_reload_continues_the_version(source: FakeSource) -> None:
     await source.connect(CM)
     after = FakeSource()
     after.queries.parameters = ParameterCache(
@@ -115,14 +108,19 @@ async def test_a_reload_continues_the_version() -> None:
 # Several streams -----------------------------------------------------------------------------
 
 
-async def test_streams_that_connect_at_the_same_time_share_one_request() -> None:
-    source = FakeSource(two_streams=True)
-    first = asyncio.create_task(source.connect(None))
-    second = asyncio.create_task(source.connect_second(None))
+async def connect_both(source: FakeSource) -> list[asyncio.Task[None]]:
+    """Connect both streams; return when both wait for the server's answer."""
+    tasks = [asyncio.create_task(connect(None)) for connect in (source.connect, source.connect_second)]
     await source.server.wait_for_commands(1)
     await asyncio.sleep(0)
+    return tasks
+
+
+async def test_streams_that_connect_at_the_same_time_share_one_request() -> None:
+    source = FakeSource(two_streams=True)
+    tasks = await connect_both(source)
     source.server.answer(MM)
-    await asyncio.gather(first, second)
+    await asyncio.gather(*tasks)
     assert source.server.commands == ["SendParameters"]
     assert source.announced == [(MM, 1), (MM, 1)]
     assert (await source.parameters()).session == 3
@@ -131,24 +129,16 @@ async def test_streams_that_connect_at_the_same_time_share_one_request() -> None
 @pytest.mark.parametrize("reply", [ServerError("err-what?"), SILENCE])
 async def test_streams_that_connect_at_the_same_time_share_a_refusal(reply: Exception) -> None:
     source = FakeSource(two_streams=True)
-    first = asyncio.create_task(source.connect(None))
-    second = asyncio.create_task(source.connect_second(None))
-    await source.server.wait_for_commands(1)
-    await asyncio.sleep(0)
+    tasks = await connect_both(source)
     source.server.unanswered.popleft().set_exception(reply)
-    for task in (first, second):
-        with pytest.raises(type(reply)):
-            await task
+    assert await asyncio.gather(*tasks, return_exceptions=True) == [reply] * 2
     assert source.server.commands == ["SendParameters"]
 
 
 @pytest.mark.parametrize("is_cancelled", [False, True])
 async def test_a_stream_asks_itself_if_the_other_connection_ends(is_cancelled: bool) -> None:
     source = FakeSource(two_streams=True)
-    first = asyncio.create_task(source.connect(None))
-    second = asyncio.create_task(source.connect_second(None))
-    await source.server.wait_for_commands(1)
-    await asyncio.sleep(0)
+    first, second = await connect_both(source)
     if is_cancelled:
         first.cancel()
     else:
@@ -194,36 +184,27 @@ async def test_parameters_are_not_void_while_another_connection_gives_them() -> 
 # Reading again -------------------------------------------------------------------------------
 
 
-async def test_changes_are_announced() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
-    source.server.replies["SendParameters"] = CM
-    await source.queries.parameters.refresh()
-    await source.queries.parameters.refresh()
+async def test_changes_are_announced(source: FakeSource) -> None:
+    await source.refresh(CM)
+    await source.refresh()
     assert source.announced == [(MM, 1), (CM, 2)]
     assert (await source.parameters()).xml == CM
     assert source.server.commands == ["SendParameters"] * 2
 
 
-async def test_a_change_of_the_statistics_is_not_announced_but_answered() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
-    source.server.replies["SendParameters"] = parameters_xml("mm", frames_sent=2)
-    await source.queries.parameters.refresh()
+async def test_a_change_of_the_statistics_is_not_announced_but_answered(source: FakeSource) -> None:
+    await source.refresh(parameters_xml("mm", frames_sent=2))
     assert source.announced == [(MM, 1)]
     answer = await source.parameters()
     assert answer.xml == parameters_xml("mm", frames_sent=2)
     general = answer.parsed.parameters.general
     assert general is not None
     assert general.frames_sent == 2
-    source.server.replies["SendParameters"] = b"\n" + parameters_xml("mm", frames_sent=3)
-    await source.queries.parameters.refresh()
+    await source.refresh(b"\n" + parameters_xml("mm", frames_sent=3))
     assert source.announced == [(MM, 1)]
 
 
-async def test_another_frame_of_poses_is_another_version_of_the_parameters() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_another_frame_of_poses_is_another_version_of_the_parameters(source: FakeSource) -> None:
     await source.queries.parameters.begin_version()
     assert source.announced == [(MM, 1), (MM, 2)]
     assert (await source.parameters()).version == 2
@@ -231,10 +212,10 @@ async def test_another_frame_of_poses_is_another_version_of_the_parameters() -> 
 
 async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_them() -> None:
     source = FakeSource()
-    await source.queries.parameters.refresh()
+    await source.refresh()
     with pytest.raises(ServerError):
         await source.connect(ServerError("err-what?"))
-    await source.queries.parameters.refresh()
+    await source.refresh()
     assert source.server.commands == ["SendParameters"]
 
 
@@ -246,21 +227,19 @@ async def test_a_server_that_was_silent_in_the_handshake_is_asked_once_more() ->
             await source.connect(SILENCE)
         source.server.replies["SendParameters"] = later
         source.server.commands.clear()
-        await source.queries.parameters.refresh()
+        await source.refresh()
         assert source.server.commands == ["SendParameters"]
-        await source.queries.parameters.refresh()
+        await source.refresh()
         assert source.server.commands == ["SendParameters"] * num_asked
     assert source.announced == [(MM, 1)]
 
 
 async def test_a_refusal_later_on_keeps_the_parameters_and_ends_the_reading(
-    caplog: pytest.LogCaptureFixture,
+    source: FakeSource, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
     source.server.replies["SendParameters"] = ServerError("busy")
     for _ in range(3):
-        await source.queries.parameters.refresh()
+        await source.refresh()
     assert source.server.commands == ["SendParameters"]
     assert (await source.parameters()).xml == MM
     assert source.announced == [(MM, 1)]
@@ -268,19 +247,17 @@ async def test_a_refusal_later_on_keeps_the_parameters_and_ends_the_reading(
     assert warning.startswith("lab: the parameters cannot be read again: ")
     source.server.replies["SendParameters"] = CM
     assert (await source.parameters(fresh=True)).xml == CM  # a peer may ask nevertheless
-    await source.queries.parameters.refresh()
+    await source.refresh()
     assert source.server.commands == ["SendParameters"] * 3
 
 
 @pytest.mark.parametrize("reply", [SILENCE, GARBAGE])
 async def test_no_answer_later_on_keeps_the_parameters_and_is_logged_once(
-    reply: bytes | Exception, caplog: pytest.LogCaptureFixture
+    source: FakeSource, reply: bytes | Exception, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
     source.server.replies["SendParameters"] = reply
     for _ in range(3):
-        await source.queries.parameters.refresh()
+        await source.refresh()
     assert source.server.commands == ["SendParameters"] * 3
     assert (await source.parameters()).xml == MM
     assert source.announced == [(MM, 1)]
@@ -294,8 +271,7 @@ async def test_an_answer_to_a_peer_is_read_again_later() -> None:
     source.server.replies["SendParameters"] = MM
     assert (await source.parameters()).xml == MM
     assert source.announced == [(MM, 1)]
-    source.server.replies["SendParameters"] = CM
-    await source.queries.parameters.refresh()
+    await source.refresh(CM)
     assert source.announced == [(MM, 1), (CM, 2)]
 
 
@@ -312,8 +288,7 @@ async def test_changes_are_logged(
     caplog.set_level(logging.INFO)
     source = FakeSource()
     await source.store_parameters(labelled(before))
-    source.server.replies["SendParameters"] = labelled(after)
-    await source.queries.parameters.refresh()
+    await source.refresh(labelled(after))
     [record] = [record for record in caplog.records if record.name == "gateway.queries.known_parameters"]
     assert record.levelno == level
     assert record.message.startswith(text)
@@ -327,9 +302,7 @@ def labelled(labels: str) -> bytes:
 # Peers ---------------------------------------------------------------------------------------
 
 
-async def test_a_section_is_taken_from_all_parameters() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_a_section_is_taken_from_all_parameters(source: FakeSource) -> None:
     for _ in range(2):
         section = await source.parameters("3d")
         assert parse_parameters(section.xml).parameters.markers is not None
@@ -345,9 +318,7 @@ async def test_a_section_is_taken_from_all_parameters() -> None:
     assert source.server.commands == ["SendParameters"]
 
 
-async def test_answers_for_some_sections_are_kept_up_to_a_limit() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_answers_for_some_sections_are_kept_up_to_a_limit(source: FakeSource) -> None:
     general = await source.parameters("general")
     both = await source.parameters("general", "3d")
     assert (await source.parameters("general", "3d")) is both
@@ -359,9 +330,7 @@ async def test_answers_for_some_sections_are_kept_up_to_a_limit() -> None:
     assert (await source.parameters("general")) is not general
 
 
-async def test_a_section_that_is_missing_is_requested_once() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_a_section_that_is_missing_is_requested_once(source: FakeSource) -> None:
     tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
     assert (await source.parameters("6d")).xml == tools
     assert (await source.parameters("6d")).xml == tools
@@ -374,9 +343,9 @@ async def test_a_section_that_is_missing_is_requested_once() -> None:
     assert (await source.parameters("6d", fresh=True)).xml == tools
 
 
-async def test_a_section_that_a_lost_connection_prevents_is_an_error_and_asked_for_again() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_a_section_that_a_lost_connection_prevents_is_an_error_and_asked_for_again(
+    source: FakeSource,
+) -> None:
     source.server.replies["SendParameters 6D"] = ClosedError("closed")
     assert (await source.parameters_error("6d")).code == "no-connection"
     tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
@@ -392,10 +361,8 @@ async def test_a_section_of_malformed_xml_is_requested() -> None:
 
 @pytest.mark.parametrize("problem", [ServerError("err-what?"), ReplyTimeoutError("did not answer")])
 async def test_a_server_without_single_sections_is_not_asked_again_in_the_connection(
-    problem: Exception,
+    source: FakeSource, problem: Exception
 ) -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
     source.server.replies["SendParameters 6D"] = problem
     assert (await source.parameters("6d")).xml == MM
     assert (await source.parameters("force")).xml == MM
@@ -405,9 +372,7 @@ async def test_a_server_without_single_sections_is_not_asked_again_in_the_connec
     assert (await source.parameters("6d")).xml == in_root("<The_6D/>")  # another server may know sections
 
 
-async def test_stale_parameters_are_returned_only_without_a_connection() -> None:
-    source = FakeSource()
-    await source.store_parameters(MM)
+async def test_stale_parameters_are_returned_only_without_a_connection(source: FakeSource) -> None:
     source.disconnect()
     assert (await source.parameters_error()).code == "no-connection"
     assert (await source.parameters(stale_ok=True, fresh=True)).xml == MM
@@ -466,7 +431,6 @@ async def test_xml_is_parsed_in_a_thread_and_only_its_statistics_if_nothing_else
     source = FakeSource()
     long = parameters_xml("mm") + b" " * LONG_XML_BYTES
     await source.store_parameters(long)
-    source.server.replies["SendParameters"] = long.replace(b">1<", b">2<")
-    await source.queries.parameters.refresh()
+    await source.refresh(long.replace(b">1<", b">2<"))
     assert parsed[0] == long
     assert all(len(xml) < 1000 for xml in parsed[1:])  # the statistics alone

@@ -7,7 +7,7 @@ import pytest
 from gateway.errors import ClosedError, QueryError, ReplyTimeoutError, ServerError
 from gateway.queries.server_requests import ServerRequests
 from gateway.rtc3d.commands import SendCurrentFrame, SendParameters
-from tests.unit.queries.fake_source import FakeSource, parameters_xml
+from tests.unit.queries.fake_source import CM, MM, FakeSource
 
 
 async def test_equal_requests_share_a_reply_and_different_ones_wait_for_each_other() -> None:
@@ -17,11 +17,11 @@ async def test_equal_requests_share_a_reply_and_different_ones_wait_for_each_oth
     await source.server.wait_for_commands(1)
     await asyncio.sleep(0)
     assert source.server.commands == ["SendParameters"]  # one at a time
-    source.server.answer(parameters_xml("mm"))
+    source.server.answer(MM)
     await source.server.wait_for_commands(2)
-    source.server.answer(parameters_xml("cm"))
+    source.server.answer(CM)
     results = await asyncio.gather(*tasks)
-    assert [result.xml for result in results] == [parameters_xml("mm")] * 5 + [parameters_xml("cm")] * 5
+    assert [result.xml for result in results] == [MM] * 5 + [CM] * 5
     assert source.server.commands == ["SendParameters", "SendParameters 6D"]
     assert len({id(result) for result in results}) == 2  # each reply is parsed once
 
@@ -31,8 +31,8 @@ async def test_cancelling_one_caller_does_not_cancel_a_shared_request() -> None:
     cancelled, other = (asyncio.create_task(source.parameters()) for _ in range(2))
     await source.server.wait_for_commands(1)
     cancelled.cancel()
-    source.server.answer(parameters_xml("mm"))
-    assert (await other).xml == parameters_xml("mm")
+    source.server.answer(MM)
+    assert (await other).xml == MM
     with contextlib.suppress(asyncio.CancelledError):
         await cancelled
 
@@ -49,32 +49,29 @@ async def test_the_fallback_is_sent_if_the_command_is_refused_and_its_error_rais
         await requests.send(SendCurrentFrame((component,)), fallback=SendCurrentFrame())
 
 
-async def test_a_command_without_a_reply_leads_to_a_timeout_error_that_is_not_cached() -> None:
-    source = FakeSource()
-    source.server.replies["SendParameters"] = ReplyTimeoutError("192.0.2.1:3020 did not answer")
-    error = await source.parameters_error()
-    assert (error.code, str(error)) == ("timeout", "source 'lab': 192.0.2.1:3020 did not answer")
-    source.server.replies["SendParameters"] = parameters_xml("mm")
-    assert (await source.parameters()).xml == parameters_xml("mm")
-
-
-async def test_a_request_waits_no_longer_than_configured() -> None:
+@pytest.mark.parametrize(
+    ("reply", "code", "text"),
+    [
+        (
+            ReplyTimeoutError("192.0.2.1:3020 did not answer"),
+            "timeout",
+            "source 'lab': 192.0.2.1:3020 did not answer",
+        ),
+        (None, "timeout", "source 'lab': no answer within 0.05 s; queries waiting for the server: 1"),
+        (ClosedError("closed"), "no-connection", "source 'lab' has just lost its connection: closed"),
+    ],
+    ids=["the server is silent", "the query may wait no longer", "the connection is lost"],
+)
+async def test_a_command_without_a_reply_is_an_error_and_the_next_one_is_sent(
+    reply: Exception | None, code: str, text: str
+) -> None:
     source = FakeSource(query_timeout_s=0.05)
+    if reply is not None:
+        source.server.replies["SendParameters"] = reply
     error = await source.parameters_error()
-    assert error.code == "timeout"
-    assert str(error) == "source 'lab': no answer within 0.05 s; queries waiting for the server: 1"
-    source.server.replies["SendParameters"] = parameters_xml("mm")
-    assert (await source.parameters()).xml == parameters_xml("mm")  # the next request is not blocked
-
-
-async def test_losing_the_connection_during_a_request_is_an_error() -> None:
-    source = FakeSource()
-    source.server.replies["SendParameters"] = ClosedError("the connection to 192.0.2.1:3020 was closed")
-    error = await source.parameters_error()
-    assert error.code == "no-connection"
-    assert str(error) == (
-        "source 'lab' has just lost its connection: the connection to 192.0.2.1:3020 was closed"
-    )
+    assert (error.code, str(error)) == (code, text)
+    source.server.replies["SendParameters"] = MM
+    assert (await source.parameters()).xml == MM
 
 
 async def test_losing_the_connection_while_waiting_for_another_request_is_an_error() -> None:
@@ -83,7 +80,7 @@ async def test_losing_the_connection_while_waiting_for_another_request_is_an_err
     await source.server.wait_for_commands(1)
     second = asyncio.create_task(source.queries._requests.send(SendCurrentFrame()))
     source.server.is_connected = False
-    source.server.answer(parameters_xml("mm"))
+    source.server.answer(MM)
     await first
     with pytest.raises(QueryError) as caught:
         await second

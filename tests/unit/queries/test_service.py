@@ -11,7 +11,7 @@ from gateway.outputs.registry import OUTPUTS
 from gateway.queries.service import SourceQueryService
 from gateway.rtc3d.parameters import SECTIONS
 from tests.toy_output import ToyOutput
-from tests.unit.queries.fake_source import FakeSource, parameters_xml
+from tests.unit.queries.fake_source import CM, MM, FakeSource
 
 
 async def trim(source: str, options: Mapping[str, str]) -> Answer:
@@ -115,15 +115,15 @@ async def test_sections_are_checked_before_the_server_is_asked() -> None:
 
 async def test_sections_are_requested_in_the_order_of_the_specification() -> None:
     source = FakeSource()
-    source.server.replies["SendParameters"] = parameters_xml("mm")  # without Force
-    source.server.replies["SendParameters 3D Force"] = parameters_xml("cm")
+    source.server.replies["SendParameters"] = MM  # without Force
+    source.server.replies["SendParameters 3D Force"] = CM
     parameters = await service_of(source).parameters("lab", ["force", "3d", "3d"], fresh=False)
-    assert (parameters.xml, parameters.session) == (parameters_xml("cm"), 1)
+    assert (parameters.xml, parameters.session) == (CM, 1)
 
 
 @pytest.mark.parametrize("sections", [(), tuple(SECTIONS), tuple(reversed(SECTIONS))])
 async def test_a_request_for_all_sections_is_a_request_for_all_parameters(sections: tuple[str, ...]) -> None:
     source = FakeSource()
-    source.server.replies["SendParameters"] = parameters_xml("mm")
+    source.server.replies["SendParameters"] = MM
     await service_of(source).parameters("lab", sections, fresh=False)
     assert source.server.commands == ["SendParameters"]

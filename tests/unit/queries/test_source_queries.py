@@ -1,12 +1,15 @@
 import asyncio
 import json
+from typing import Any
 
 import pytest
 
+from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError, ServerError
 from gateway.messages.encode import encode_message, with_sequence
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import JSON, XML
+from gateway.queries.parameter_refresh import ParameterRefresh
 from gateway.queries.questions import Question
 from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import ComponentType
@@ -14,31 +17,26 @@ from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.stream.state import StreamState
 from tests.servers import markers_frame
-from tests.unit.queries.fake_source import FakeSource, parameters_xml
+from tests.unit.queries.fake_source import MM, FakeSource
+from tests.virtual_time import run_in_virtual_time
 
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))[8:]
 
 
-async def test_parameters_are_answered_with_their_xml_age_session_and_version() -> None:
-    source = FakeSource()
-    await source.store_parameters(parameters_xml("mm"))
+async def test_parameters_are_answered_with_their_xml_age_session_and_version(source: FakeSource) -> None:
     answer = await source.answer("parameters")
-    assert (answer.payload, answer.encoding) == (parameters_xml("mm"), XML)
+    assert (answer.payload, answer.encoding) == (MM, XML)
     assert answer.attachment.keys() == {"age_s", "session", "parameters_version", "frame"}
     assert (answer.attachment["session"], answer.attachment["parameters_version"]) == (1, 1)
 
 
-async def test_stale_parameters_are_marked_as_stale() -> None:
-    source = FakeSource()
-    await source.store_parameters(parameters_xml("mm"))
+async def test_stale_parameters_are_marked_as_stale(source: FakeSource) -> None:
     source.server.is_connected = False
     answer = await source.answer("parameters", stale_ok=True)
     assert answer.attachment["stale"] is True
 
 
-async def test_parameters_are_converted_to_json_once() -> None:
-    source = FakeSource()
-    await source.store_parameters(parameters_xml("mm"))
+async def test_parameters_are_converted_to_json_once(source: FakeSource) -> None:
     first = await source.answer("parameters", as_json=True)
     second = await source.answer("parameters", as_json=True)
     assert first.payload is second.payload
@@ -51,14 +49,12 @@ async def test_parameters_are_converted_to_json_once() -> None:
     ("xml", "code", "text"),
     [
         (b"It is 3 o'clock.", "unreadable", "the server's XML cannot be read; ask without format=json"),
-        (parameters_xml("mm"), "nothing-yet", "the server's answer has no section 6d"),
+        (MM, "nothing-yet", "the server's answer has no section 6d"),
     ],
 )
 async def test_parameters_that_cannot_be_converted_to_json_are_an_error(
-    xml: bytes, code: str, text: str
+    source: FakeSource, xml: bytes, code: str, text: str
 ) -> None:
-    source = FakeSource()
-    await source.store_parameters(parameters_xml("mm"))
     source.server.replies["SendParameters 6D"] = xml
     assert (await source.answer("parameters", "6d")).payload == xml
     with pytest.raises(QueryError, match=text) as caught:
@@ -139,3 +135,34 @@ async def test_a_current_frame_without_the_component_is_an_error(
     with pytest.raises(QueryError, match=text) as caught:
         await source.answer("component", "3d")
     assert caught.value.code == code
+
+
+# When the parameters are read again, in virtual time ----------------------------------------
+
+
+async def readings_s(request_s: float, **settings: Any) -> list[int]:
+    """Return the times of all readings, with a request at one time, and another reading after 4 s."""
+    loop = asyncio.get_running_loop()
+    started_s, readings_s = loop.time(), list[int]()
+
+    async def read() -> None:
+        readings_s.append(round(loop.time() - started_s))
+        if len(readings_s) > 9:
+            task.cancel()  # time would stand still
+
+    source_settings = SourceSettings(name="lab", host="192.0.2.1", **settings)
+    refresh = ParameterRefresh(source_settings, read, lambda: started_s + 4.0)
+    task = asyncio.create_task(refresh.run())
+    loop.call_later(request_s, refresh.request)
+    await asyncio.sleep(30.0)
+    task.cancel()
+    return readings_s
+
+
+def test_an_answer_for_another_reason_delays_the_next_reading() -> None:
+    """So the server is not asked for what it has just sent."""
+    assert run_in_virtual_time(readings_s(99.0, parameters_interval_s=10.0)) == [14, 24]
+
+
+def test_without_an_interval_the_parameters_are_read_on_request_only() -> None:
+    assert run_in_virtual_time(readings_s(5.0, parameters_interval_s=0.0)) == [6]

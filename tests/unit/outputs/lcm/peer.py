@@ -15,6 +15,7 @@ from gateway.messages.decode import decode
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.encodings import JSON, json_bytes
 from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.queries import LcmQueries
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.losses import amounts
 from tests.waiting import wait_until_async
@@ -79,6 +80,11 @@ class Lab:
     def open(self) -> None:
         self.output.announce("lab")
         self.output.start()
+
+    @property
+    def queries(self) -> LcmQueries:
+        assert self.output._queries is not None
+        return self.output._queries
 
     def lost(self, source: str) -> dict[str, tuple[int, int]]:
         return amounts(self._losses[source].report())

@@ -21,32 +21,25 @@ URL = lcm_url()
 GROUP = ("239.255.76.67", urlsplit(URL).port)
 
 
-@pytest.fixture
-def rmem_max(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.mark.parametrize(
+    ("allowed", "url", "option"),
+    [
+        (212992, "udpm://239.255.76.67:7667?ttl=0", "&recv_buf_size=212992"),
+        (212992, "udpm://", "?recv_buf_size=212992"),
+        (2**23, "udpm://", "?recv_buf_size=4194304"),
+        (None, "udpm://", ""),
+        *((212992, url, "") for url in ("udpm://?recv_buf_size=1000", "memq://", "tcpq://host:7700")),
+    ],
+)
+def test_a_multicast_subscriber_gets_as_large_a_buffer_as_the_kernel_allows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, allowed: int | None, url: str, option: str
+) -> None:
+    """Up to 4 MiB. Without a known limit, the kernel decides; a size in the URL and other schemes stay."""
     path = tmp_path / "rmem_max"
     monkeypatch.setattr(connection, "_RMEM_MAX", path)
-    return path
-
-
-@pytest.mark.parametrize(("allowed", "size"), [(212992, 212992), (2**23, 2**22), (None, None)])
-def test_a_multicast_subscriber_gets_as_large_a_buffer_as_the_kernel_allows(
-    rmem_max: Path, allowed: int | None, size: int | None
-) -> None:
-    """Without a known limit, the kernel decides."""
     if allowed is not None:
-        rmem_max.write_text(f"{allowed}\n")
-    option = "" if size is None else f"recv_buf_size={size}"
-    url = "udpm://239.255.76.67:7667?ttl=0"
-    assert receiving_url(url) == (f"{url}&{option}" if option else url)
-    assert receiving_url("udpm://") == (f"udpm://?{option}" if option else "udpm://")
-
-
-@pytest.mark.parametrize(
-    "url", ["udpm://239.255.76.67:7667?recv_buf_size=1000", "memq://", "tcpq://host:7700"]
-)
-def test_other_urls_stay_as_they_are(rmem_max: Path, url: str) -> None:
-    rmem_max.write_text("212992\n")
-    assert receiving_url(url) == url
+        path.write_text(f"{allowed}\n")
+    assert receiving_url(url) == url + option
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])

@@ -73,10 +73,8 @@ async def test_an_output_without_queries_has_no_results() -> None:
 async def test_long_parameters_are_sent_by_a_thread(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     """Short ones must not overtake them: late subscribers would keep the old names."""
     monkeypatch.setattr(parameters_module, "LONG_REPLY_BYTES", 10)
-    queries = lab.output._queries
-    assert queries is not None
     may_send = threading.Event()
-    queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
+    lab.queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
     sent = lab.output.publish_parameters("lab", ServerParameters(b"<long enough/>", 3, 4))
     short = lab.output.publish_parameters("lab", ServerParameters(b"<a/>", 3, 5))
     may_send.set()

@@ -9,6 +9,7 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm import requests
 from gateway.outputs.lcm.queries import LcmQueries
+from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
@@ -90,12 +91,11 @@ async def test_requests_beyond_the_rate_get_an_error_and_are_counted(lab: Lab) -
 
 @with_settings(max_queries_per_source_per_s=1.0)
 async def test_a_flood_of_requests_is_not_a_flood_of_errors(lab: Lab) -> None:
-    assert lab.output._queries is not None
-    queries, is_sent = lab.output._queries, threading.Event()
-    queries._requests._admission._refusals = TokenBucket(2.0, monotonic=Clock())
+    is_sent = threading.Event()
+    lab.queries._requests._admission._refusals = TokenBucket(2.0, monotonic=Clock())
     for number in range(8):
         lab.send(request(number))
-    queries._long_sender.offer(is_sent.set)
+    lab.queries._long_sender.offer(is_sent.set)
     await wait_until_async(is_sent.is_set)
     lab.deliver()
     assert [reply.error_code for reply in lab.replies].count("rate") == 2
@@ -104,9 +104,8 @@ async def test_a_flood_of_requests_is_not_a_flood_of_errors(lab: Lab) -> None:
 async def test_a_long_reply_is_sent_by_a_thread(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     """It would keep the frames of all sources waiting."""
     monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
-    assert lab.output._queries is not None
     may_send = threading.Event()
-    lab.output._queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
+    lab.queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
     lab.send(request(1))
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
     lab.deliver()
@@ -134,8 +133,7 @@ async def test_malformed_requests_and_those_beyond_the_limits_are_counted_by_sou
     for data in (b"", request(5)[:-1], bytes(8) + request(6)[8:]):
         lab.send(data)
     assert (lab.lost("lab"), lab.lost("hall")) == ({"malformed request": (5, 0)}, {})
-    assert lab.output._queries is not None
-    assert lab.output._queries._requests._admission.num_pending == 0
+    assert lab.queries._requests._admission.num_pending == 0
 
 
 async def test_after_the_end_of_queries_no_request_is_answered() -> None:
@@ -191,3 +189,17 @@ async def test_an_error_is_the_reply_and_a_defect_is_logged(
     assert (received.error, received.error_code) == (error, code)
     assert lab.output.query_results == {"lab": {code: 1}}
     assert [record.message for record in caplog.records if record.exc_info] == logged == caplog.messages
+
+
+def test_messages_on_other_channels_leave_room_for_requests() -> None:
+    """On udpm://, the gateway's own messages arrive, too: they must not delay the replies."""
+    receiver = LcmReceiver("udpm://", "MOCAP", None, 64, lambda: None)
+    receiver._received = bucket = TokenBucket(100.0, monotonic=Clock(0.0))
+    requests: list[bytes] = []
+    receiver.add("MOCAP_LAB_COMMAND_REQUEST", requests.append)
+    for _ in range(100):
+        receiver._handle("MOCAP_LAB_3D", b"message")
+    assert bucket.left == pytest.approx(95.0)
+    receiver._handle("MOCAP_LAB_COMMAND_REQUEST", b"request")
+    assert bucket.left == pytest.approx(94.0)
+    assert requests == [b"request"]

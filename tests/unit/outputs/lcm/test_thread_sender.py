@@ -10,7 +10,6 @@ from gateway.errors import OutputError
 from gateway.outputs.lcm import thread_sender
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN
 from gateway.outputs.lcm.thread_sender import LcmThreadSender
-from tests.lcm_relay import LcmRelay
 from tests.waiting import wait_until
 
 URL = "tcpq://192.0.2.9:7700"
@@ -103,19 +102,6 @@ def test_messages_are_published_in_order_on_their_channels(lcm: FakeLcm, sender:
 # The queue -----------------------------------------------------------------------------------
 
 
-def test_the_queue_is_limited_in_messages(
-    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 3)
-    block(lcm, sender)
-    send(sender, b"second", b"third")
-    error = refusal(sender)
-    assert (error.cause, str(error)) == ("queue full", FULL)
-    lcm.reads.set()
-    wait_until(lambda: len(lcm.published) == 3)
-    assert messages(lcm) == [b"first", b"second", b"third"]
-
-
 def test_the_queue_is_limited_in_bytes(
     lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,7 +117,7 @@ def test_the_queue_is_limited_in_bytes(
 
 
 @pytest.mark.usefixtures("no_hold")
-def test_a_full_queue_is_a_problem_until_the_peer_reads_again_and_logged_once(
+def test_messages_beyond_the_queue_are_refused_until_the_peer_reads_again_and_logged_once(
     lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
@@ -139,7 +125,8 @@ def test_a_full_queue_is_a_problem_until_the_peer_reads_again_and_logged_once(
     block(lcm, sender)
     assert sender.problem == ""
     for _ in range(3):
-        refusal(sender)
+        error = refusal(sender)
+        assert (error.cause, str(error)) == ("queue full", FULL)
     assert sender.problem == FULL
     lcm.reads.set()
     wait_until(lambda: not sender._queue)
@@ -147,6 +134,7 @@ def test_a_full_queue_is_a_problem_until_the_peer_reads_again_and_logged_once(
     assert sender.problem == ""
     wait_until(lambda: not sender._queue)
     send(sender, b"third")
+    wait_until(lambda: messages(lcm) == [b"first", b"second", b"third"])
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
     assert caplog.messages[0] == f"lcm: {FULL}"
     assert caplog.messages[1].startswith("lcm: the peer reads again, after ")
@@ -221,16 +209,6 @@ def test_opening_is_tried_again_until_it_succeeds(lcm: FakeLcm, caplog: pytest.L
     assert (levels[0], levels[-1], set(levels[1:-1])) == (logging.WARNING, logging.INFO, {logging.DEBUG})
 
 
-def test_while_opening_takes_long_the_problem_names_the_url(lcm: FakeLcm) -> None:
-    lcm.opens.clear()
-    sender = LcmThreadSender(URL, lambda: None)
-    sender.open()
-    error = refusal(sender)
-    assert (error.cause, str(error)) == ("not open", f"LCM has not opened {URL} yet; check lcm.url")
-    assert sender.problem == str(error)
-    sender.close()
-
-
 # Closing -------------------------------------------------------------------------------------
 
 
@@ -268,35 +246,15 @@ def test_closing_ends_the_attempts_to_send_again(lcm: FakeLcm, sender: LcmThread
     assert sender.problem == CLOSED
 
 
-def test_what_opens_only_after_closing_is_not_used(lcm: FakeLcm) -> None:
+def test_while_lcm_opens_the_problem_names_the_url_and_closing_is_final(lcm: FakeLcm) -> None:
     opened: list[bool] = []
     lcm.opens.clear()
     sender = LcmThreadSender(URL, lambda: opened.append(True))
     sender.open()
+    assert (refusal(sender).cause, str(refusal(sender))) == ("not open", sender.problem)
+    assert sender.problem == f"LCM has not opened {URL} yet; check lcm.url"
     sender.close()
     lcm.opens.set()
     wait_until(lambda: not sender._thread.is_alive())
     assert (opened, sender.problem) == ([], CLOSED)
     assert refusal(sender).cause == "not open"
-
-
-# With a real relay ---------------------------------------------------------------------------
-
-
-def test_a_relay_that_reads_again_gets_every_message_that_was_accepted() -> None:
-    relay = LcmRelay()
-    sender = LcmThreadSender(relay.url, lambda: None)
-    sender.open()
-    wait_until(lambda: not sender.problem)
-    relay.stop_reading()
-    accepted = 0
-    while not sender.problem:
-        try:
-            send(sender, bytes(100_000))
-        except OutputError:
-            break
-        accepted += 1
-    relay.read_again()
-    wait_until(lambda: relay.num_published == accepted)
-    sender.close()
-    relay.close()

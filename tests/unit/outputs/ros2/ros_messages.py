@@ -20,34 +20,21 @@ def header(utime: int, frame_id: str) -> Any:
     return message("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
 
 
-def pose_fields(values: tuple[float, ...], position: str, orientation: str, vector: str) -> dict[str, Any]:
-    """Return the fields of a Pose or a Transform: x, y, z of type ``vector``, and a quaternion."""
-    x, y, z, qx, qy, qz, qw = values
-    return {
-        position: message(f"geometry_msgs/msg/{vector}", x=x, y=y, z=z),
-        orientation: message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    }
-
-
-def pose_stamped(utime: int, frame_id: str, values: tuple[float, ...]) -> Any:
-    """Return a PoseStamped."""
-    pose = message("geometry_msgs/msg/Pose", **pose_fields(values, "position", "orientation", "Point"))
-    return message("geometry_msgs/msg/PoseStamped", header=header(utime, frame_id), pose=pose)
-
-
 def tf_message(utime: int, frame_id: str, children: list[tuple[str, tuple[float, ...]]]) -> Any:
     """Return a TFMessage with the name and the pose of each child."""
-    transforms = [
-        message(
-            "geometry_msgs/msg/TransformStamped",
-            header=header(utime, frame_id),
-            child_frame_id=child,
-            transform=message(
-                "geometry_msgs/msg/Transform", **pose_fields(values, "translation", "rotation", "Vector3")
-            ),
+    transforms = []
+    for child, (x, y, z, qx, qy, qz, qw) in children:
+        translation = message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        rotation = message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
+        transform = message("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+        transforms.append(
+            message(
+                "geometry_msgs/msg/TransformStamped",
+                header=header(utime, frame_id),
+                child_frame_id=child,
+                transform=transform,
+            )
         )
-        for child, values in children
-    ]
     return message("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 

@@ -138,12 +138,6 @@ def test_messages_equal_those_of_real_ros(ours: bytes, theirs: str) -> None:
     assert ours == bytes.fromhex(theirs)
 
 
-@given(utimes, texts, poses)
-def test_poses_equal_those_of_rosbags(utime: int, frame_id: str, pose: tuple[float, ...]) -> None:
-    ours = StampedEncoder(frame_id).encode(cdr.stamp(utime), pack_pose(*pose))
-    assert ours == ros.encoded(ros.pose_stamped(utime, frame_id, pose))
-
-
 @given(utimes, texts, st.tuples(*6 * [doubles]))
 def test_wrenches_equal_those_of_rosbags(utime: int, frame_id: str, wrench: tuple[float, ...]) -> None:
     ours = StampedEncoder(frame_id).encode(cdr.stamp(utime), pack_wrench(*wrench))

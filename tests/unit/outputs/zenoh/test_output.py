@@ -1,11 +1,8 @@
 import json
-import logging
-import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zenoh
@@ -16,62 +13,28 @@ from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.command_session import command_config
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.networks import free_endpoint, zenoh_keys
+from tests.unit.outputs.zenoh.lab import Lab
 from tests.waiting import wait_until
 
 MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
 
 
-class Lab:
-    """A gateway's output, a peer that listens on ``endpoint``, and somebody connected to it."""
-
-    def __init__(self, **settings: Any) -> None:
-        self.endpoint = free_endpoint()
-        self.output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=self.endpoint), **settings))
-        self._somebody: zenoh.Session | None = None
-        self.samples: list[zenoh.Sample] = []
-
-    def open(self) -> None:
-        self.output.start()
-        wait_until(lambda: self.output.health().connected)
-
-    @property
-    def somebody(self) -> zenoh.Session:
-        if self._somebody is None:
-            self._somebody = open_zenoh("client", connect=self.endpoint)
-        return self._somebody
-
-    def hear(self, keys: str) -> zenoh.Subscriber[None]:
-        return self.somebody.declare_subscriber(keys, self.samples.append)
-
-    def sample_of(self, topic: Topic) -> zenoh.Sample:
-        """Return what arrives of a message published under ``topic``."""
-        publisher = self.output.publisher(topic)
-        wait_until(lambda: publisher.wanted)
-        self.samples.clear()
-        publisher.publish(b"message")
-        wait_until(lambda: self.samples)
-        [sample] = self.samples
-        assert sample.payload.to_bytes() == b"message"
-        return sample
-
-    def tokens(self, keys: str) -> list[str]:
-        replies = self.somebody.liveliness().get(keys)
-        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
-
-    def close(self) -> None:
-        self.output.close()
-        if self._somebody is not None:
-            self._somebody.close()
+def sample_of(lab: Lab, topic: Topic) -> zenoh.Sample:
+    """Return what arrives of a message published under ``topic``."""
+    publisher = lab.output.publisher(topic)
+    wait_until(lambda: publisher.wanted)
+    publisher.publish(b"message")
+    wait_until(lambda: lab.samples)
+    [sample] = lab.samples
+    assert sample.payload.to_bytes() == b"message"
+    return sample
 
 
-@pytest.fixture
-def lab() -> Iterator[Lab]:
-    lab = Lab()
-    yield lab
-    lab.close()
+def tokens(lab: Lab, keys: str) -> list[str]:
+    replies = lab.peer.liveliness().get(keys)
+    return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
 # Keys and samples ----------------------------------------------------------------------------
@@ -80,8 +43,6 @@ def lab() -> Iterator[Lab]:
 @pytest.mark.parametrize(
     ("parts", "type_name", "key"),
     [
-        (("3d",), "rtc3d.markers_t", "mocap/lab/3d"),
-        (("6d",), "rtc3d.tools_t", "mocap/lab/6d"),
         (("status",), "rtc3d.status_t", "mocap/lab/status"),
         (("6d", "a/b *?"), "rtc3d.tool_pose_t", "mocap/lab/6d/a%2Fb%20%2A%3F"),
     ],
@@ -90,24 +51,23 @@ def test_samples_have_the_topics_key_and_the_lcm_type_as_schema(
     lab: Lab, parts: tuple[str, ...], type_name: str, key: str
 ) -> None:
     lab.open()
-    subscriber = lab.hear("mocap/**")
-    sample = lab.sample_of(Topic("lab", parts, type_name))
-    subscriber.undeclare()
+    lab.subscribe("mocap/**")
+    sample = sample_of(lab, Topic("lab", parts, type_name))
     assert str(sample.key_expr) == key
     assert str(sample.encoding) == f"application/x-lcm;{type_name}"
 
 
-@pytest.mark.parametrize("express", [False, True])
-def test_samples_are_dropped_rather_than_waited_for_and_express_as_configured(express: bool) -> None:
-    lab = Lab(express=express, prefix="site/hall")
-    try:
-        lab.open()
-        with lab.hear("**"):
-            sample = lab.sample_of(MARKERS)
-        found = (sample.congestion_control, sample.express, str(sample.key_expr))
-        assert found == (zenoh.CongestionControl.DROP, express, "site/hall/lab/3d")
-    finally:
-        lab.close()
+@pytest.mark.parametrize(
+    "settings", [{"prefix": "site/hall", "express": express} for express in (False, True)]
+)
+def test_samples_are_dropped_rather_than_waited_for_and_express_as_configured(
+    lab: Lab, settings: dict[str, Any]
+) -> None:
+    lab.open()
+    lab.subscribe("**")
+    sample = sample_of(lab, MARKERS)
+    found = (sample.congestion_control, sample.express, str(sample.key_expr))
+    assert found == (zenoh.CongestionControl.DROP, settings["express"], "site/hall/lab/3d")
 
 
 def test_a_topic_is_wanted_while_somebody_subscribes_to_its_key(lab: Lab) -> None:
@@ -115,7 +75,7 @@ def test_a_topic_is_wanted_while_somebody_subscribes_to_its_key(lab: Lab) -> Non
     other = lab.output.publisher(Topic("lab", ("analog",), "rtc3d.analog_t"))
     assert not early.wanted
     lab.open()
-    first, second = lab.hear("mocap/lab/3d"), lab.hear("mocap/*/3d")
+    first, second = lab.subscribe("mocap/lab/3d"), lab.subscribe("mocap/*/3d")
     wait_until(lambda: early.wanted)
     late = lab.output.publisher(MARKERS)
     wait_until(lambda: late.wanted)
@@ -123,7 +83,7 @@ def test_a_topic_is_wanted_while_somebody_subscribes_to_its_key(lab: Lab) -> Non
     first.undeclare()
     second.undeclare()
     wait_until(lambda: not early.wanted and not late.wanted)
-    with lab.hear("mocap/lab/3d"):
+    with lab.subscribe("mocap/lab/3d"):
         wait_until(lambda: early.wanted)
         early.close()
         assert not early.wanted
@@ -138,38 +98,9 @@ def test_a_message_for_a_closed_publisher_is_refused_with_its_key(lab: Lab) -> N
     assert (str(caught.value), caught.value.cause) == (text, "closed")
 
 
-def test_a_message_is_refused_as_not_open_while_the_session_opens() -> None:
-    """The gateway publishes from its own thread while another one declares everything on the new session."""
-    refused: list[OutputError] = []
-
-    class Queries:
-        """Publishes at the moment when the session is set and messages cannot be sent yet."""
-
-        def __getattr__(self, _name: str) -> Callable[..., None]:
-            def publish(*_: object) -> None:
-                with pytest.raises(OutputError) as caught:
-                    publisher.publish(b"message")
-                refused.append(caught.value)
-
-            return publish
-
-    output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=free_endpoint())))
-    output._queries = cast(ZenohQueries, Queries())
-    publisher = output.publisher(MARKERS)
-    try:
-        output.start()
-        wait_until(lambda: refused)
-        assert refused[0].cause == "not open"
-        assert str(refused[0]).startswith("the Zenoh session is not open yet; ")
-    finally:
-        output._queries = None
-        output.close()
-
-
 def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: Lab) -> None:
     publisher = lab.output.publisher(MARKERS)
     lab.open()
-    lab.output.wait_until_open(30)  # it still declares on the session
     assert lab.output.session is not None
     lab.output.session.close()
     with pytest.raises(OutputError) as caught:
@@ -183,104 +114,37 @@ def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: L
 # Liveliness ----------------------------------------------------------------------------------
 
 
-def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
-    lab.output.announce("early")
-    lab.output.withdraw("early")
-    lab.output.announce("lab")
+@pytest.mark.parametrize("name", ["alive", "server"])
+def test_tokens_show_sources_and_their_servers_until_the_output_closes(lab: Lab, name: str) -> None:
+    """A source is alive from announcement to withdrawal, its server while its frames flow."""
+
+    def show(source: str, is_shown: bool = True) -> None:
+        for _ in range(2):
+            if name == "server":
+                lab.output.show_streaming(source, is_shown)
+            else:
+                (lab.output.announce if is_shown else lab.output.withdraw)(source)
+
+    def wait_for(*sources: str) -> None:
+        expected = [f"mocap/{source}/{name}" for source in sources]
+        wait_until(lambda: tokens(lab, f"mocap/*/{name}") == expected)
+
+    show("early")
+    show("early", False)
+    show("lab")
     lab.open()
-    seen: list[tuple[str, str]] = []
-
-    def alive() -> list[str]:
-        return lab.tokens("mocap/*/alive")
-
-    watching = lab.somebody.liveliness().declare_subscriber(
-        "mocap/*/alive", lambda sample: seen.append((str(sample.key_expr), str(sample.kind))), history=True
-    )
-    wait_until(lambda: alive() == ["mocap/lab/alive"])
-    lab.output.announce("hall-2")
-    wait_until(lambda: alive() == ["mocap/hall-2/alive", "mocap/lab/alive"])
-    lab.output.withdraw("lab")
-    wait_until(lambda: alive() == ["mocap/hall-2/alive"])
+    wait_for("lab")
+    show("hall-2")
+    wait_for("hall-2", "lab")
+    show("lab", False)
+    wait_for("hall-2")
+    show("lab")
+    wait_for("hall-2", "lab")
     lab.output.close()
-    wait_until(lambda: alive() == [])
-    born = [("mocap/lab/alive", "SampleKind.PUT"), ("mocap/hall-2/alive", "SampleKind.PUT")]
-    gone = {(key, "SampleKind.DELETE") for key, _ in born}
-    wait_until(lambda: gone <= set(seen))
-    watching.undeclare()
-    # Zenoh may tell of a token twice: from history, and as it comes.
-    told = list(dict.fromkeys(seen))
-    assert (told[:2], set(told[2:])) == (born, gone)
-
-
-def test_a_server_is_shown_while_its_frames_flow(lab: Lab) -> None:
-    def shown() -> list[str]:
-        return lab.tokens("mocap/*/server")
-
-    lab.output.show_streaming("lab", True)
-    lab.open()
-    wait_until(lambda: shown() == ["mocap/lab/server"])
-    lab.output.show_streaming("hall-2", True)
-    lab.output.show_streaming("hall-2", True)
-    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
-    lab.output.show_streaming("lab", False)
-    lab.output.show_streaming("lab", False)
-    wait_until(lambda: shown() == ["mocap/hall-2/server"])
-    lab.output.show_streaming("lab", True)
-    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
-    lab.output.close()
-    wait_until(lambda: shown() == [])
+    wait_for()
 
 
 # Opening -------------------------------------------------------------------------------------
-
-
-def test_an_endpoint_that_is_taken_is_told_once_and_used_once_it_is_free(
-    lab: Lab, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO, "gateway.outputs")
-    port = int(lab.endpoint.rpartition(":")[2])
-    with socket.create_server(("127.0.0.1", port)):
-        lab.output.start()
-        wait_until(lambda: caplog.records)
-        problem = lab.output.health().problem
-        assert lab.endpoint in problem
-        assert "are zenoh.config's endpoints right and free?" in problem
-        assert ".rs:" not in problem
-    wait_until(lambda: lab.output.health().connected)
-    wait_until(lambda: len(caplog.records) >= 2)
-    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
-    assert caplog.messages[0] == f"zenoh: {problem}"
-    assert caplog.messages[1].startswith("zenoh: the session is open, after ")
-
-
-def test_a_router_lost_and_found_is_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.outputs")
-    endpoint = free_endpoint()
-    router = open_zenoh("router", listen=endpoint)
-    output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=endpoint)))
-    publisher = output.publisher(MARKERS)
-    try:
-        output.start()
-        wait_until(lambda: output.health().connected)
-        caplog.clear()
-        output.maintain()
-        router.close()
-        wait_until(lambda: not output.health().connected)
-        with pytest.raises(OutputError) as caught:
-            publisher.publish(b"message")
-        assert (caught.value.cause, str(caught.value)) == ("no router", output.health().problem)
-        for _ in range(3):
-            output.maintain()
-        router = open_zenoh("router", listen=endpoint)
-        wait_until(lambda: output.health().connected)
-        for _ in range(3):
-            output.maintain()
-    finally:
-        output.close()
-        router.close()
-    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
-    assert "no Zenoh router is connected: start zenohd" in caplog.messages[0]
-    assert caplog.messages[1].startswith("zenoh: connected to the router, after ")
 
 
 def test_a_process_ends_although_the_router_never_answers() -> None:
@@ -299,26 +163,6 @@ output.close()
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
     )
     assert "the Zenoh session is not open yet; is the router running" in done.stdout
-
-
-def test_a_session_that_opens_only_after_close_is_closed() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
-        keys = zenoh_keys("client", connect=endpoint)
-        keys["connect"]["timeout_ms"] = -1
-        output = ZenohOutput(ZenohSettings(config=keys))
-        output.start()
-        connection, _ = silent.accept()  # the session is opening
-        output.close()
-        connection.close()
-    router = open_zenoh("router", listen=endpoint)
-    events: list[zenoh.SampleKind] = []
-    router.info.declare_transport_events_listener(lambda event: events.append(event.kind), history=True)
-    try:
-        wait_until(lambda: zenoh.SampleKind.DELETE in events)
-        assert not output.health().connected
-    finally:
-        router.close()
 
 
 def test_health_says_how_to_open_a_session_before_and_after(lab: Lab) -> None:

@@ -1,9 +1,8 @@
-"""Queries, parameters and files of the Zenoh output, with a service that the test sets."""
+"""Queries, parameters and files of the Zenoh output, with a scripted service."""
 
 import asyncio
 import json
 import logging
-from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,130 +10,50 @@ import pytest
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.log import current_log_fields
 from gateway.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.outputs.contract import Answer, KeyPath, ServerFile, ServerParameters
+from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh import queries as queries_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.losses import amounts
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
-from tests.queried_gateway import Reply, query, query_all
+from tests.networks import open_zenoh, zenoh_keys
+from tests.unit.outputs.zenoh.lab import STATUS, QueriedLab
 from tests.waiting import wait_until_async
 
 XML = b"<RT_Parameters/>"
-STATUS, C3D = ("status",), ("c3d",)
-
-
-class Unmakeable:
-    """A payload that cannot be made."""
-
-    num_bytes, is_made = 1, False
-
-    def make(self) -> bytes:
-        raise QueryError("no JSON of this frame")
-
-
-class Service:
-    """Answers every key with itself, or raises ``error``."""
-
-    def __init__(self) -> None:
-        self.sources = {"lab", "hall"}
-        self.error: Exception | None = None
-        self.payload = b"payload"
-        self.received: list[tuple[str, Sequence[Any], dict[str, str]]] = []
-        self.log_fields: dict[str, str] = {}
-
-    def serves(self, source: str) -> bool:
-        return source in self.sources
-
-    def keys(self, _source: str) -> list[KeyPath]:
-        return [STATUS, C3D, ("parameters", "3d")]
-
-    def commands(self) -> list[str]:
-        return ["recording", "take"]
-
-    def accepted_keys(self, _source: str) -> str:
-        return "status, c3d"
-
-    async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
-        self.received.append((source, path, dict(options)))
-        self.log_fields = dict(current_log_fields())
-        if self.error is not None:
-            raise self.error
-        return Answer(self.payload, "text/plain", {"age_s": 1.5})
-
-    async def answer_all(
-        self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
-    ) -> dict[KeyPath, Answer]:
-        self.received.append((source, list(paths), dict(options)))
-        answers = {path: Answer("/".join(path).encode(), "text/plain") for path in paths}
-        return answers if "fail" not in options else answers | {STATUS: Answer(Unmakeable(), "text/plain")}
-
-
-class Lab:
-    """An output that serves the source "lab", and a client connected to it."""
-
-    def __init__(self) -> None:
-        self.service = Service()
-        self.endpoint = free_endpoint()
-        self.output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=self.endpoint)))
-        self.output.serve_queries(self.service)  # type: ignore[arg-type]  # it has the methods that are called
-        self.samples: list[zenoh.Sample] = []
-
-    async def open(self) -> None:
-        self.output.announce("lab")
-        self.output.start()
-        await wait_until_async(lambda: self.output.health().connected)
-        await asyncio.to_thread(self.output.wait_until_open, 30)  # it declares the queryables last
-        self.peer = open_zenoh("client", connect=self.endpoint)
-
-    def subscribe(self, keys: str) -> None:
-        self.peer.declare_subscriber(keys, self.samples.append)
-
-    def payloads(self, key: str) -> list[bytes]:
-        return [each.payload.to_bytes() for each in self.samples if str(each.key_expr) == key]
-
-    async def query(self, selector: str) -> Reply:
-        return await query(self.peer, selector)
 
 
 @pytest.fixture
-async def lab() -> AsyncIterator[Lab]:
-    lab = Lab()
-    await lab.open()
-    yield lab
-    await lab.output.stop_queries()
-    lab.output.close()
-    lab.peer.close()
+def lab(queried: QueriedLab) -> QueriedLab:
+    return queried
 
 
 # Queries -------------------------------------------------------------------------------------
 
 
-async def test_the_service_receives_source_path_and_options(lab: Lab) -> None:
+async def test_the_service_receives_source_path_and_options(lab: QueriedLab) -> None:
     reply = await lab.query("mocap/lab/parameters/3d?format=json;fresh;_time=now;a=b=c")
-    assert reply == ("mocap/lab/parameters/3d", b"payload", "text/plain", {"age_s": 1.5}, "", "")
+    assert reply == ("mocap/lab/parameters/3d", b"answer 1", "text/plain", {"age_s": 1.5}, "", "")
     options = {"format": "json", "fresh": "", "a": "b=c"}
     assert lab.service.received == [("lab", ("parameters", "3d"), options)]
     assert lab.service.log_fields == {"source": "lab"}
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
 
 
-async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -> None:
-    replies = await query_all(lab.peer, "mocap/lab/**?format=json")
+async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: QueriedLab) -> None:
+    replies = await lab.query_all("mocap/lab/**?format=json")
     assert sorted((reply.key, reply.payload, reply.attachment) for reply in replies) == [
         ("mocap/lab/parameters/3d", b"parameters/3d", {}),
         ("mocap/lab/status", b"status", {}),
     ]
     assert lab.service.received == [("lab", [STATUS, ("parameters", "3d")], {"format": "json"})]
-    replies = await query_all(lab.peer, "mocap/lab/**?fail=yes")
+    replies = await lab.query_all("mocap/lab/**?fail=yes")
     assert [(reply.key, reply.code) for reply in replies] == [("mocap/lab/parameters/3d", "")]
-    replies = await query_all(lab.peer, "mocap/lab/parameters/*")
+    replies = await lab.query_all("mocap/lab/parameters/*")
     assert [reply.key for reply in replies] == ["mocap/lab/parameters/3d"]
-    replies = await query_all(lab.peer, "mocap/*/c3d")
+    replies = await lab.query_all("mocap/*/c3d")
     assert [(reply.key, reply.payload) for reply in replies] == [("mocap/lab/c3d", b"c3d")]
 
 
@@ -152,7 +71,7 @@ async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -
     ],
 )
 async def test_a_selector_that_matches_nothing_is_an_error_with_the_accepted_keys(
-    lab: Lab, selector: str, error: str
+    lab: QueriedLab, selector: str, error: str
 ) -> None:
     reply = await lab.query(selector)
     assert (reply.error, reply.code) == (error, "bad-request")
@@ -161,7 +80,7 @@ async def test_a_selector_that_matches_nothing_is_an_error_with_the_accepted_key
 
 
 async def test_errors_are_replies_with_their_code_and_are_counted(
-    lab: Lab, caplog: pytest.LogCaptureFixture
+    lab: QueriedLab, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab.service.error = QueryError("the server refuses", code="refused")
     for _ in range(2):
@@ -177,32 +96,30 @@ async def test_errors_are_replies_with_their_code_and_are_counted(
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"refused": 2, "defect": 1}})
 
 
-async def test_sources_are_served_between_announcement_and_withdrawal(lab: Lab) -> None:
-    assert await query_all(lab.peer, "mocap/hall/status") == []
+async def test_sources_are_served_between_announcement_and_withdrawal(lab: QueriedLab) -> None:
+    assert await lab.query_all("mocap/hall/status") == []
     lab.output.announce("hall")
     lab.output.announce("hall")
     reply = await lab.query("mocap/hall/status")
     assert reply.key == "mocap/hall/status"
     lab.output.withdraw("hall")
     lab.output.withdraw("hall")
-    assert await query_all(lab.peer, "mocap/hall/status") == []
-    assert (await lab.query("mocap/lab/status")).payload == b"payload"
+    assert await lab.query_all("mocap/hall/status") == []
+    assert (await lab.query("mocap/lab/status")).key == "mocap/lab/status"
 
 
-async def test_a_source_that_the_gateway_no_longer_has_gets_no_reply(lab: Lab) -> None:
+async def test_a_source_that_the_gateway_no_longer_has_gets_no_reply(lab: QueriedLab) -> None:
     lab.service.sources.discard("lab")
-    assert await query_all(lab.peer, "mocap/lab/status") == []
+    assert await lab.query_all("mocap/lab/status") == []
     assert lab.service.received == []
 
 
 async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_own(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+    lab: QueriedLab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(answers_module, "LONG_ANSWER_BYTES", 7)
-    queries = lab.output._queries
-    assert queries is not None
+    monkeypatch.setattr(answers_module, "LONG_ANSWER_BYTES", 8)
     used: list[str] = []
-    for name, sender in (("short", queries._sender), ("long", queries._answers._long_sender)):
+    for name, sender in (("short", lab.queries._sender), ("long", lab.queries._answers._long_sender)):
         offer = sender.offer
 
         def record(call: Any, num_bytes: int = 0, name: str = name, offer: Any = offer) -> Any:
@@ -210,16 +127,16 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
             return offer(call, num_bytes)
 
         monkeypatch.setattr(sender, "offer", record)
-    assert (await lab.query("mocap/lab/status")).payload == b"payload"
-    lab.service.payload = b"8 bytes."
-    assert (await lab.query("mocap/lab/status")).payload == b"8 bytes."
+    assert (await lab.query("mocap/lab/status")).payload == b"answer 1"
+    lab.service.num_bytes = 9
+    assert (await lab.query("mocap/lab/status")).payload == b"answer 2 "
     assert used == ["short", "long"]
 
 
 # Parameters and files ------------------------------------------------------------------------
 
 
-async def test_parameters_are_published_with_their_encoding_and_a_low_priority(lab: Lab) -> None:
+async def test_parameters_are_published_with_their_encoding_and_a_low_priority(lab: QueriedLab) -> None:
     lab.subscribe("mocap/lab/parameters")
     frame = CoordinateFrame("lab", 0.01, translation_m=(0, 0, 2))
     lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4, frame=frame))
@@ -241,7 +158,7 @@ async def test_parameters_are_published_with_their_encoding_and_a_low_priority(l
     assert sample.priority == zenoh.Priority.DATA_LOW
 
 
-async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab) -> None:
+async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: QueriedLab) -> None:
     lab.subscribe("mocap/lab/*")
     await lab.query("mocap/lab/status")
     file = ServerFile(Path("/spool/Käfig.c3d"), 7)
@@ -260,20 +177,18 @@ async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab
 
 
 async def test_parameters_published_before_opening_follow_when_the_session_opens() -> None:
-    lab = Lab()
+    lab = QueriedLab()
     lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
     lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
     lab.output.announce_file("lab", ServerFile(Path("early.c3d"), 7))
-    await lab.open()
+    await asyncio.to_thread(lab.open)
     lab.subscribe("mocap/lab/*")
     await wait_until_async(lambda: lab.payloads("mocap/lab/parameters"))
     assert set(lab.payloads("mocap/lab/parameters")) == {XML}
-    await lab.output.stop_queries()
-    lab.output.close()
-    lab.peer.close()
+    await lab.stop()
 
 
-async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: Lab) -> None:
+async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: QueriedLab) -> None:
     lab.output.announce("hall")
     lab.output.publish_parameters("hall", ServerParameters(b"<old/>", 1, 4))
     await lab.query("mocap/hall/status")  # the thread sends the reply after the parameters
@@ -296,7 +211,7 @@ async def test_an_output_without_queries_has_no_results() -> None:
     await asyncio.to_thread(output.close)
 
 
-async def test_an_event_loop_that_has_ended_is_no_error(lab: Lab) -> None:
+async def test_an_event_loop_that_has_ended_is_no_error(lab: QueriedLab) -> None:
     loop = asyncio.new_event_loop()
     loop.close()
     queries = queries_module.ZenohQueries(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
@@ -305,7 +220,7 @@ async def test_an_event_loop_that_has_ended_is_no_error(lab: Lab) -> None:
 
 
 async def test_what_zenoh_does_not_publish_is_counted_and_logged(
-    lab: Lab, caplog: pytest.LogCaptureFixture
+    lab: QueriedLab, caplog: pytest.LogCaptureFixture
 ) -> None:
     session = open_zenoh("client", connect=lab.endpoint)
     loop = asyncio.get_running_loop()

@@ -48,6 +48,7 @@ class Lab:
         if self.defects:
             raise self.defects.pop()
         self.declared.append(session)
+        self.while_declaring = (self.holder.is_cut_off, self.holder.refusal.cause)
 
     def open(self) -> None:
         """Do what the opening thread does."""
@@ -72,6 +73,8 @@ def test_the_session_is_opened_as_soon_as_there_is_a_router(
     assert lab.declared == [lab.session]
     assert (lab.listen.call_args.args[0].indirect, lab.listen.call_args.kwargs) == (False, {"history": True})
     assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+    assert caplog.messages[0] == f"zenoh: {problems[1]}"
+    assert caplog.messages[1].startswith("zenoh: it is open, after ")
 
 
 def test_without_a_transport_nothing_can_be_sent(
@@ -82,7 +85,12 @@ def test_without_a_transport_nothing_can_be_sent(
     holder = lab.holder
     assert (holder.is_cut_off, holder.refusal.cause) == (True, "not open")
     lab.open()
-    assert (holder.is_cut_off, holder.refusal.cause) == (True, "no router")
+    assert (holder.is_cut_off, holder.refusal.cause, str(holder.refusal)) == (
+        True,
+        "no router",
+        "no router there",
+    )
+    assert holder.health.problem == "no router there"
     for is_open, is_cut_off in ((True, False), (True, False), (False, False), (False, True), (True, False)):
         lab.transport(is_open=is_open)
         assert (holder.is_cut_off, holder.health.connected) == (is_cut_off, not is_cut_off)
@@ -145,8 +153,10 @@ def test_what_cannot_be_declared_is_declared_on_the_next_session(
 
 
 def test_a_peer_needs_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But nothing is sent before everything is declared: the gateway publishes from its own thread."""
     lab = Lab(monkeypatch, mode="peer")
     lab.open()
+    assert lab.while_declaring == (True, "not open")
     assert not lab.holder.is_cut_off
     lab.holder.maintain()
     assert lab.holder.health.connected
