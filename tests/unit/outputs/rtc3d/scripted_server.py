@@ -1,12 +1,10 @@
 """A LiveServer whose clients are scripted: no sockets, no threads, and the event loop's time is virtual."""
 
 import asyncio
-import inspect
 import io
 import logging
 import struct
 from collections.abc import Callable, Coroutine
-from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,30 +17,9 @@ from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import ClientConnection
 from tests.unit.outputs.rtc3d.live_client import body, markers
 from tests.unit.rtc3d_server.wire import DATA, command, packets_in
-from tests.virtual_time import run_in_virtual_time
 
 _Result = TypeVar("_Result")
 _CLIENT, _SERVER = ("192.0.2.7", 4711), ("192.0.2.1", 3120)
-
-
-def in_virtual_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run a test in virtual time, with a new ``server`` and a ``client`` of it if the test takes them."""
-    names = inspect.signature(test).parameters
-
-    async def with_server(fixtures: dict[str, Any]) -> None:
-        made: dict[str, Any] = {}
-        if not names.keys().isdisjoint({"server", "client"}):
-            made["server"] = ScriptedServer()
-            made["client"] = made["server"].client() if "client" in names else None
-        await test(**fixtures, **{name: each for name, each in made.items() if name in names})
-
-    @wraps(test)
-    def run(**fixtures: Any) -> None:
-        run_in_virtual_time(with_server(fixtures))
-
-    others = [each for name, each in names.items() if name not in {"server", "client"}]
-    run.__signature__ = inspect.Signature(others)  # type: ignore[attr-defined]
-    return run
 
 
 async def settle() -> None:

@@ -1,14 +1,10 @@
 """A client of a simulator with faults, without a socket, in virtual time, and packets that faults change."""
 
 import asyncio
-import inspect
 import struct
-import types
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 
 from gateway.rtc3d.packets import Packet, PacketReader
 from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault
@@ -28,34 +24,10 @@ from tests.unit.rtc3d_server.wire import (
     packet,
     packets_in,
 )
-from tests.virtual_time import run_in_virtual_time
 
 RATE_HZ = 1000.0
 NEVER_MS = 600_000.0
 VERSION = (COMMAND, b"OK-Version 1.0")
-
-
-def played(scenario: Callable[..., Any]) -> Callable[..., None]:
-    """Run a test with a client in virtual time, whose clock the faults read, too."""
-
-    def run(monkeypatch: pytest.MonkeyPatch, **fixtures: Any) -> None:
-        clock = types.SimpleNamespace(monotonic=lambda: asyncio.get_running_loop().time())
-        for module in ("pipeline", "write_queue"):
-            monkeypatch.setattr(f"gateway.simulator.faults.{module}.time", clock)
-
-        async def with_client() -> None:
-            client = FaultyClient()
-            await scenario(client, **fixtures)
-            await client.faults.clear()
-            assert client.filter.waiting_bytes == 0
-
-        run_in_virtual_time(with_client())
-
-    _, *others = inspect.signature(scenario).parameters.values()
-    own = inspect.Parameter("monkeypatch", inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    run.__signature__ = inspect.Signature([own, *others])  # type: ignore[attr-defined]
-    run.__name__ = scenario.__name__
-    return run
 
 
 class FaultyClient:

@@ -37,7 +37,6 @@ from tests.unit.simulator.faults.faulty_client import (
     components_in_packet,
     frame,
     markers,
-    played,
     writes_for,
 )
 
@@ -215,7 +214,6 @@ def test_jitter_is_exponential_with_the_configured_mean() -> None:
         *((Undersize(), 0, []), (Undersize(size_bytes=7), 7, []), (Cut(), 1000, ["close"])),
     ],
 )
-@played
 async def test_a_header_can_announce_what_does_not_follow(
     client: FaultyClient, fault: Fault, size: int, calls: list[str]
 ) -> None:
