@@ -196,9 +196,7 @@ async def test_replies_wait_for_the_end_of_a_file_and_frames_are_dropped(tmp_pat
     assert client.connection.session.frames_dropped == 1
 
 
-async def test_packets_held_back_by_a_file_are_bounded(
-    server: ScriptedServer, tmp_path: Path
-) -> None:
+async def test_packets_held_back_by_a_file_are_bounded(server: ScriptedServer, tmp_path: Path) -> None:
     """Exactly as many wait as fit; the others are counted."""
     client = await stalled(server, tmp_path, b"walk", STREAM)
     for _ in range(MAX_HELD_PACKETS + 3):

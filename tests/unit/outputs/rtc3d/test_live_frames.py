@@ -4,9 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, WAIT_US
+from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.unit.outputs.rtc3d.live_client import (
     FAST,
     SLOW,
@@ -20,7 +19,7 @@ from tests.unit.outputs.rtc3d.live_client import (
     frame_of_markers,
     markers,
 )
-from tests.unit.rtc3d_server.wire import COMMAND, ERROR, EVENT, MARKERS, WireComponent
+from tests.unit.rtc3d_server.wire import EVENT, MARKERS
 
 UNKNOWN = bytes.fromhex("0000000c 00000063 01020304")
 WHOLE = body(markers(7, 10_000), TOOL_OUT_OF_VIEW, event(7, 10_000, 3), UNKNOWN) + b"\n"
@@ -107,14 +106,6 @@ def test_the_current_frame_is_the_newest_and_each_is_sent_once() -> None:
     assert other.numbers() == [[9]]
 
 
-def test_requests_for_components_that_never_come_are_bounded() -> None:
-    client = LiveSource().client()
-    for _ in range(MAX_FRAME_REQUESTS):
-        assert client.send("SendCurrentFrame Force")[0][0] == COMMAND
-    assert client.send("SendCurrentFrame Force")[0][0] == ERROR
-    assert len(client.session.measurement_stopped()) == MAX_FRAME_REQUESTS
-
-
 def test_little_is_kept_of_large_frames() -> None:
     source = LiveSource()
     client = source.client("StreamFrames 3D")
@@ -147,48 +138,6 @@ def test_a_client_of_one_stream_gets_every_frame_of_it() -> None:
     client = source.client("StreamFrames Analog")
     source.play(1, 5)
     assert client.numbers() == [[number] for number in range(10, 60)]
-
-
-def test_at_first_frames_wait_until_the_announced_components_are_known() -> None:
-    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=1000.0)
-    client = source.client(BOTH)
-    for step in range(5):
-        source.arrive(body(analog(5 + step, 5000 + 1000 * step)), FAST)
-        source.wait(1000)
-    assert client.take() == []
-    source.play(1, 3)
-    assert client.numbers() == joined(1, 3)
-
-
-def test_at_first_frames_wait_until_the_rates_are_known() -> None:
-    source = LiveSource(is_new=True)
-    client = source.client(BOTH)
-    source.play(1, 20, fast_first=True)
-    assert client.numbers() == joined(1, 20)
-
-
-def test_the_second_frame_of_a_new_source_waits_for_its_sample() -> None:
-    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=100.0)
-    client = source.client(BOTH)
-    for number in range(1, 4):
-        source.arrive(frame_of_markers(number))
-        source.wait(1000)
-        source.arrive(body(analog(number, 10_000 * number)), FAST)
-        source.wait(9000)
-    assert client.numbers() == [[1, 1], [2, 2], [3, 3]]
-
-
-def test_a_client_that_asks_between_two_samples_gets_complete_frames_only() -> None:
-    source = LiveSource(played=3, fast_first=True)
-    source.scene.forget_frames()
-    source.arrive(body(analog(40, 40_000)), FAST)
-    source.scene.forget_frames()
-    client = source.client(BOTH)
-    source.arrive(frame_of_markers(4))
-    for step in range(1, 10):
-        source.arrive(body(analog(40 + step, 40_000 + 1000 * step)), FAST)
-    source.play(5, 6, fast_first=True)
-    assert client.numbers() == joined(5, 6)
 
 
 @pytest.mark.parametrize("command", ["StreamFrames 3D Analog", "SendCurrentFrame 3D Analog"])
@@ -232,19 +181,6 @@ def test_requests_with_pauses_between_them_do_not_change_the_rate() -> None:
     assert source.scene.frames(()).rate == 100
 
 
-def test_a_frame_waits_for_the_faster_stream_and_not_for_ever() -> None:
-    source = LiveSource(played=5)
-    client = source.client(BOTH)
-    source.arrive(frame_of_markers(6))
-    source.wait(WAIT_US - 1)
-    assert client.take() == []
-    source.wait(1)
-    assert client.numbers() == [[6, 59]]
-    source.wait(1_000_000)
-    source.arrive(frame_of_markers(7))
-    assert client.numbers() == [[7]]
-
-
 def test_while_the_slower_stream_has_no_frames_the_faster_one_sets_the_rate() -> None:
     source = LiveSource(played=5)
     client = source.client(BOTH)
@@ -265,40 +201,7 @@ def test_a_new_measurement_is_joined_from_its_first_frames(fast_first: bool) -> 
     assert client.numbers()[1:] == joined(2, 5)
 
 
-def test_a_connection_that_is_made_again_continues_the_joined_frames() -> None:
-    source = LiveSource(played=5)
-    client = source.client(BOTH)
-    for number in range(6, 10):
-        source.arrive(frame_of_markers(number), SLOW + 2)
-        source.arrive(body(analog(10 * number, 10_000 * number)), FAST)
-        source.wait(10_000)
-    assert client.numbers() == joined(6, 9)
-
-
-def test_time_stamps_that_are_no_times_join_the_newest_without_waiting() -> None:
-    source = LiveSource()
-    client = source.client(BOTH)
-    for number in range(1, 10):
-        source.arrive(body(analog(number, 0)), FAST)
-        source.arrive(body(markers(number, 0)), SLOW)
-    assert client.numbers()[-6:] == [[number, number] for number in range(4, 10)]
-
-
 # Events ----------------------------------------------------------------------------------------
-
-
-def test_no_event_is_lost_at_a_low_rate() -> None:
-    source = LiveSource()
-    client = source.client("StreamFrames FrequencyDivisor:4 3D Events")
-    for number in range(1, 10):
-        source.arrive(frame_of_markers(number, event_of(number)))
-    frames = client.take()
-    assert [frame[0].frame_number for frame in frames] == [1, 5, 9]
-    items: list[tuple[float, ...]] = [(number, 10_000 * number, -1, -1, -1) for number in range(1, 10)]
-    expected = [(1, items[:1]), (5, items[1:5]), (9, items[5:])]
-    assert [frame[1] for frame in frames] == [
-        WireComponent(EVENT, number, 10_000 * number, found) for number, found in expected
-    ]
 
 
 def test_a_client_that_lacks_events_is_counted() -> None:
