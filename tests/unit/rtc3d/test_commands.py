@@ -141,19 +141,7 @@ def test_the_error_says_what_is_accepted(verb: str, parameters: list[str], text:
 
 def test_the_error_of_an_invalid_rate_shows_the_three_forms() -> None:
     """A rate that is misread would make the server send too much or nothing."""
-    numbers = [
-        "",
-        "0",
-        "-60",
-        "+60",
-        "60Hz",
-        "nan",
-        "inf",
-        "1e3",
-        "1_000",
-        "60:30",
-        "\N{ARABIC-INDIC DIGIT SIX}",
-    ]
+    numbers = ["", *["0", "-60", "+60", "60Hz", "nan", "inf", "1e3", "1_000", "60:30", "٦"]]
     rates = [prefix + number for prefix in ("Frequency:", "FrequencyDivisor:") for number in numbers]
     for rate in (*rates, "Frequency:0.0000009", "Frequency:" + "9" * 400, "FrequencyDivisor:2.5", ":"):
         text = error_text(f"StreamFrames 3D {rate}".encode())
