@@ -56,14 +56,9 @@ def event_of(number: int) -> bytes:
 class LiveSource:
     """A live source with clients; time passes only by ``wait``."""
 
-    def __init__(
-        self, *, is_new: bool = False, played: int = 0, fast_first: bool = False, **announced_hz: float
-    ) -> None:
-        """With ``is_new``, nothing is known of its streams, so frames wait at first; see ``play``."""
+    def __init__(self, *, played: int = 0, fast_first: bool = False) -> None:
         self.scene = LiveScene("lab")
-        self.scene._announced_hz = {ComponentType[name]: rate_hz for name, rate_hz in announced_hz.items()}
-        if not is_new:
-            self.scene._arrivals.began_us = -1_000_000_000
+        self.scene._arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
         self.now_us = 0
         self._clients: list[LiveClient] = []
         self.scene.start()

@@ -8,24 +8,14 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs.rtc3d.client_filter import (
-    MAX_HELD_PACKETS,
-    asks_for_parameters,
-    recording_control,
-)
+from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, asks_for_parameters, recording_control
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
 from gateway.rtc3d.commands import ControlRecording
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.losses import amounts
-from tests.unit.outputs.rtc3d.scripted_server import (
-    Client,
-    Line,
-    ScriptedServer,
-    settle,
-    write_file,
-)
+from tests.unit.outputs.rtc3d.scripted_server import Client, Line, ScriptedServer, settle, write_file
 from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, streaming
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, command, packet
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gateway.errors import ConfigError, FrameError
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
-from gateway.simulator.faults.base import Fault, LastingConnectionFault
+from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault
 from gateway.simulator.faults.frame_faults import (
     FrozenTimestamps,
     JumpingTimestamps,
@@ -29,16 +29,57 @@ from gateway.simulator.faults.reply_faults import MinimalServer, RefusedCommands
 from gateway.simulator.faults.server_faults import Restart
 from gateway.simulator.faults.stream_faults import Delay, Jitter, Merge, Split
 from gateway.simulator.scene_settings import SceneSettings
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, packet, packets_in
-from tests.unit.simulator.faults.faulty_client import (
-    FaultyClient,
-    active,
-    changed,
-    components_in_packet,
-    frame,
-    markers,
-    writes_for,
+from gateway.simulator.simulator import Simulator
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
+    COMMAND,
+    DATA,
+    MARKERS,
+    TOOLS,
+    ByteOrder,
+    WireComponent,
+    components_in,
+    packet,
+    packets_in,
 )
+from tests.unit.simulator.faults.faulty_client import FaultyClient
+
+
+def active(fault: Fault, seed: int = 1) -> ActiveFault:
+    return ActiveFault(fault, Simulator(CountingScene()).faults, np.random.default_rng(seed))
+
+
+def markers(
+    byte_order: ByteOrder = "big", count: int = 2, number: int = 7, timestamp_us: int = 9000
+) -> bytes:
+    """Return a 3D component; marker k is at (k, 1.5, -2) with the residual 0.25."""
+    sign = ">" if byte_order == "big" else "<"
+    items = b"".join(struct.pack(sign + "4f", k, 1.5, -2.0, 0.25) for k in range(count))
+    return struct.pack(sign + "IIiqI", 24 + len(items), MARKERS, number, timestamp_us, count) + items
+
+
+def frame(*components: bytes, byte_order: ByteOrder = "big") -> bytes:
+    sign = ">" if byte_order == "big" else "<"
+    return packet(DATA, struct.pack(sign + "I", len(components)) + b"".join(components))
+
+
+def writes_for(
+    fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFault | None = None
+) -> list[PendingWrite]:
+    """Return what is written instead of one packet that is due at 100 s."""
+    return fault.change_writes([PendingWrite(100.0, packet)], active_fault or active(fault))
+
+
+def changed(fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFault | None = None) -> bytes:
+    [write] = writes_for(fault, packet, active_fault)
+    assert (write.due_s, write.joins_previous) == (100.0, False)
+    return write.data
+
+
+def components_in_packet(data: bytes) -> list[WireComponent]:
+    [(packet_type, body)] = packets_in(data)
+    assert packet_type == DATA
+    return components_in(body)
 
 
 def test_every_kind_of_fault_has_defaults_for_all_parameters() -> None:

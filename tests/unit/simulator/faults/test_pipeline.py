@@ -23,7 +23,7 @@ from gateway.simulator.faults.server_faults import NoMeasurement
 from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Jitter, Merge, SlowReader, Split
 from gateway.simulator.faults.write_queue import MAX_WAITING_BYTES
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, NO_DATA, XML, components_in, packet
-from tests.unit.simulator.faults.faulty_client import NEVER_MS, VERSION, FaultyClient
+from tests.unit.simulator.faults.faulty_client import VERSION, FaultyClient
 
 UNDERSIZE = struct.pack(">II", 0, DATA)
 
@@ -216,7 +216,7 @@ async def test_nothing_is_sent_after_the_connection_has_ended(client: FaultyClie
 
 async def test_everything_is_sent_before_the_server_closes_the_connection(client: FaultyClient) -> None:
     """Bye is answered in spite of any delay, and after what came before it."""
-    client.begin(Delay(delay_ms=NEVER_MS), LateAcknowledgements(delay_ms=NEVER_MS))
+    client.begin(Delay(delay_ms=600_000), LateAcknowledgements(delay_ms=600_000))
     client.send("Version 1.0", "Bye")
     client.filter.flush()
     assert client.packets == [VERSION, (COMMAND, b"bye")]
