@@ -1,11 +1,16 @@
-"""What LSL streams say about themselves: names, types, rates, channels, and the rest of their XML."""
+"""What LSL streams say about themselves, and what the doctor says about streams."""
 
 import dataclasses
+import socket
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gateway.findings import Result
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.lsl import checks
+from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.streams import (
     MAX_RATE_HZ,
     DescribedSource,
@@ -31,6 +36,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
+from tests.lsl_receiver import lsl_config
 
 UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Mx": "Nmm", "My": "Nmm", "Mz": "Nmm"}
 FORCE_CHANNELS = tuple(ForceChannel(str(at), name, unit) for at, (name, unit) in enumerate(UNITS.items()))
@@ -196,3 +202,16 @@ def test_a_rate_that_cannot_be_is_not_announced(
 def test_the_number_of_described_items_comes_from_the_parameters() -> None:
     assert [num_labels(component, PARAMETERS) for component in WIRE_ORDER] == [2, 1, 2, 1, 1]
     assert [num_labels(component, Parameters()) for component in WIRE_ORDER] == [None] * 5
+
+
+def test_streams_of_a_source_whose_name_begins_alike_are_not_those_of_this_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    names = ("doctor_event", "lab_2_3d", "lab_2_event")
+    streams = [{"computer": socket.gethostname(), "name": name} for name in names]
+    monkeypatch.setattr(checks, "_find_streams", lambda *_: streams)
+    settings = LslSettings(enabled=True, config=str(lsl_config(tmp_path)))
+    opens, found, gateway = checks.check_lsl(settings, ["lab", "lab_2"], [], 20.0)
+    assert (opens.result, found.result) == (Result.PASSING, Result.PASSING)
+    assert gateway.result is Result.WARNING
+    assert gateway.found == "streams of lab_2 are offered, but none of lab"

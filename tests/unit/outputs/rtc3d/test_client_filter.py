@@ -2,7 +2,6 @@
 
 import asyncio
 import socket
-import struct
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,8 @@ from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.losses import amounts
 from tests.unit.outputs.rtc3d.scripted_server import Client, Line, ScriptedServer, settle, write_file
 from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, streaming
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, command, packet
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, command, packet
+from tests.vectors import START_RECORDING, STOP_RECORDING
 
 C3D = 5
 VERSION = (COMMAND, b"OK-Version 1.0")
@@ -201,29 +201,16 @@ async def test_packets_held_back_by_a_file_are_bounded(server: ScriptedServer, t
 # Which packets control recordings ----------------------------------------------------------
 
 
-def switch(event_id: int, sign: str = ">", number: int = -1) -> bytes:
-    """Return the recording packet of WaveFront's clients (field note 16)."""
-    return struct.pack(sign + "IIIiqI", 1, 48, EVENT, number, 0, 1) + struct.pack(
-        sign + "iqiii", event_id, 0, -1, -1, -1
-    )
-
-
-@pytest.mark.parametrize("sign", [">", "<"])
-@pytest.mark.parametrize("ending", [b"", b"\n"])
-def test_the_recording_packet_starts_and_stops(sign: str, ending: bytes) -> None:
-    for is_start in (True, False):
-        found = recording_control(Packet(DATA, switch(int(is_start), sign) + ending))
-        assert found == ControlRecording(is_start)
-
-
 @pytest.mark.parametrize(
     ("sent", "control"),
     [
         (Packet(COMMAND, b"Recording Start,file=walk 1.c3d\n"), ControlRecording(True, ",file=walk 1.c3d")),
         (Packet(COMMAND, b"recording stop\0"), ControlRecording(False)),
         *((Packet(COMMAND, text), None) for text in (b"Version 1.0", b"Recording", b"")),
-        *((Packet(DATA, data), None) for data in (b"\0\0\0\1", switch(2), switch(1, number=7))),
-        (Packet(77, switch(1)), None),
+        (Packet(DATA, START_RECORDING[8:]), ControlRecording(True)),
+        (Packet(DATA, STOP_RECORDING[8:]), ControlRecording(False)),
+        *((Packet(DATA, data), None) for data in (b"\0\0\0\1", b"\0\0\0\0")),
+        (Packet(77, START_RECORDING[8:]), None),
     ],
 )
 def test_only_recording_commands_start_and_stop(sent: Packet, control: ControlRecording | None) -> None:
