@@ -8,7 +8,6 @@ from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
 from gateway.rtc3d.components import ComponentType
 from tests.unit.outputs.rtc3d.live_client import (
     FAST,
-    SLOW,
     TOOL_OUT_OF_VIEW,
     LiveSource,
     analog,
@@ -19,7 +18,6 @@ from tests.unit.outputs.rtc3d.live_client import (
     frame_of_markers,
     markers,
 )
-from tests.unit.rtc3d_server.wire import EVENT, MARKERS
 
 UNKNOWN = bytes.fromhex("0000000c 00000063 01020304")
 WHOLE = body(markers(7, 10_000), TOOL_OUT_OF_VIEW, event(7, 10_000, 3), UNKNOWN) + b"\n"
@@ -156,19 +154,6 @@ def test_the_first_frames_after_a_pause_are_complete(command: str, pause_us: int
     assert {len(frame) for frame in client.numbers()} == {2}
 
 
-@each_order
-def test_a_measurement_that_begins_late_begins_with_complete_frames(fast_first: bool) -> None:
-    source = LiveSource(played=3, fast_first=fast_first)
-    source.scene.stop()
-    client = source.client(BOTH)
-    source.wait(1_500_000)
-    source.arrive(body(analog(9, 9_000)), FAST)
-    source.play(1, 3, fast_first=fast_first)
-    numbers = client.numbers()
-    assert numbers[-2:] == joined(2, 3)
-    assert {len(frame) for frame in numbers} == {2}
-
-
 def test_requests_with_pauses_between_them_do_not_change_the_rate() -> None:
     source = LiveSource(played=3)
     client = source.client()
@@ -266,34 +251,3 @@ def test_a_request_for_components_that_do_not_come_gets_an_empty_frame() -> None
     client.send("SendCurrentFrame 6D")
     tool = body(TOOL_OUT_OF_VIEW)
     assert (client.bodies, streaming.bodies) == ([body(), tool], [tool])
-
-
-def test_a_request_for_components_that_a_new_server_lacks_gets_an_empty_frame() -> None:
-    source = LiveSource()
-    client = source.client()
-    for number in range(1, 4):
-        source.arrive(frame_of_markers(number, TOOL_OUT_OF_VIEW))
-        source.wait(10_000)
-    source.scene.stop()
-    client.send("SendCurrentFrame 6D")
-    for number in range(1, 4):
-        source.arrive(frame_of_markers(number), SLOW + 2)
-        source.wait(1_000_000)
-    assert client.bodies == [body()]
-
-
-def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
-    source = LiveSource()
-    client = source.client("StreamFrames FrequencyDivisor:2 3D Events")
-    for number in range(1, 7):
-        source.arrive(frame_of_markers(number))
-        source.arrive(body(event_of(number)))
-    frames = client.take()
-    numbers = [[each.frame_number for each in frame if each.type == MARKERS] for frame in frames]
-    assert numbers == [[1], [3], [5]]
-    assert [item[0] for frame in frames for each in frame if each.type == EVENT for item in each.items] == [
-        1,
-        2,
-        3,
-        4,
-    ]
