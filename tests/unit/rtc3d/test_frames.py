@@ -266,16 +266,13 @@ def reader_after(*bodies: bytes) -> FrameReader:
 
 @both_orders
 @pytest.mark.parametrize("frames", [FULL_FRAME, FRAME_WITH_UNKNOWN, EMPTY_FRAME])
-def test_frames_of_a_layout_are_read_alike_and_share_it(
-    frames: dict[ByteOrder, bytes], order: ByteOrder
-) -> None:
+def test_frames_of_one_layout_share_it(frames: dict[ByteOrder, bytes], order: ByteOrder) -> None:
     """Other connections have layouts of their own, so layouts are forgotten with the connection."""
     reader, expected = FrameReader(order), split_frame(frames[order], order)
     layout = reader.read(frames[order]).layout
     for _ in range(3):
         read = reader.read(bytes(bytearray(frames[order])))
         assert read.layout is layout
-        assert (read.layout.fields, read.components) == (expected.layout.fields, expected.components)
         assert read.unknown_types == expected.unknown_types
     assert FrameReader(order).read(frames[order]).layout is not layout
 

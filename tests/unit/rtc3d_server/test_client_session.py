@@ -112,9 +112,7 @@ def test_a_recording_is_started_and_stopped(
         (",DurationUnits=Minutes,Duration = 1.5 ,file=take1.tsv", 90),
     ],
 )
-def test_the_duration_ends_a_recording(
-    client: ScriptedClient, options: str, duration_s: float | None
-) -> None:
+def test_a_duration_ends_a_recording(client: ScriptedClient, options: str, duration_s: float | None) -> None:
     """Field note 26, in any order and any case."""
     client.send(f"Recording Start{options}")
     assert client.recording_durations_s == [duration_s]
@@ -123,9 +121,7 @@ def test_the_duration_ends_a_recording(
 
 
 @pytest.mark.parametrize("options", [",duration=soon", ",duration=-1", ",duration=5,durationunits=frames"])
-def test_a_duration_that_the_server_does_not_understand_is_an_error(
-    client: ScriptedClient, options: str
-) -> None:
+def test_a_duration_that_is_not_understood_is_an_error(client: ScriptedClient, options: str) -> None:
     [(packet_type, text)] = client.send(f"Recording Start{options}")
     assert (packet_type, b"one of seconds, minutes, hours" in text) == (ERROR, True)
     assert not client.session.is_recording
@@ -177,9 +173,7 @@ def test_the_reply_to_send_parameters_is_xml_with_the_requested_sections(client:
         ("Force", 50_000, []),  # which the scene lacks
     ],
 )
-def test_a_stream_has_its_rate(
-    client: ScriptedClient, requested: str, until_us: int, numbers: list[int]
-) -> None:
+def test_rates_of_streams(client: ScriptedClient, requested: str, until_us: int, numbers: list[int]) -> None:
     """§5.3.5: the slowest component of a request is the limit."""
     client.send(f"StreamFrames {requested}")
     assert client.numbers_until(until_us) == numbers

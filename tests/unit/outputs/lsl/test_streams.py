@@ -191,9 +191,7 @@ def test_the_source_id_is_stable_and_differs_for_other_channels() -> None:
         pytest.param(1000.0, 700, 0.0, id="too many values"),
     ],
 )
-def test_a_rate_that_cannot_be_is_not_announced(
-    rate_hz: float | None, num_items: int, announced_hz: float
-) -> None:
+def test_no_impossible_rate_is_announced(rate_hz: float | None, num_items: int, announced_hz: float) -> None:
     """liblsl would reserve memory for it."""
     parameters = Parameters(markers=Parameters3D(rate_hz, "mm"))
     assert stream_of(ComponentType.MARKERS, num_items, parameters).rate_hz == announced_hz

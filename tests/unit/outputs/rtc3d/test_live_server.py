@@ -36,9 +36,7 @@ async def streaming(server: ScriptedServer) -> Client:
 # Measurements -------------------------------------------------------------------------------
 
 
-async def test_a_client_waits_two_seconds_for_an_unknown_source(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_client_waits_two_seconds_for_a_new_source(server: ScriptedServer, client: Client) -> None:
     """The gateway may have to start its own stream first, so No Data at once would be wrong."""
     assert await client.ask(STREAM) == [OK_STREAM]
     await asyncio.sleep(0.5)
@@ -63,9 +61,7 @@ async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait(serv
     assert not server.is_measuring
 
 
-async def test_a_frame_or_a_stream_of_the_source_ends_the_wait(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_frame_or_stream_of_the_source_ends_the_wait(server: ScriptedServer, client: Client) -> None:
     """The time-out of the request must not end the measurement, nor do gaps in a stream."""
     await client.ask(STREAM)
     server.arrive(1)

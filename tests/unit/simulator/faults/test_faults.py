@@ -83,14 +83,6 @@ def components_in_packet(data: bytes) -> list[WireComponent]:
 
 
 def test_every_kind_of_fault_has_defaults_for_all_parameters() -> None:
-    assert set(KINDS) == {
-        *("delay", "jitter", "split", "merge", "cut", "half_open", "slow_reader", "garbage"),
-        *("oversize", "undersize", "wrong_counts", "wrong_byte_order", "unknown_component"),
-        *("refused_commands", "minimal_server", "reply_text", "frames_first"),
-        *("doubled_acknowledgements", "missing_acknowledgements", "late_acknowledgements"),
-        *("no_measurement", "restart", "change_scene", "rename", "occlusion"),
-        *("frozen_timestamps", "jumping_timestamps", "constant_frame_numbers", "short_events"),
-    }
     for name, kind in KINDS.items():
         assert parse_fault(name) == kind()
 
@@ -160,26 +152,16 @@ def test_the_description_of_the_kinds_has_each_with_its_parameters() -> None:
 # Replies --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("refused", "texts"),
-    [
-        (False, ["StreamFrames", "STREAMFRAMES\0", "StreamFrames FrequencyDivisor:4", "StreamFrames Stop"]),
-        (False, ["SendCurrentFrame"]),
-        (
-            True,
-            ["Version 1.0", "SetByteOrder LittleEndian", "SendParameters", "SendParameters All", "Bye", ""],
-        ),
-        (
-            True,
-            ["StreamFrames AllFrames", "StreamFrames Frequency:60", "StreamFrames 3D", "SendCurrentFrame 3D"],
-        ),
-        (True, ["StreamFrames FrequencyDivisor:4 3D"]),
-    ],
-)
-def test_a_minimal_server_accepts_only_the_commands_of_field_note_2(refused: bool, texts: list[str]) -> None:
+def test_a_minimal_server_accepts_only_the_commands_of_field_note_2() -> None:
     """The gateway's fallback to simpler commands is tested against this server."""
-    for text in texts:
-        assert (MinimalServer().refusal(Packet(COMMAND, text.encode())) is not None) == refused, text
+    streams = ("", "\0", " FrequencyDivisor:4", " Stop")
+    accepted = ["SendCurrentFrame", "STREAMFRAMES", *(f"StreamFrames{each}" for each in streams)]
+    refused_streams = (" AllFrames", " Frequency:60", " 3D", " FrequencyDivisor:4 3D")
+    refused = ["Version 1.0", "SetByteOrder LittleEndian", "SendParameters", "SendParameters All", "Bye", ""]
+    refused += ["SendCurrentFrame 3D", *(f"StreamFrames{each}" for each in refused_streams)]
+    found = [MinimalServer().refusal(Packet(COMMAND, text.encode())) for text in accepted + refused]
+    assert found[: len(accepted)] == [None] * len(accepted)
+    assert None not in found[len(accepted) :]
 
 
 def test_refused_commands_are_recognised_by_their_first_word() -> None:
