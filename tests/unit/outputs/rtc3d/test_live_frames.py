@@ -138,34 +138,6 @@ def test_a_client_of_one_stream_gets_every_frame_of_it() -> None:
     assert client.numbers() == [[number] for number in range(10, 60)]
 
 
-@pytest.mark.parametrize("command", ["StreamFrames 3D Analog", "SendCurrentFrame 3D Analog"])
-@pytest.mark.parametrize("pause_us", [300_000, 5_000_000])
-@each_order
-def test_the_first_frames_after_a_pause_are_complete(command: str, pause_us: int, fast_first: bool) -> None:
-    source = LiveSource(played=3, fast_first=True)
-    source.scene.forget_frames()  # nobody asks for any
-    source.wait(pause_us)
-    client = source.client(command)
-    base_us = 40_000 + pause_us
-    for step in range(5, 10):
-        source.arrive(body(analog(step, base_us - 10_000 + 1000 * step)), FAST)
-        source.wait(1000)
-    source.play(0, 2, fast_first=fast_first, base_us=base_us)
-    assert {len(frame) for frame in client.numbers()} == {2}
-
-
-def test_requests_with_pauses_between_them_do_not_change_the_rate() -> None:
-    source = LiveSource(played=3)
-    client = source.client()
-    for number in range(100, 300, 10):
-        source.scene.forget_frames()
-        client.send("SendCurrentFrame")
-        source.wait(500_000)
-        source.play(number, number)
-    assert {len(frame) for frame in client.take()} == {3}
-    assert source.scene.frames(()).rate == 100
-
-
 def test_while_the_slower_stream_has_no_frames_the_faster_one_sets_the_rate() -> None:
     source = LiveSource(played=5)
     client = source.client(BOTH)
