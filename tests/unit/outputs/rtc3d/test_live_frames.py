@@ -5,11 +5,16 @@ from itertools import pairwise
 import pytest
 
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
-from gateway.rtc3d.components import ComponentType
-from tests.unit.outputs.rtc3d.live_client import (
+from gateway.outputs.rtc3d.live_scene import LiveScene
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.packets import Packet
+from gateway.rtc3d.parameters import General
+from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from tests.unit.outputs.rtc3d.scripted_server import (
     FAST,
+    SLOW,
     TOOL_OUT_OF_VIEW,
-    LiveSource,
     analog,
     body,
     component,
@@ -18,13 +23,104 @@ from tests.unit.outputs.rtc3d.live_client import (
     frame_of_markers,
     markers,
 )
+from tests.unit.rtc3d_server.wire import COMMAND, EVENT, WireComponent, components_in
 
+ALL = frozenset(WIRE_ORDER)
 UNKNOWN = bytes.fromhex("0000000c 00000063 01020304")
 WHOLE = body(markers(7, 10_000), TOOL_OUT_OF_VIEW, event(7, 10_000, 3), UNKNOWN) + b"\n"
 ONE_TOOL = body(TOOL_OUT_OF_VIEW)
 AT_7 = (markers(7, 10_000), analog(70, 10_001))
 BOTH = "StreamFrames 3D Analog"
 each_order = pytest.mark.parametrize("fast_first", [False, True])
+
+
+class LiveSource:
+    """A live source with clients; time passes only by ``wait``."""
+
+    def __init__(self, *, played: int = 0, fast_first: bool = False) -> None:
+        self.scene = LiveScene("lab")
+        self.scene._arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
+        self.now_us = 0
+        self._clients: list[LiveClient] = []
+        self.scene.start()
+        self.play(1, played, fast_first=fast_first)
+
+    def client(self, *commands: str) -> "LiveClient":
+        self._clients.append(LiveClient(self))
+        for command in commands:
+            self._clients[-1].send(command)
+        return self._clients[-1]
+
+    def play(self, first: int, last: int, *, fast_first: bool = False) -> None:
+        """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
+        for number in range(first, last + 1):
+            timestamp_us = 10_000 * number
+            slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
+            fast = (body(analog(10 * number, timestamp_us)), FAST)
+            for each in (fast, slow) if fast_first else (slow, fast):
+                self.arrive(*each)
+            for step in range(1, 10):
+                self.wait(1000)
+                self.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
+            self.wait(1000)
+
+    def arrive(
+        self,
+        frame: bytes,
+        stream: int = SLOW,
+        byte_order: ByteOrder = "big",
+        wanted: frozenset[ComponentType] = ALL,
+    ) -> None:
+        """Let a frame arrive, and send what is due then."""
+        self.scene.add(split_frame(frame, byte_order), stream, wanted, self.now_us)
+        self.send()
+
+    def wait(self, us: int) -> None:
+        """Let time pass; send what is due when the scene says so."""
+        until_us = self.now_us + us
+        while (due_us := self.scene.advance(self.now_us)) is not None and due_us <= until_us:
+            self.now_us = max(due_us, self.now_us)
+            self.send()
+        self.now_us = until_us
+        self.send()
+
+    def send(self) -> None:
+        elapsed_us = max(self.now_us, self.scene.newest_us)
+        self.scene.advance(elapsed_us)
+        for client in self._clients:
+            client.bodies += [packet.packet[8:] for packet in client.session.due_frames(elapsed_us)]
+
+
+class LiveClient:
+    """One client; ``bodies`` are the bodies of the frames that it got."""
+
+    def __init__(self, source: LiveSource) -> None:
+        self.bodies: list[bytes] = []
+        self.session = ClientSession(
+            SessionCallbacks(
+                source.scene.frames,
+                lambda sections: source.scene.parameters_xml(sections, General()),
+                lambda: max(source.now_us, source.scene.newest_us),
+            )
+        )
+        self._source = source
+
+    def send(self, text: str) -> None:
+        self.session.answer(Packet(COMMAND, text.encode()))
+        self._source.send()
+
+    def take(self, byte_order: ByteOrder = "big") -> list[list[WireComponent]]:
+        """Return the frames that have come since the last call."""
+        bodies, self.bodies = self.bodies, []
+        return [components_in(each, byte_order) for each in bodies]
+
+    def event_ids(self) -> list[list[int]]:
+        """Return the ids of the events in each of these frames."""
+        return [[int(item[0]) for c in frame if c.type == EVENT for item in c.items] for frame in self.take()]
+
+    def numbers(self) -> list[list[int]]:
+        """Return the frame numbers of the components of each of these frames."""
+        return [[each.frame_number for each in frame] for frame in self.take()]
 
 
 @pytest.mark.parametrize(

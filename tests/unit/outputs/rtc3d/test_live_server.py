@@ -13,8 +13,15 @@ from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import SECTIONS, General
 from gateway.rtc3d.parameters_xml import parse_parameters
 from tests.losses import amounts
-from tests.unit.outputs.rtc3d.live_client import body, markers
-from tests.unit.outputs.rtc3d.scripted_server import Client, ScriptedServer, frame_numbers, parameters, settle
+from tests.unit.outputs.rtc3d.scripted_server import (
+    Client,
+    ScriptedServer,
+    body,
+    frame_numbers,
+    markers,
+    parameters,
+    settle,
+)
 from tests.unit.rtc3d_server.wire import COMMAND, ERROR, NO_DATA, XML
 
 STREAM = "StreamFrames 3D"

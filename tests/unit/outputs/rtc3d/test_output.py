@@ -21,8 +21,7 @@ from gateway.outputs.rtc3d.publisher import QUEUE_FULL
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from tests.unit.outputs.rtc3d.live_client import body, markers
-from tests.unit.outputs.rtc3d.scripted_server import settle
+from tests.unit.outputs.rtc3d.scripted_server import body, markers, settle
 
 LAB, HALL = 3120, 3121
 FRAME = split_frame(body(markers(1, 10_000)), "big")
