@@ -42,10 +42,9 @@ _NAMES = ("version", "little", "stream", "stop", "current", "all", "3d", "6d", "
 NAMES: Final = dict(zip(_COMMANDS, _NAMES, strict=True))
 
 
-def xml(*sections: str) -> bytes:
-    """Return an XML packet with these elements of §6, all empty."""
-    inside = "".join(f"<{section}/>" for section in sections)
-    return packet(2, f"<RT_Parameters Ver='1.00'>{inside}</RT_Parameters>")
+def xml(section: str) -> bytes:
+    """Return an XML packet with an empty element of §6."""
+    return packet(2, f"<RT_Parameters Ver='1.00'><{section}/></RT_Parameters>")
 
 
 def outcome(event: ProtocolEvent) -> str:

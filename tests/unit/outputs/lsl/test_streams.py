@@ -65,47 +65,34 @@ def stream_of(
     return lsl_stream(DescribedSource("lab", computer, parameters, frame), component, num_items)
 
 
+def positions(name: str) -> list[tuple[str, str, str]]:
+    return [(f"{name}_{axis}", f"Position{axis}", "meters") for axis in "XYZ"]
+
+
 def marker(name: str) -> list[tuple[str, str, str]]:
-    positions = [(f"{name}_{axis}", f"Position{axis}", "meters") for axis in "XYZ"]
-    return [*positions, (f"{name}_reliability", "Reliability", "")]
+    return [*positions(name), (f"{name}_reliability", "Reliability", "")]
 
 
-ORIENTATIONS = {"X": "B", "Y": "C", "Z": "D", "W": "A"}
-"""As XDF names them."""
+PROBE = [
+    *positions("Probe"),  # XDF names the parts of a quaternion A to D, beginning with the scalar
+    *(
+        (f"Probe_quat_{names[0]}", f"Orientation{names[1]}", "quaternion")
+        for names in ("XB", "YC", "ZD", "WA")
+    ),
+    ("Probe_error", "Error", "meters"),
+]
+ELECTRODES = [("EMG left", "EMG", "uV"), ("Trigger", "Analog", "V")]
+FORCES = [(f"Walkway_F{axis}", f"Force{axis}", "N") for axis in "XYZ"]
+MOMENTS = [(f"Walkway_M{axis}", f"Moment{axis}", "Nmm") for axis in "XYZ"]
 
 
 @pytest.mark.parametrize(
     ("component", "num_items", "facts", "channels"),
     [
         (ComponentType.MARKERS, 2, ("lab_3d", "MoCap", 100.0, False), marker("C7") + marker("LASI")),
-        (
-            ComponentType.TOOLS,
-            1,
-            ("lab_6d", "MoCap", 50.0, False),
-            [
-                *((f"Probe_{axis}", f"Position{axis}", "meters") for axis in "XYZ"),
-                *(
-                    (f"Probe_quat_{axis}", f"Orientation{ORIENTATIONS[axis]}", "quaternion")
-                    for axis in "XYZW"
-                ),
-                ("Probe_error", "Error", "meters"),
-            ],
-        ),
-        (
-            ComponentType.ANALOG,
-            2,
-            ("lab_analog", "Analog", 2000.0, False),
-            [("EMG left", "EMG", "uV"), ("Trigger", "Analog", "V")],
-        ),
-        (
-            ComponentType.FORCE,
-            1,
-            ("lab_force", "Force", 1000.0, False),
-            [
-                *((f"Walkway_F{axis}", f"Force{axis}", "N") for axis in "XYZ"),
-                *((f"Walkway_M{axis}", f"Moment{axis}", "Nmm") for axis in "XYZ"),
-            ],
-        ),
+        (ComponentType.TOOLS, 1, ("lab_6d", "MoCap", 50.0, False), PROBE),
+        (ComponentType.ANALOG, 2, ("lab_analog", "Analog", 2000.0, False), ELECTRODES),
+        (ComponentType.FORCE, 1, ("lab_force", "Force", 1000.0, False), FORCES + MOMENTS),
         (ComponentType.EVENT, 1, ("lab_event", "Markers", 0.0, True), [("event", "Marker", "")]),
     ],
 )

@@ -112,10 +112,7 @@ def test_a_fault_is_parsed_from_the_form_in_which_it_is_printed(text: str, fault
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            "dely,at_s=1",
-            r"fault 'dely,at_s=1': fault: found 'dely' \(did you mean 'delay'\?\); expected no_me",
-        ),
+        ("dely,at_s=1", r"'dely,at_s=1': fault: found 'dely' \(did you mean 'delay'\?\); expected no_me"),
         ("", "fault '': fault: found ''; expected no_measurement,"),
         ("cut,at=1", r"at: unknown key \(did you mean 'at_s'\?\); known keys: at_s, every_s, times"),
         ("cut,reset=1", "reset: found 1; expected true or false"),

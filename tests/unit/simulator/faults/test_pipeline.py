@@ -29,36 +29,25 @@ UNDERSIZE = struct.pack(">II", 0, DATA)
 
 # Replies --------------------------------------------------------------------------------------
 
+GREETING = "Version 1.0"
 LITTLE = (COMMAND, b"OK-SetByteOrder LittleEndian")
 UNKNOWN = b"Unknown command 'Fly'"
-DIVISOR = "StreamFrames FrequencyDivisor:2"
 
 
 @pytest.mark.parametrize(
     ("fault", "sent", "expected"),
     [
-        (RefusedCommands(times=1), ["Version 1.0"] * 2, [(ERROR, b"Error-version is refused"), VERSION]),
-        (
-            MinimalServer(),
-            ["Version 1.0", DIVISOR],
-            [(ERROR, b"Error-version is not known in this form"), (COMMAND, b"OK-" + DIVISOR.encode())],
-        ),
-        (
-            MissingAcknowledgements(commands=("version",)),
-            ["Version 1.0", "SetByteOrder LittleEndian", "Version 2.0"],
-            [LITTLE, (ERROR, b"Error-Version 2.0 is not supported")],
-        ),
+        (RefusedCommands(times=1), [GREETING] * 2, [(ERROR, b"Error-version is refused"), VERSION]),
+        (MinimalServer(), [GREETING], [(ERROR, b"Error-version is not known in this form")]),
+        (MissingAcknowledgements(commands=("version",)), [GREETING, "SetByteOrder LittleEndian"], [LITTLE]),
+        (MissingAcknowledgements(), ["Version 2.0"], [(ERROR, b"Error-Version 2.0 is not supported")]),
         (
             DoubledAcknowledgements(copies=3),
-            ["Version 1.0", "Fly"],
+            [GREETING, "Fly"],
             [VERSION] * 3 + [(ERROR, b"Error-" + UNKNOWN)],
         ),
-        (DoubledAcknowledgements(times=1), ["Version 1.0"] * 2, [VERSION] * 3),
-        (
-            ReplyText(form="echo"),
-            ["Version 1.0", "Fly"],
-            [(COMMAND, b"Version 1.0"), (ERROR, b"err-" + UNKNOWN)],
-        ),
+        (DoubledAcknowledgements(times=1), [GREETING] * 2, [VERSION] * 3),
+        (ReplyText(form="echo"), [GREETING, "Fly"], [(COMMAND, b"Version 1.0"), (ERROR, b"err-" + UNKNOWN)]),
         (ReplyText(form="ok-verb"), ["Version 1.0"], [(COMMAND, b"ok-version")]),
         (ReplyText(), ["SendParameters", "Bye"], [(XML, b"<RT_Parameters"), (COMMAND, b"bye")]),
         (ReplyText(connection=2), ["Version 1.0"], [VERSION]),
