@@ -64,15 +64,11 @@ def error_text(body: bytes) -> str:
 
 
 def test_each_command_is_encoded_as_its_text_and_parsed_from_it() -> None:
-    """Clients differ in case, spaces and endings (§5.2, field note 13); servers may not care."""
+    """Clients differ in spaces (§5.2); the property tests prove it for case and endings."""
     for command, text in TEXTS:
-        assert str(command) == text
-        body = encode_command(command)
-        assert body == text.encode("ascii")
-        for variant in (body, body.lower(), body.upper(), body.swapcase(), body.replace(b" ", b"   ")):
-            assert parse_command(variant) == command, variant
-        for end in (b"\0", b"\n", b"\r\n", b"   ", b" \0", b"\n\0", b"\0\n", b" \r\n\0\0"):
-            assert parse_command(body + end) == command, body + end
+        body = text.encode("ascii")
+        assert (str(command), encode_command(command)) == (text, body)
+        assert parse_command(body) == parse_command(body.replace(b" ", b"   ")) == command, text
 
 
 @pytest.mark.parametrize(
@@ -141,19 +137,7 @@ def test_the_error_says_what_is_accepted(verb: str, parameters: list[str], text:
 
 def test_the_error_of_an_invalid_rate_shows_the_three_forms() -> None:
     """A rate that is misread would make the server send too much or nothing."""
-    numbers = [
-        "",
-        "0",
-        "-60",
-        "+60",
-        "60Hz",
-        "nan",
-        "inf",
-        "1e3",
-        "1_000",
-        "60:30",
-        "\N{ARABIC-INDIC DIGIT SIX}",
-    ]
+    numbers = ["", *["0", "-60", "+60", "60Hz", "nan", "inf", "1e3", "1_000", "60:30", "٦"]]
     rates = [prefix + number for prefix in ("Frequency:", "FrequencyDivisor:") for number in numbers]
     for rate in (*rates, "Frequency:0.0000009", "Frequency:" + "9" * 400, "FrequencyDivisor:2.5", ":"):
         text = error_text(f"StreamFrames 3D {rate}".encode())

@@ -7,6 +7,7 @@ import pytest
 
 from gateway.rtc3d.client_protocol import Answered, ClientProtocol, PossibleReply, ProtocolEvent, Refused
 from gateway.rtc3d.commands import (
+    AllFrames,
     Command,
     SendCurrentFrame,
     SendParameters,
@@ -15,10 +16,13 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
-from tests.servers import error, ok
-from tests.unit.rtc3d.protocols import FRAME, STREAM, xml
+from gateway.rtc3d.components import ComponentType
+from tests.servers import error, ok, packet
+from tests.vectors import FULL_FRAME
 
 VERSION: Final = Version()
+STREAM: Final = StreamFrames(AllFrames(), (ComponentType.MARKERS,))
+FRAME: Final = packet(3, FULL_FRAME["big"])
 CURRENT: Final = SendCurrentFrame()
 GIVE_UP: Final = "give up"
 ASSUME: Final = "assume"
@@ -33,10 +37,14 @@ GENERAL_3D: Final = SendParameters(("general", "3d"))
 Step = Command | bytes | str
 """A command to send, bytes to receive, or what else the client does."""
 
-
 _COMMANDS = (VERSION, LITTLE, STREAM, STOP, CURRENT, ALL, ONLY_3D, ONLY_6D, StreamFrames(), GENERAL_3D)
 _NAMES = ("version", "little", "stream", "stop", "current", "all", "3d", "6d", "streamframes", "general 3d")
 NAMES: Final = dict(zip(_COMMANDS, _NAMES, strict=True))
+
+
+def xml(section: str) -> bytes:
+    """Return an XML packet with an empty element of §6."""
+    return packet(2, f"<RT_Parameters Ver='1.00'><{section}/></RT_Parameters>")
 
 
 def outcome(event: ProtocolEvent) -> str:

@@ -116,9 +116,7 @@ def test_parameters_are_those_of_the_file(path: Path) -> None:
     assert [channel.unit for channel in plate.channels] == ["N", "N", "N", "Nmm", "Nmm", "Nmm"]
 
 
-def test_units_that_the_file_does_not_say_are_not_invented(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_units_that_a_file_lacks_are_not_invented(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Field note 28: one unit for many channels. Points are in mm in nearly all files."""
     content = new_recording()
     content["parameters"]["POINT"]["UNITS"]["value"] = []
@@ -139,20 +137,14 @@ def test_units_that_the_file_does_not_say_are_not_invented(
     assert [text in caplog.text for text in ("6 of its 7 analog channels", "mm is assumed")] == [True, True]
 
 
-def test_a_unit_cut_to_four_characters_is_whole(tmp_path: Path) -> None:
+def test_a_unit_cut_to_four_characters_is_whole_and_markers_without_labels_are_numbered(
+    tmp_path: Path,
+) -> None:
     content = new_recording()
     content["parameters"]["POINT"]["UNITS"]["value"] = ["mete"]
-    markers = C3dScene(written(content, tmp_path)).parameters.markers
-    assert markers is not None
-    assert markers.unit == "m"
-
-
-def test_markers_without_labels_are_numbered(tmp_path: Path) -> None:
-    content = new_recording()
     content["parameters"]["POINT"]["LABELS"]["value"] = ["heel", ""]
     markers = C3dScene(written(content, tmp_path)).parameters.markers
-    assert markers is not None
-    assert [marker.label for marker in markers.markers] == ["heel", "Marker 2"]
+    assert markers == Parameters3D(100.0, "m", (Marker("1", "heel"), Marker("2", "Marker 2")))
 
 
 def test_a_recording_without_markers_plays_at_its_analog_rate(tmp_path: Path) -> None:
@@ -166,9 +158,7 @@ def test_a_recording_without_markers_plays_at_its_analog_rate(tmp_path: Path) ->
     assert (take.measurement_rate_hz, take.num_frames) == (1000.0, 50)
 
 
-def test_force_plates_of_an_unknown_type_are_left_out_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unknown_types_of_force_plates_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     content = new_recording()
     content["parameters"]["FORCE_PLATFORM"]["TYPE"]["value"] = [77]
     path = written(content, tmp_path)
@@ -224,9 +214,7 @@ def test_events_of_the_header_are_played_if_there_is_no_group(path: Path) -> Non
     assert [(each["timestamp"], labels[each["id"]]) for each in events] == [(10_000, "RTO"), (40_000, "LHS")]
 
 
-def test_events_outside_of_the_frames_are_left_out_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_events_outside_of_the_frames_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     content = new_recording()
     content.add_parameter("EVENT", "USED", [2])
     content.add_parameter("EVENT", "LABELS", ["a", "b"])

@@ -140,14 +140,8 @@ def test_steps_have_two_peaks_and_roll_from_heel_to_toe(scene: SyntheticScene, p
 
 def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) -> None:
     events = scene.events(0, 3_000_000)
-    presses = [
-        (500_000, 1, 1),
-        (800_000, 1, 0),
-        (1_500_000, 2, 1),
-        (1_800_000, 2, 0),
-        (2_500_000, 1, 1),
-        (2_800_000, 1, 0),
-    ]
+    buttons = ((0, 1), (1_000_000, 2), (2_000_000, 1))
+    presses = [(from_us + us, n, down) for from_us, n in buttons for us, down in ((500_000, 1), (800_000, 0))]
     assert [tuple(event) for event in events.tolist()] == [(BUTTON_EVENT, *each, -1) for each in presses]
     assert scene.parameters.events is not None
     assert [int(event.id, 0) for event in scene.parameters.events.events] == [BUTTON_EVENT]
@@ -168,9 +162,7 @@ def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) ->
 
 @settings(max_examples=30)
 @given(*[st.integers(0, most) for most in (30, 12, 5, 3, 99)])
-def test_the_parameters_describe_a_scene_of_any_size(
-    markers: int, tools: int, analog: int, plates: int, seed: int
-) -> None:
+def test_parameters_describe_any_scene(markers: int, tools: int, analog: int, plates: int, seed: int) -> None:
     """Clients allocate by the parameters; labels have a word and a number, and tools name their markers."""
     scene = SyntheticScene(markers=markers, tools=tools, analog=analog, plates=plates, seed=seed)
     counts = dict(zip(COUNTED, (markers, tools, analog, plates), strict=True))

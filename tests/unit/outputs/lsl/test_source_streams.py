@@ -201,9 +201,7 @@ def test_streams_do_not_pile_up_however_often_labels_change(lab: Streams) -> Non
     assert (lab.streams.waiting, lab.lost) == ({}, {})
 
 
-def test_a_stream_that_waits_is_not_described_for_every_frame(
-    lab: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_that_waits_is_described_only_once(lab: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     described: list[int] = []
 
     def counting(*arguments: Any) -> Any:

@@ -1,11 +1,16 @@
-"""What LSL streams say about themselves: names, types, rates, channels, and the rest of their XML."""
+"""What LSL streams say about themselves, and what the doctor says about streams."""
 
 import dataclasses
+import socket
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gateway.findings import Result
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.lsl import checks
+from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.streams import (
     MAX_RATE_HZ,
     DescribedSource,
@@ -31,6 +36,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
+from tests.lsl_receiver import lsl_config
 
 UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Mx": "Nmm", "My": "Nmm", "Mz": "Nmm"}
 FORCE_CHANNELS = tuple(ForceChannel(str(at), name, unit) for at, (name, unit) in enumerate(UNITS.items()))
@@ -59,47 +65,34 @@ def stream_of(
     return lsl_stream(DescribedSource("lab", computer, parameters, frame), component, num_items)
 
 
+def positions(name: str) -> list[tuple[str, str, str]]:
+    return [(f"{name}_{axis}", f"Position{axis}", "meters") for axis in "XYZ"]
+
+
 def marker(name: str) -> list[tuple[str, str, str]]:
-    positions = [(f"{name}_{axis}", f"Position{axis}", "meters") for axis in "XYZ"]
-    return [*positions, (f"{name}_reliability", "Reliability", "")]
+    return [*positions(name), (f"{name}_reliability", "Reliability", "")]
 
 
-ORIENTATIONS = {"X": "B", "Y": "C", "Z": "D", "W": "A"}
-"""As XDF names them."""
+PROBE = [
+    *positions("Probe"),  # XDF names the parts of a quaternion A to D, beginning with the scalar
+    *(
+        (f"Probe_quat_{names[0]}", f"Orientation{names[1]}", "quaternion")
+        for names in ("XB", "YC", "ZD", "WA")
+    ),
+    ("Probe_error", "Error", "meters"),
+]
+ELECTRODES = [("EMG left", "EMG", "uV"), ("Trigger", "Analog", "V")]
+FORCES = [(f"Walkway_F{axis}", f"Force{axis}", "N") for axis in "XYZ"]
+MOMENTS = [(f"Walkway_M{axis}", f"Moment{axis}", "Nmm") for axis in "XYZ"]
 
 
 @pytest.mark.parametrize(
     ("component", "num_items", "facts", "channels"),
     [
         (ComponentType.MARKERS, 2, ("lab_3d", "MoCap", 100.0, False), marker("C7") + marker("LASI")),
-        (
-            ComponentType.TOOLS,
-            1,
-            ("lab_6d", "MoCap", 50.0, False),
-            [
-                *((f"Probe_{axis}", f"Position{axis}", "meters") for axis in "XYZ"),
-                *(
-                    (f"Probe_quat_{axis}", f"Orientation{ORIENTATIONS[axis]}", "quaternion")
-                    for axis in "XYZW"
-                ),
-                ("Probe_error", "Error", "meters"),
-            ],
-        ),
-        (
-            ComponentType.ANALOG,
-            2,
-            ("lab_analog", "Analog", 2000.0, False),
-            [("EMG left", "EMG", "uV"), ("Trigger", "Analog", "V")],
-        ),
-        (
-            ComponentType.FORCE,
-            1,
-            ("lab_force", "Force", 1000.0, False),
-            [
-                *((f"Walkway_F{axis}", f"Force{axis}", "N") for axis in "XYZ"),
-                *((f"Walkway_M{axis}", f"Moment{axis}", "Nmm") for axis in "XYZ"),
-            ],
-        ),
+        (ComponentType.TOOLS, 1, ("lab_6d", "MoCap", 50.0, False), PROBE),
+        (ComponentType.ANALOG, 2, ("lab_analog", "Analog", 2000.0, False), ELECTRODES),
+        (ComponentType.FORCE, 1, ("lab_force", "Force", 1000.0, False), FORCES + MOMENTS),
         (ComponentType.EVENT, 1, ("lab_event", "Markers", 0.0, True), [("event", "Marker", "")]),
     ],
 )
@@ -185,9 +178,7 @@ def test_the_source_id_is_stable_and_differs_for_other_channels() -> None:
         pytest.param(1000.0, 700, 0.0, id="too many values"),
     ],
 )
-def test_a_rate_that_cannot_be_is_not_announced(
-    rate_hz: float | None, num_items: int, announced_hz: float
-) -> None:
+def test_no_impossible_rate_is_announced(rate_hz: float | None, num_items: int, announced_hz: float) -> None:
     """liblsl would reserve memory for it."""
     parameters = Parameters(markers=Parameters3D(rate_hz, "mm"))
     assert stream_of(ComponentType.MARKERS, num_items, parameters).rate_hz == announced_hz
@@ -196,3 +187,16 @@ def test_a_rate_that_cannot_be_is_not_announced(
 def test_the_number_of_described_items_comes_from_the_parameters() -> None:
     assert [num_labels(component, PARAMETERS) for component in WIRE_ORDER] == [2, 1, 2, 1, 1]
     assert [num_labels(component, Parameters()) for component in WIRE_ORDER] == [None] * 5
+
+
+def test_streams_of_a_source_whose_name_begins_alike_are_not_those_of_this_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    names = ("doctor_event", "lab_2_3d", "lab_2_event")
+    streams = [{"computer": socket.gethostname(), "name": name} for name in names]
+    monkeypatch.setattr(checks, "_find_streams", lambda *_: streams)
+    settings = LslSettings(enabled=True, config=str(lsl_config(tmp_path)))
+    opens, found, gateway = checks.check_lsl(settings, ["lab", "lab_2"], [], 20.0)
+    assert (opens.result, found.result) == (Result.PASSING, Result.PASSING)
+    assert gateway.result is Result.WARNING
+    assert gateway.found == "streams of lab_2 are offered, but none of lab"

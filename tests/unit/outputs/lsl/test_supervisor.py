@@ -99,7 +99,7 @@ def test_a_process_that_ended_is_replaced_and_gets_the_streams_again(
     assert "streams are offered by liblsl" in caplog.records[-1].getMessage()
 
 
-def test_a_stream_that_cannot_open_is_reported_by_a_process_that_ignores_signals(
+def test_a_stream_that_cannot_open_is_reported_and_signals_are_ignored(
     processes: LslProcesses,
 ) -> None:
     """Those that stop a gateway."""
@@ -160,9 +160,7 @@ def test_why_liblsl_cannot_be_loaded_is_said(
     assert processes.problem == text
 
 
-def test_a_process_that_cannot_be_started_is_tried_again(
-    processes: LslProcesses, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_start_is_tried_again(processes: LslProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as without_descriptors:
         error = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
         without_descriptors.setattr(socket, "socketpair", Mock(side_effect=error))

@@ -1,48 +1,62 @@
-"""A LiveServer whose clients are scripted: no sockets, no threads, and the event loop's time is virtual."""
+"""A LiveServer with scripted clients, without sockets and threads, and the bytes of frames of a source."""
 
 import asyncio
-import inspect
 import io
 import logging
 import struct
-from collections.abc import Callable, Coroutine
-from functools import wraps
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from gateway.losses import Losses
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.rtc3d.live_server import LiveServer, SourceState
-from gateway.rtc3d.components import WIRE_ORDER
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import ClientConnection
-from tests.unit.outputs.rtc3d.live_client import body, markers
-from tests.unit.rtc3d_server.wire import DATA, command, packets_in
-from tests.virtual_time import run_in_virtual_time
+from tests.unit.rtc3d_server.wire import DATA, EVENT, command, packets_in
 
+_ITEM = {1: "4f", 2: "f", 3: "6f", 4: "8f", EVENT: "iqiii"}
+SLOW, FAST = 1, 2  # the numbers of streams
+TOOL_OUT_OF_VIEW = bytes.fromhex("00000038 00000004 00000007 0000000000002710 00000001" + "ff" * 32)
 _Result = TypeVar("_Result")
 _CLIENT, _SERVER = ("192.0.2.7", 4711), ("192.0.2.1", 3120)
 
 
-def in_virtual_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run a test in virtual time, with a new ``server`` and a ``client`` of it if the test takes them."""
-    names = inspect.signature(test).parameters
+def component(
+    kind: int, number: int, timestamp_us: int, items: Sequence[Sequence[float]], byte_order: ByteOrder = "big"
+) -> bytes:
+    """Return a component (§7.1)."""
+    sign = ">" if byte_order == "big" else "<"
+    data = b"".join(struct.pack(sign + _ITEM[kind], *item) for item in items)
+    return struct.pack(sign + "IIiqI", 24 + len(data), kind, number, timestamp_us, len(items)) + data
 
-    async def with_server(fixtures: dict[str, Any]) -> None:
-        made: dict[str, Any] = {}
-        if not names.keys().isdisjoint({"server", "client"}):
-            made["server"] = ScriptedServer()
-            made["client"] = made["server"].client() if "client" in names else None
-        await test(**fixtures, **{name: each for name, each in made.items() if name in names})
 
-    @wraps(test)
-    def run(**fixtures: Any) -> None:
-        run_in_virtual_time(with_server(fixtures))
+def body(*components: bytes, byte_order: ByteOrder = "big") -> bytes:
+    """Return the body of a data frame."""
+    return struct.pack((">" if byte_order == "big" else "<") + "I", len(components)) + b"".join(components)
 
-    others = [each for name, each in names.items() if name not in {"server", "client"}]
-    run.__signature__ = inspect.Signature(others)  # type: ignore[attr-defined]
-    return run
+
+def markers(number: int, timestamp_us: int, byte_order: ByteOrder = "big") -> bytes:
+    return component(1, number, timestamp_us, [(number, 2, 3, 0.5)], byte_order)
+
+
+def analog(number: int, timestamp_us: int, byte_order: ByteOrder = "big") -> bytes:
+    return component(2, number, timestamp_us, [(number,), (-1.5,)], byte_order)
+
+
+def event(number: int, timestamp_us: int, event_id: int) -> bytes:
+    return component(EVENT, number, timestamp_us, [(event_id, timestamp_us, -1, -1, -1)])
+
+
+def frame_of_markers(number: int, *others: bytes) -> bytes:
+    """Return the body of frame ``number`` of 100 Hz."""
+    return body(markers(number, 10_000 * number), *others)
+
+
+def event_of(number: int) -> bytes:
+    return event(number, 10_000 * number, number)
 
 
 async def settle() -> None:
@@ -187,7 +201,7 @@ class ScriptedServer(LiveServer):
 
     def arrive(self, number: int) -> None:
         """Let a frame with markers arrive from the source."""
-        frame = split_frame(body(markers(number, 10_000 * number)), "big")
+        frame = split_frame(frame_of_markers(number), "big")
         self.take(frame, 1, frozenset(WIRE_ORDER))
 
     @property

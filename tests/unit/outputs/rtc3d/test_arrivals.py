@@ -12,7 +12,7 @@ from gateway.outputs.rtc3d.frame_bytes import encode_joined
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, LiveFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
-from tests.unit.outputs.rtc3d.live_client import (
+from tests.unit.outputs.rtc3d.scripted_server import (
     FAST,
     SLOW,
     TOOL_OUT_OF_VIEW,

@@ -2,40 +2,28 @@
 
 import asyncio
 import socket
-import struct
 from pathlib import Path
 
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs.rtc3d.client_filter import (
-    MAX_HELD_PACKETS,
-    asks_for_parameters,
-    recording_control,
-)
+from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, asks_for_parameters, recording_control
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
 from gateway.rtc3d.commands import ControlRecording
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.losses import amounts
-from tests.unit.outputs.rtc3d.scripted_server import (
-    Client,
-    Line,
-    ScriptedServer,
-    in_virtual_time,
-    settle,
-    write_file,
-)
+from tests.unit.outputs.rtc3d.scripted_server import Client, Line, ScriptedServer, settle, write_file
 from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, streaming
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, command, packet
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, command, packet
+from tests.vectors import START_RECORDING, STOP_RECORDING
 
 C3D = 5
 VERSION = (COMMAND, b"OK-Version 1.0")
 _CHUNK = 256 * 1024
 
 
-@in_virtual_time
 async def test_a_client_without_a_command_is_disconnected_after_ten_seconds(server: ScriptedServer) -> None:
     """Programs of other protocols must not occupy places; errors are no commands."""
     good, wrong, silent = await server.greeted(), server.client(), server.client()
@@ -50,7 +38,6 @@ async def test_a_client_without_a_command_is_disconnected_after_ten_seconds(serv
     assert not good.line.is_closed
 
 
-@in_virtual_time
 async def test_the_system_is_asked_to_notice_vanished_clients() -> None:
     """A computer that loses power sends no end."""
     options = ScriptedServer().client().line.options
@@ -63,7 +50,6 @@ async def test_the_system_is_asked_to_notice_vanished_clients() -> None:
 # Recordings ---------------------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_a_recording_is_acknowledged_once_it_is_done(server: ScriptedServer, client: Client) -> None:
     """Commands after it wait, so that a client sees the replies in order. It gets those of the server."""
     options = ", File=take1.tsv,duration=5,durationunits=seconds"
@@ -81,7 +67,6 @@ async def test_a_recording_is_acknowledged_once_it_is_done(server: ScriptedServe
 
 
 @pytest.mark.parametrize(("sent", "done"), [("Recording Start", b"started"), ("Recording Stop", b"stopped")])
-@in_virtual_time
 async def test_a_refusal_says_why(server: ScriptedServer, client: Client, sent: str, done: bytes) -> None:
     """A defect is no reason to leave the client without an answer; it waits for 30 s at most."""
     for error, text in (
@@ -98,7 +83,6 @@ async def test_a_refusal_says_why(server: ScriptedServer, client: Client, sent: 
     assert client.receive() == [(ERROR, b"Error-The recording was not " + done + b": no answer within 30 s")]
 
 
-@in_virtual_time
 async def test_a_client_that_goes_ends_what_waits_for_it(client: Client) -> None:
     """Nothing is left behind: no timer, no task."""
     await client.ask("Recording Start")
@@ -122,7 +106,6 @@ async def stalled(server: ScriptedServer, tmp_path: Path, content: bytes = b"wal
     return client
 
 
-@in_virtual_time
 async def test_files_go_whole_and_in_order_to_clients_that_have_greeted(tmp_path: Path) -> None:
     """A half-open connection gets no file, and files are closed."""
     server = ScriptedServer()
@@ -137,7 +120,6 @@ async def test_files_go_whole_and_in_order_to_clients_that_have_greeted(tmp_path
     assert not server.losses.report()
 
 
-@in_virtual_time
 async def test_a_file_is_read_no_faster_than_the_client_reads(server: ScriptedServer, tmp_path: Path) -> None:
     """A long file must not fill the memory."""
     content = bytes(5 * _CHUNK)
@@ -150,7 +132,6 @@ async def test_a_file_is_read_no_faster_than_the_client_reads(server: ScriptedSe
     assert client.receive() == [(C3D, content)]
 
 
-@in_virtual_time
 async def test_at_most_four_files_wait_for_a_client(server: ScriptedServer, tmp_path: Path) -> None:
     """Further ones are counted as lost."""
     await server.greeted()
@@ -159,7 +140,6 @@ async def test_at_most_four_files_wait_for_a_client(server: ScriptedServer, tmp_
     assert amounts(server.losses.report()) == {FILE: (2, 0)}
 
 
-@in_virtual_time
 async def test_a_file_that_is_gone_is_counted_and_the_next_one_comes(tmp_path: Path) -> None:
     """The client stays connected: it has got nothing of it."""
     server = ScriptedServer()
@@ -171,7 +151,6 @@ async def test_a_file_that_is_gone_is_counted_and_the_next_one_comes(tmp_path: P
     assert amounts(server.losses.report()) == {FILE: (1, 0)}
 
 
-@in_virtual_time
 async def test_a_file_that_became_shorter_ends_the_connection(server: ScriptedServer, tmp_path: Path) -> None:
     """The client expects the rest, and would take further packets for it."""
     client = await stalled(server, tmp_path, bytes(2 * _CHUNK))
@@ -183,7 +162,6 @@ async def test_a_file_that_became_shorter_ends_the_connection(server: ScriptedSe
     assert server.files.opened == []
 
 
-@in_virtual_time
 async def test_replies_wait_for_the_end_of_a_file_and_frames_are_dropped(tmp_path: Path) -> None:
     """Nothing may come in the middle of a file, and nothing twice."""
     server = ScriptedServer()
@@ -208,10 +186,8 @@ async def test_replies_wait_for_the_end_of_a_file_and_frames_are_dropped(tmp_pat
     assert client.connection.session.frames_dropped == 1
 
 
-@in_virtual_time
-async def test_packets_that_wait_for_the_end_of_a_file_are_bounded(tmp_path: Path) -> None:
+async def test_packets_held_back_by_a_file_are_bounded(server: ScriptedServer, tmp_path: Path) -> None:
     """Exactly as many wait as fit; the others are counted."""
-    server = ScriptedServer()
     client = await stalled(server, tmp_path, b"walk", STREAM)
     for _ in range(MAX_HELD_PACKETS + 3):
         client.connection.filter.send(packet(*NO_FRAMES))
@@ -225,29 +201,16 @@ async def test_packets_that_wait_for_the_end_of_a_file_are_bounded(tmp_path: Pat
 # Which packets control recordings ----------------------------------------------------------
 
 
-def switch(event_id: int, sign: str = ">", number: int = -1) -> bytes:
-    """Return the recording packet of WaveFront's clients (field note 16)."""
-    return struct.pack(sign + "IIIiqI", 1, 48, EVENT, number, 0, 1) + struct.pack(
-        sign + "iqiii", event_id, 0, -1, -1, -1
-    )
-
-
-@pytest.mark.parametrize("sign", [">", "<"])
-@pytest.mark.parametrize("ending", [b"", b"\n"])
-def test_the_recording_packet_starts_and_stops(sign: str, ending: bytes) -> None:
-    for is_start in (True, False):
-        found = recording_control(Packet(DATA, switch(int(is_start), sign) + ending))
-        assert found == ControlRecording(is_start)
-
-
 @pytest.mark.parametrize(
     ("sent", "control"),
     [
         (Packet(COMMAND, b"Recording Start,file=walk 1.c3d\n"), ControlRecording(True, ",file=walk 1.c3d")),
         (Packet(COMMAND, b"recording stop\0"), ControlRecording(False)),
         *((Packet(COMMAND, text), None) for text in (b"Version 1.0", b"Recording", b"")),
-        *((Packet(DATA, data), None) for data in (b"\0\0\0\1", switch(2), switch(1, number=7))),
-        (Packet(77, switch(1)), None),
+        (Packet(DATA, START_RECORDING[8:]), ControlRecording(True)),
+        (Packet(DATA, STOP_RECORDING[8:]), ControlRecording(False)),
+        *((Packet(DATA, data), None) for data in (b"\0\0\0\1", b"\0\0\0\0")),
+        (Packet(77, START_RECORDING[8:]), None),
     ],
 )
 def test_only_recording_commands_start_and_stop(sent: Packet, control: ControlRecording | None) -> None:
@@ -264,7 +227,6 @@ def test_requests_for_parameters_are_recognised() -> None:
         assert not asks_for_parameters(other)
 
 
-@in_virtual_time
 async def test_a_client_that_resets_its_connection_at_once_is_no_defect(server: ScriptedServer) -> None:
     """The system no longer knows its address; a port scan must not look like a problem of the source."""
     line = Line(None)

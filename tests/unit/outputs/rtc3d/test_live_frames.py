@@ -4,14 +4,17 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, WAIT_US
-from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
-from tests.unit.outputs.rtc3d.live_client import (
+from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
+from gateway.outputs.rtc3d.live_scene import LiveScene
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.packets import Packet
+from gateway.rtc3d.parameters import General
+from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from tests.unit.outputs.rtc3d.scripted_server import (
     FAST,
     SLOW,
     TOOL_OUT_OF_VIEW,
-    LiveSource,
     analog,
     body,
     component,
@@ -20,14 +23,104 @@ from tests.unit.outputs.rtc3d.live_client import (
     frame_of_markers,
     markers,
 )
-from tests.unit.rtc3d_server.wire import COMMAND, ERROR, EVENT, MARKERS, WireComponent
+from tests.unit.rtc3d_server.wire import COMMAND, EVENT, WireComponent, components_in
 
+ALL = frozenset(WIRE_ORDER)
 UNKNOWN = bytes.fromhex("0000000c 00000063 01020304")
 WHOLE = body(markers(7, 10_000), TOOL_OUT_OF_VIEW, event(7, 10_000, 3), UNKNOWN) + b"\n"
 ONE_TOOL = body(TOOL_OUT_OF_VIEW)
 AT_7 = (markers(7, 10_000), analog(70, 10_001))
 BOTH = "StreamFrames 3D Analog"
 each_order = pytest.mark.parametrize("fast_first", [False, True])
+
+
+class LiveSource:
+    """A live source with clients; time passes only by ``wait``."""
+
+    def __init__(self, *, played: int = 0, fast_first: bool = False) -> None:
+        self.scene = LiveScene("lab")
+        self.scene._arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
+        self.now_us = 0
+        self._clients: list[LiveClient] = []
+        self.scene.start()
+        self.play(1, played, fast_first=fast_first)
+
+    def client(self, *commands: str) -> "LiveClient":
+        self._clients.append(LiveClient(self))
+        for command in commands:
+            self._clients[-1].send(command)
+        return self._clients[-1]
+
+    def play(self, first: int, last: int, *, fast_first: bool = False) -> None:
+        """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
+        for number in range(first, last + 1):
+            timestamp_us = 10_000 * number
+            slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
+            fast = (body(analog(10 * number, timestamp_us)), FAST)
+            for each in (fast, slow) if fast_first else (slow, fast):
+                self.arrive(*each)
+            for step in range(1, 10):
+                self.wait(1000)
+                self.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
+            self.wait(1000)
+
+    def arrive(
+        self,
+        frame: bytes,
+        stream: int = SLOW,
+        byte_order: ByteOrder = "big",
+        wanted: frozenset[ComponentType] = ALL,
+    ) -> None:
+        """Let a frame arrive, and send what is due then."""
+        self.scene.add(split_frame(frame, byte_order), stream, wanted, self.now_us)
+        self.send()
+
+    def wait(self, us: int) -> None:
+        """Let time pass; send what is due when the scene says so."""
+        until_us = self.now_us + us
+        while (due_us := self.scene.advance(self.now_us)) is not None and due_us <= until_us:
+            self.now_us = max(due_us, self.now_us)
+            self.send()
+        self.now_us = until_us
+        self.send()
+
+    def send(self) -> None:
+        elapsed_us = max(self.now_us, self.scene.newest_us)
+        self.scene.advance(elapsed_us)
+        for client in self._clients:
+            client.bodies += [packet.packet[8:] for packet in client.session.due_frames(elapsed_us)]
+
+
+class LiveClient:
+    """One client; ``bodies`` are the bodies of the frames that it got."""
+
+    def __init__(self, source: LiveSource) -> None:
+        self.bodies: list[bytes] = []
+        self.session = ClientSession(
+            SessionCallbacks(
+                source.scene.frames,
+                lambda sections: source.scene.parameters_xml(sections, General()),
+                lambda: max(source.now_us, source.scene.newest_us),
+            )
+        )
+        self._source = source
+
+    def send(self, text: str) -> None:
+        self.session.answer(Packet(COMMAND, text.encode()))
+        self._source.send()
+
+    def take(self, byte_order: ByteOrder = "big") -> list[list[WireComponent]]:
+        """Return the frames that have come since the last call."""
+        bodies, self.bodies = self.bodies, []
+        return [components_in(each, byte_order) for each in bodies]
+
+    def event_ids(self) -> list[list[int]]:
+        """Return the ids of the events in each of these frames."""
+        return [[int(item[0]) for c in frame if c.type == EVENT for item in c.items] for frame in self.take()]
+
+    def numbers(self) -> list[list[int]]:
+        """Return the frame numbers of the components of each of these frames."""
+        return [[each.frame_number for each in frame] for frame in self.take()]
 
 
 @pytest.mark.parametrize(
@@ -100,19 +193,13 @@ def test_the_current_frame_is_the_newest_and_each_is_sent_once() -> None:
     source.arrive(frame_of_markers(3))
     source.arrive(frame_of_markers(4))
     assert client.numbers() == [[3]]
+    held = source.scene.frames([ComponentType.MARKERS])  # the next client shares it
     source.scene.forget_frames()
     other = source.client("SendCurrentFrame 3D")
+    assert held is source.scene.frames([ComponentType.MARKERS])
     assert other.numbers() == []
     source.arrive(frame_of_markers(9))
     assert other.numbers() == [[9]]
-
-
-def test_requests_for_components_that_never_come_are_bounded() -> None:
-    client = LiveSource().client()
-    for _ in range(MAX_FRAME_REQUESTS):
-        assert client.send("SendCurrentFrame Force")[0][0] == COMMAND
-    assert client.send("SendCurrentFrame Force")[0][0] == ERROR
-    assert len(client.session.measurement_stopped()) == MAX_FRAME_REQUESTS
 
 
 def test_little_is_kept_of_large_frames() -> None:
@@ -149,102 +236,6 @@ def test_a_client_of_one_stream_gets_every_frame_of_it() -> None:
     assert client.numbers() == [[number] for number in range(10, 60)]
 
 
-def test_at_first_frames_wait_until_the_announced_components_are_known() -> None:
-    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=1000.0)
-    client = source.client(BOTH)
-    for step in range(5):
-        source.arrive(body(analog(5 + step, 5000 + 1000 * step)), FAST)
-        source.wait(1000)
-    assert client.take() == []
-    source.play(1, 3)
-    assert client.numbers() == joined(1, 3)
-
-
-def test_at_first_frames_wait_until_the_rates_are_known() -> None:
-    source = LiveSource(is_new=True)
-    client = source.client(BOTH)
-    source.play(1, 20, fast_first=True)
-    assert client.numbers() == joined(1, 20)
-
-
-def test_the_second_frame_of_a_new_source_waits_for_its_sample() -> None:
-    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=100.0)
-    client = source.client(BOTH)
-    for number in range(1, 4):
-        source.arrive(frame_of_markers(number))
-        source.wait(1000)
-        source.arrive(body(analog(number, 10_000 * number)), FAST)
-        source.wait(9000)
-    assert client.numbers() == [[1, 1], [2, 2], [3, 3]]
-
-
-def test_a_client_that_asks_between_two_samples_gets_complete_frames_only() -> None:
-    source = LiveSource(played=3, fast_first=True)
-    source.scene.forget_frames()
-    source.arrive(body(analog(40, 40_000)), FAST)
-    source.scene.forget_frames()
-    client = source.client(BOTH)
-    source.arrive(frame_of_markers(4))
-    for step in range(1, 10):
-        source.arrive(body(analog(40 + step, 40_000 + 1000 * step)), FAST)
-    source.play(5, 6, fast_first=True)
-    assert client.numbers() == joined(5, 6)
-
-
-@pytest.mark.parametrize("command", ["StreamFrames 3D Analog", "SendCurrentFrame 3D Analog"])
-@pytest.mark.parametrize("pause_us", [300_000, 5_000_000])
-@each_order
-def test_the_first_frames_after_a_pause_are_complete(command: str, pause_us: int, fast_first: bool) -> None:
-    source = LiveSource(played=3, fast_first=True)
-    source.scene.forget_frames()  # nobody asks for any
-    source.wait(pause_us)
-    client = source.client(command)
-    base_us = 40_000 + pause_us
-    for step in range(5, 10):
-        source.arrive(body(analog(step, base_us - 10_000 + 1000 * step)), FAST)
-        source.wait(1000)
-    source.play(0, 2, fast_first=fast_first, base_us=base_us)
-    assert {len(frame) for frame in client.numbers()} == {2}
-
-
-@each_order
-def test_a_measurement_that_begins_late_begins_with_complete_frames(fast_first: bool) -> None:
-    source = LiveSource(played=3, fast_first=fast_first)
-    source.scene.stop()
-    client = source.client(BOTH)
-    source.wait(1_500_000)
-    source.arrive(body(analog(9, 9_000)), FAST)
-    source.play(1, 3, fast_first=fast_first)
-    numbers = client.numbers()
-    assert numbers[-2:] == joined(2, 3)
-    assert {len(frame) for frame in numbers} == {2}
-
-
-def test_requests_with_pauses_between_them_do_not_change_the_rate() -> None:
-    source = LiveSource(played=3)
-    client = source.client()
-    for number in range(100, 300, 10):
-        source.scene.forget_frames()
-        client.send("SendCurrentFrame")
-        source.wait(500_000)
-        source.play(number, number)
-    assert {len(frame) for frame in client.take()} == {3}
-    assert source.scene.frames(()).rate == 100
-
-
-def test_a_frame_waits_for_the_faster_stream_and_not_for_ever() -> None:
-    source = LiveSource(played=5)
-    client = source.client(BOTH)
-    source.arrive(frame_of_markers(6))
-    source.wait(WAIT_US - 1)
-    assert client.take() == []
-    source.wait(1)
-    assert client.numbers() == [[6, 59]]
-    source.wait(1_000_000)
-    source.arrive(frame_of_markers(7))
-    assert client.numbers() == [[7]]
-
-
 def test_while_the_slower_stream_has_no_frames_the_faster_one_sets_the_rate() -> None:
     source = LiveSource(played=5)
     client = source.client(BOTH)
@@ -265,40 +256,7 @@ def test_a_new_measurement_is_joined_from_its_first_frames(fast_first: bool) -> 
     assert client.numbers()[1:] == joined(2, 5)
 
 
-def test_a_connection_that_is_made_again_continues_the_joined_frames() -> None:
-    source = LiveSource(played=5)
-    client = source.client(BOTH)
-    for number in range(6, 10):
-        source.arrive(frame_of_markers(number), SLOW + 2)
-        source.arrive(body(analog(10 * number, 10_000 * number)), FAST)
-        source.wait(10_000)
-    assert client.numbers() == joined(6, 9)
-
-
-def test_time_stamps_that_are_no_times_join_the_newest_without_waiting() -> None:
-    source = LiveSource()
-    client = source.client(BOTH)
-    for number in range(1, 10):
-        source.arrive(body(analog(number, 0)), FAST)
-        source.arrive(body(markers(number, 0)), SLOW)
-    assert client.numbers()[-6:] == [[number, number] for number in range(4, 10)]
-
-
 # Events ----------------------------------------------------------------------------------------
-
-
-def test_no_event_is_lost_at_a_low_rate() -> None:
-    source = LiveSource()
-    client = source.client("StreamFrames FrequencyDivisor:4 3D Events")
-    for number in range(1, 10):
-        source.arrive(frame_of_markers(number, event_of(number)))
-    frames = client.take()
-    assert [frame[0].frame_number for frame in frames] == [1, 5, 9]
-    items: list[tuple[float, ...]] = [(number, 10_000 * number, -1, -1, -1) for number in range(1, 10)]
-    expected = [(1, items[:1]), (5, items[1:5]), (9, items[5:])]
-    assert [frame[1] for frame in frames] == [
-        WireComponent(EVENT, number, 10_000 * number, found) for number, found in expected
-    ]
 
 
 def test_a_client_that_lacks_events_is_counted() -> None:
@@ -363,34 +321,3 @@ def test_a_request_for_components_that_do_not_come_gets_an_empty_frame() -> None
     client.send("SendCurrentFrame 6D")
     tool = body(TOOL_OUT_OF_VIEW)
     assert (client.bodies, streaming.bodies) == ([body(), tool], [tool])
-
-
-def test_a_request_for_components_that_a_new_server_lacks_gets_an_empty_frame() -> None:
-    source = LiveSource()
-    client = source.client()
-    for number in range(1, 4):
-        source.arrive(frame_of_markers(number, TOOL_OUT_OF_VIEW))
-        source.wait(10_000)
-    source.scene.stop()
-    client.send("SendCurrentFrame 6D")
-    for number in range(1, 4):
-        source.arrive(frame_of_markers(number), SLOW + 2)
-        source.wait(1_000_000)
-    assert client.bodies == [body()]
-
-
-def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
-    source = LiveSource()
-    client = source.client("StreamFrames FrequencyDivisor:2 3D Events")
-    for number in range(1, 7):
-        source.arrive(frame_of_markers(number))
-        source.arrive(body(event_of(number)))
-    frames = client.take()
-    numbers = [[each.frame_number for each in frame if each.type == MARKERS] for frame in frames]
-    assert numbers == [[1], [3], [5]]
-    assert [item[0] for frame in frames for each in frame if each.type == EVENT for item in each.items] == [
-        1,
-        2,
-        3,
-        4,
-    ]

@@ -13,12 +13,12 @@ from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import SECTIONS, General
 from gateway.rtc3d.parameters_xml import parse_parameters
 from tests.losses import amounts
-from tests.unit.outputs.rtc3d.live_client import body, markers
 from tests.unit.outputs.rtc3d.scripted_server import (
     Client,
     ScriptedServer,
+    body,
     frame_numbers,
-    in_virtual_time,
+    markers,
     parameters,
     settle,
 )
@@ -43,10 +43,7 @@ async def streaming(server: ScriptedServer) -> Client:
 # Measurements -------------------------------------------------------------------------------
 
 
-@in_virtual_time
-async def test_a_client_waits_two_seconds_for_an_unknown_source(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_client_waits_two_seconds_for_a_new_source(server: ScriptedServer, client: Client) -> None:
     """The gateway may have to start its own stream first, so No Data at once would be wrong."""
     assert await client.ask(STREAM) == [OK_STREAM]
     await asyncio.sleep(0.5)
@@ -61,7 +58,6 @@ async def test_a_client_waits_two_seconds_for_an_unknown_source(
     assert client.receive() == []
 
 
-@in_virtual_time
 async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait(server: ScriptedServer) -> None:
     """As a server answers."""
     client = await server.greeted(STREAM)
@@ -72,10 +68,7 @@ async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait(serv
     assert not server.is_measuring
 
 
-@in_virtual_time
-async def test_a_frame_or_a_stream_of_the_source_ends_the_wait(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_frame_or_stream_of_the_source_ends_the_wait(server: ScriptedServer, client: Client) -> None:
     """The time-out of the request must not end the measurement, nor do gaps in a stream."""
     await client.ask(STREAM)
     server.arrive(1)
@@ -91,7 +84,6 @@ async def test_a_frame_or_a_stream_of_the_source_ends_the_wait(
     assert (client.receive(), server.is_measuring) == ([], True)
 
 
-@in_virtual_time
 async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment(server: ScriptedServer) -> None:
     """Frames of a backlog come after the source has ended; each of them postpones No Data."""
     client = await streaming(server)
@@ -113,7 +105,6 @@ async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment(server: Sc
     assert client.receive() == [NO_FRAMES]
 
 
-@in_virtual_time
 async def test_a_source_that_has_been_silent_ends_at_once(server: ScriptedServer) -> None:
     """Clients must not wait for what is known."""
     client = await streaming(server)
@@ -123,7 +114,6 @@ async def test_a_source_that_has_been_silent_ends_at_once(server: ScriptedServer
     assert client.receive() == [NO_FRAMES]
 
 
-@in_virtual_time
 async def test_closing_ends_everything_and_nobody_wants_frames(server: ScriptedServer) -> None:
     """A source must not go on sending for clients that are gone."""
     await server.listen()
@@ -137,7 +127,6 @@ async def test_closing_ends_everything_and_nobody_wants_frames(server: ScriptedS
 # Parameters ---------------------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_a_request_waits_for_parameters(server: ScriptedServer, client: Client) -> None:
     """A client that comes with the gateway's start would otherwise get an error."""
     assert await client.ask("SendParameters 3D", "Version 1.0") == []
@@ -150,7 +139,6 @@ async def test_a_request_waits_for_parameters(server: ScriptedServer, client: Cl
     assert b"heel" in xml
 
 
-@in_virtual_time
 async def test_a_request_for_parameters_waits_for_one_second(server: ScriptedServer, client: Client) -> None:
     """Anything that is known of the source ends the wait: it answers, and will give none later."""
     assert await client.ask("SendParameters") == []
@@ -162,7 +150,6 @@ async def test_a_request_for_parameters_waits_for_one_second(server: ScriptedSer
         assert (await server.client().ask("SendParameters"))[0][0] == ERROR
 
 
-@in_virtual_time
 async def test_the_newest_parameters_are_served_at_once(server: ScriptedServer, client: Client) -> None:
     """Parameters and frames of one moment belong together."""
     for label in ("heel", "toe"):
@@ -178,7 +165,6 @@ async def test_the_newest_parameters_are_served_at_once(server: ScriptedServer, 
 # Which frames are wanted --------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_frames_are_wanted_while_any_client_asks_for_some(server: ScriptedServer) -> None:
     """The gateway's own stream depends on it; each change is reported once."""
     first, second = server.client(), server.client()
@@ -193,7 +179,6 @@ async def test_frames_are_wanted_while_any_client_asks_for_some(server: Scripted
     assert server.changes == [True, False]
 
 
-@in_virtual_time
 async def test_a_request_is_wanted_until_it_is_answered(server: ScriptedServer, client: Client) -> None:
     """Otherwise the source would send for nobody."""
     await client.ask("SendCurrentFrame 3D")
@@ -209,7 +194,6 @@ async def test_a_request_is_wanted_until_it_is_answered(server: ScriptedServer, 
     assert frame_numbers(client.receive()) == [3]
 
 
-@in_virtual_time
 async def test_maintenance_corrects_what_another_server_of_the_source_said(server: ScriptedServer) -> None:
     """After a change of the port, the former server says last that nothing is wanted."""
     await streaming(server)
@@ -218,7 +202,6 @@ async def test_maintenance_corrects_what_another_server_of_the_source_said(serve
     assert server.changes == [True, True]
 
 
-@in_virtual_time
 async def test_a_frame_is_sent_when_it_arrives_even_if_others_came_in_the_same_moment() -> None:
     """The times of frames grow with each of them, so they can be ahead of the clock."""
     server = ScriptedServer()
@@ -285,7 +268,6 @@ def test_the_whole_parameters_are_the_servers_own_bytes() -> None:
 # Limits -------------------------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_clients_that_are_too_many_are_turned_away() -> None:
     """The limit counts exactly, and those that are served notice nothing."""
     server = ScriptedServer(max_clients=2)
@@ -300,7 +282,6 @@ async def test_clients_that_are_too_many_are_turned_away() -> None:
     assert not fourth.line.is_closed
 
 
-@in_virtual_time
 async def test_the_oldest_silent_connection_makes_room_for_a_client() -> None:
     """Half-open connections must not lock clients out; each makes room only once."""
     server = ScriptedServer(max_clients=3)
@@ -313,7 +294,6 @@ async def test_the_oldest_silent_connection_makes_room_for_a_client() -> None:
 
 
 @pytest.mark.parametrize(("max_clients", "most"), [(8, 4 * 2**20), (1000, 512 * 2**20 // 1000)])
-@in_virtual_time
 async def test_what_waits_for_all_clients_together_has_a_limit(max_clients: int, most: int) -> None:
     """The gateway's memory is bounded however many clients do not read."""
     assert ScriptedServer(max_clients).client().line.high_water == most
@@ -322,7 +302,6 @@ async def test_what_waits_for_all_clients_together_has_a_limit(max_clients: int,
 # Losses -------------------------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_each_lost_frame_of_a_client_is_counted_once(server: ScriptedServer) -> None:
     """Losses are per source: those of its clients add up, whether they are still there or not."""
     first, second = await server.greeted(), await server.greeted()

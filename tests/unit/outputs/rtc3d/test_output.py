@@ -21,8 +21,7 @@ from gateway.outputs.rtc3d.publisher import QUEUE_FULL
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from tests.unit.outputs.rtc3d.live_client import body, markers
-from tests.unit.outputs.rtc3d.scripted_server import in_virtual_time, settle
+from tests.unit.outputs.rtc3d.scripted_server import body, markers, settle
 
 LAB, HALL = 3120, 3121
 FRAME = split_frame(body(markers(1, 10_000)), "big")
@@ -126,7 +125,6 @@ def take_over(output: Rtc3dOutput, ports: Mapping[str, int], **values: Any) -> b
 # Ports --------------------------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_the_ports_of_announced_sources_are_open() -> None:
     """Clients must not reach a source that is not there yet."""
     output = Rtc3dOutput(settings({"lab": LAB, "hall": HALL}))
@@ -145,7 +143,6 @@ async def test_the_ports_of_announced_sources_are_open() -> None:
     assert Server.events[1:] == [f"open 127.0.0.1 {HALL}", f"close 127.0.0.1 {LAB}", f"open 127.0.0.1 {LAB}"]
 
 
-@in_virtual_time
 async def test_closing_closes_every_port_for_good() -> None:
     """An output that is closed cannot be started again."""
     output = await started({"lab": LAB, "hall": HALL})
@@ -160,14 +157,12 @@ async def test_closing_closes_every_port_for_good() -> None:
     assert never_started._thread is None
 
 
-@in_virtual_time
 async def test_a_port_for_an_unknown_source_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     """Nobody could connect, and the name is probably mistyped."""
     await started({"lab": LAB, "lap": HALL}, "lab")
     assert [each.args for each in caplog.records if each.levelno == logging.WARNING] == [("lap",)]
 
 
-@in_virtual_time
 async def test_a_port_in_use_is_tried_again_until_it_is_free() -> None:
     """The waits double from 0.2 s up to 1 s; meanwhile, the health says why."""
     Server.busy.add(LAB)
@@ -184,7 +179,6 @@ async def test_a_port_in_use_is_tried_again_until_it_is_free() -> None:
     assert Server.opened["lab"].num_applied == 1
 
 
-@in_virtual_time
 async def test_a_reload_touches_only_what_has_changed() -> None:
     """Clients of the other sources stay connected."""
     output = await started({"lab": LAB, "hall": HALL})
@@ -200,7 +194,6 @@ async def test_a_reload_touches_only_what_has_changed() -> None:
     assert output.is_configured_like(Rtc3dOutput(Rtc3dSettings()))
 
 
-@in_virtual_time
 async def test_ports_that_are_exchanged_or_get_another_address_are_closed_before_they_are_opened() -> None:
     """Otherwise each source would find the other's port, or its own, in use."""
     output = await started({"lab": LAB, "hall": HALL})
@@ -213,7 +206,6 @@ async def test_ports_that_are_exchanged_or_get_another_address_are_closed_before
     assert [sorted(Server.events[at : at + 2]) for at in (2, 4, 6, 8)] == expected
 
 
-@in_virtual_time
 async def test_a_port_that_never_opened_is_given_up() -> None:
     """A source that is withdrawn must not be tried for ever."""
     Server.busy.add(LAB)
@@ -227,7 +219,6 @@ async def test_a_port_that_never_opened_is_given_up() -> None:
 # What the thread gets -----------------------------------------------------------------------
 
 
-@in_virtual_time
 async def test_the_server_hears_of_every_change_of_its_source() -> None:
     """Clients get No Data and new parameters in time."""
     output = await started({"lab": LAB, "hall": HALL})
@@ -250,7 +241,6 @@ async def test_the_server_hears_of_every_change_of_its_source() -> None:
     assert (state.losses, Server.opened["hall"].state.losses) == (losses, None)
 
 
-@in_virtual_time
 async def test_files_reach_the_source_of_the_server_even_if_the_queue_is_full(tmp_path: Path) -> None:
     """A file is announced only once."""
     output = await started({"lab": LAB, "hall": HALL})
@@ -261,7 +251,6 @@ async def test_files_reach_the_source_of_the_server_even_if_the_queue_is_full(tm
     assert (Server.opened["lab"].files, Server.opened["hall"].files) == ([tmp_path], [])
 
 
-@in_virtual_time
 async def test_frames_are_handed_over_while_any_client_wants_some() -> None:
     """A frame that nobody wants costs the thread nothing; the stream is that of the session."""
     output = await started({"lab": LAB})
@@ -287,7 +276,6 @@ async def test_frames_are_handed_over_while_any_client_wants_some() -> None:
     unstarted.frame_publisher("lab").publish(FRAME, stamp, 1, COMPONENTS)
 
 
-@in_virtual_time
 async def test_a_defect_in_one_frame_does_not_end_the_thread() -> None:
     """The next frame may be different; frames of closed ports are nothing."""
     output = await started({"lab": LAB})
@@ -300,7 +288,6 @@ async def test_a_defect_in_one_frame_does_not_end_the_thread() -> None:
     assert [stream for stream, _ in server.taken] == [13, 1]
 
 
-@in_virtual_time
 async def test_recordings_are_passed_on_to_the_source() -> None:
     """The options belong to the start only."""
     asked: list[object] = []

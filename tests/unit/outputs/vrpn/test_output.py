@@ -198,7 +198,7 @@ def test_names_of_trackers_that_are_not_the_labels_are_shown() -> None:
     assert output.topic_names("stage") == {}
 
 
-def test_a_defect_in_the_servers_thread_is_logged_once_and_later_calls_are_made(
+def test_a_defect_in_the_thread_is_logged_once_and_later_calls_are_made(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     output = VrpnOutput(VrpnSettings(port=free_port()))

@@ -113,9 +113,7 @@ async def test_only_the_address_that_asks_is_called_back(running: Running) -> No
             stranger.accept()
 
 
-async def test_call_that_is_refused_is_logged_few_times(
-    running: Running, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_refused_calls_are_logged_few_times(running: Running, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(20):
         send_datagram(f"127.0.0.1 {free_port()}\0".encode(), running[1])
     async with await VrpnClient.knock(running[1]) as client:
@@ -125,9 +123,7 @@ async def test_call_that_is_refused_is_logged_few_times(
     assert "Connection refused" in refused[0]
 
 
-async def test_flood_of_requests_by_udp_is_read_slowly(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_flood_of_udp_calls_is_read_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
     monkeypatch.setattr("gateway.outputs.vrpn.knocks.knock_port", read.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
@@ -297,9 +293,7 @@ async def test_flood_of_pings_is_read_slowly(running: Running, monkeypatch: pyte
         await wait_until_async(lambda: client.poses and flood.poses)
 
 
-async def test_connections_are_accepted_at_a_limited_rate(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_connections_are_accepted_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     server, port = running
     async with contextlib.AsyncExitStack() as stack:
         first = await stack.enter_async_context(await VrpnClient.connect(port))

@@ -1,61 +1,18 @@
-"""A client of a simulator with faults, without a socket, in virtual time, and packets that faults change."""
+"""A client of a simulator with faults, without a socket."""
 
 import asyncio
-import inspect
-import struct
-import types
-from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-import pytest
-
 from gateway.rtc3d.packets import Packet, PacketReader
-from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault
-from gateway.simulator.faults.outgoing import PendingWrite
+from gateway.simulator.faults.base import ActiveFault, Fault
 from gateway.simulator.faults.pipeline import FaultPipeline
 from gateway.simulator.simulator import Simulator
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.scripted_client import ScriptedClient
-from tests.unit.rtc3d_server.wire import (
-    COMMAND,
-    DATA,
-    MARKERS,
-    ByteOrder,
-    WireComponent,
-    command,
-    components_in,
-    packet,
-    packets_in,
-)
-from tests.virtual_time import run_in_virtual_time
+from tests.unit.rtc3d_server.wire import COMMAND, command, packets_in
 
 RATE_HZ = 1000.0
-NEVER_MS = 600_000.0
 VERSION = (COMMAND, b"OK-Version 1.0")
-
-
-def played(scenario: Callable[..., Any]) -> Callable[..., None]:
-    """Run a test with a client in virtual time, whose clock the faults read, too."""
-
-    def run(monkeypatch: pytest.MonkeyPatch, **fixtures: Any) -> None:
-        clock = types.SimpleNamespace(monotonic=lambda: asyncio.get_running_loop().time())
-        for module in ("pipeline", "write_queue"):
-            monkeypatch.setattr(f"gateway.simulator.faults.{module}.time", clock)
-
-        async def with_client() -> None:
-            client = FaultyClient()
-            await scenario(client, **fixtures)
-            await client.faults.clear()
-            assert client.filter.waiting_bytes == 0
-
-        run_in_virtual_time(with_client())
-
-    _, *others = inspect.signature(scenario).parameters.values()
-    own = inspect.Parameter("monkeypatch", inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    run.__signature__ = inspect.Signature([own, *others])  # type: ignore[attr-defined]
-    run.__name__ = scenario.__name__
-    return run
 
 
 class FaultyClient:
@@ -75,10 +32,6 @@ class FaultyClient:
         self.writes: list[tuple[float, bytes]] = []
         self._began_s = asyncio.get_running_loop().time()
         self._reader = PacketReader()
-
-    @property
-    def now_s(self) -> float:
-        return round(asyncio.get_running_loop().time() - self._began_s, 6)
 
     def begin(self, *faults: Fault) -> list[ActiveFault]:
         return [self.faults.begin(fault) for fault in faults]
@@ -107,7 +60,8 @@ class FaultyClient:
     # FilteredConnection and its transport -----------------------------------------------------
 
     def write(self, data: bytes) -> None:
-        self.writes.append((self.now_s, data))
+        elapsed_s = asyncio.get_running_loop().time() - self._began_s
+        self.writes.append((round(elapsed_s, 6), data))
 
     def handle(self, data: bytes) -> None:
         for received in self._reader.feed(data):
@@ -121,45 +75,3 @@ class FaultyClient:
         if name.startswith("_"):
             raise AttributeError(name)
         return lambda *_: self.calls.append(name)
-
-
-# Packets ----------------------------------------------------------------------------------------
-
-
-def active(fault: Fault, seed: int = 1) -> ActiveFault:
-    return ActiveFault(fault, Simulator(CountingScene()).faults, np.random.default_rng(seed))
-
-
-def markers(
-    byte_order: ByteOrder = "big", count: int = 2, number: int = 7, timestamp_us: int = 9000
-) -> bytes:
-    """Return a 3D component; marker k is at (k, 1.5, -2) with the residual 0.25."""
-    sign = ">" if byte_order == "big" else "<"
-    items = b"".join(struct.pack(sign + "4f", k, 1.5, -2.0, 0.25) for k in range(count))
-    return struct.pack(sign + "IIiqI", 24 + len(items), MARKERS, number, timestamp_us, count) + items
-
-
-def frame(*components: bytes, byte_order: ByteOrder = "big") -> bytes:
-    sign = ">" if byte_order == "big" else "<"
-    return packet(DATA, struct.pack(sign + "I", len(components)) + b"".join(components))
-
-
-def writes_for(
-    fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFault | None = None
-) -> list[PendingWrite]:
-    """Return what is written instead of one packet that is due at 100 s."""
-    return fault.change_writes([PendingWrite(100.0, packet)], active_fault or active(fault))
-
-
-def changed(fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFault | None = None) -> bytes:
-    [write] = writes_for(fault, packet, active_fault)
-    assert (write.due_s, write.joins_previous) == (100.0, False)
-    return write.data
-
-
-def components_in_packet(
-    data: bytes, byte_order: ByteOrder = "big", event_bytes: int = 24
-) -> list[WireComponent]:
-    [(packet_type, body)] = packets_in(data)
-    assert packet_type == DATA
-    return components_in(body, byte_order, event_bytes=event_bytes)

@@ -182,8 +182,6 @@ def test_a_damaged_channel_is_no_source(path: Path) -> None:
     ("content", "options", "problem"),
     [
         (None, {}, "cannot be read: No such file"),
-        (b"", {}, "is empty"),
-        (b"no log" * 1000, {}, "without an LCM event"),
         (encode_event(0, 0, b"OTHER", b"12345678"), {}, "has no"),
         (log_bytes([description(), parameters(XML)]), {}, "has no frames"),
         (log_bytes(take_of(100)), {"from_s": 10}, "has no frames of lab from 10 s to its end"),
