@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
+from gateway.errors import ClosedError, LinkError, PacketError, ReplyTimeoutError, ServerError, SilenceError
 from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
 from gateway.stream.state import StreamState
 from tests.losses import amounts
@@ -267,8 +267,10 @@ async def test_packets_above_the_configured_limits_end_the_session(packet_type: 
     lab.connection.send(struct.pack(">II", limit, packet_type) + (limit - 8) * b"\xff")
     assert lab.session.is_open
     lab.connection.send(struct.pack(">II", limit + 1, packet_type))
-    with pytest.raises(ClosedError, match=rf"packet size {limit + 1} \(limit {limit}\), type {packet_type}"):
+    text = rf"packet size {limit + 1} \(limit {limit}\), type {packet_type}"
+    with pytest.raises(ClosedError, match=text) as caught:
         await lab.session.monitor(lab.check_silence)
+    assert isinstance(caught.value.__cause__, PacketError)
 
 
 # --- the end

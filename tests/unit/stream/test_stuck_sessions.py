@@ -114,6 +114,14 @@ def now_s() -> float:
 # --- servers that ignore and refuse
 
 
+async def test_frames_show_that_a_form_was_accepted() -> None:
+    lab = Lab()
+    server = StreamingServer(lab, silent_to(""), accepts=lambda _: True)
+    async with serving(lab, server):
+        await until(lambda: lab.supervisor.session)
+    assert lab.server.connection.commands == ["Version 1.0", "SendParameters", FIRST_FORM, "Bye"]
+
+
 async def test_a_server_that_answers_nothing_is_reconnected_with_a_reason() -> None:
     lab = Lab()
     lab.server.answer = silent_to("")
