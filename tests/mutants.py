@@ -29,7 +29,7 @@ LEAST_PERCENT: Final = 85
 
 TESTS: Final[dict[str, tuple[str, ...]]] = {
     "stream": ("unit/stream/test_* unit/test_*source* unit/test_*streams* property/*_clock_*",),
-    "publish": ("unit/publish/test_* property/*_tool_pose* property/*_pacing_*",),
+    "publish": ("unit/publish/test_* property/*_pacing_*",),
     "queries": ("unit/queries/test_* unit/test_source*",),
     "takes": ("unit/takes/test_* property/*takes* property/*_seek_* property/*_components_*",),
 } | {

@@ -147,12 +147,8 @@ floats = st.floats() | st.sampled_from((1e39, -1e300, float("nan"))) | st.just(1
 
 @given(numbers, floats, st.text(st.characters()))
 def test_any_values_of_a_status_can_be_encoded(number: int, value: float, text: str) -> None:
-    stream, output, loss, count = (
-        rtc3d.stream_status_t(),
-        rtc3d.output_status_t(),
-        rtc3d.loss_t(),
-        rtc3d.count_t(),
-    )
+    stream, output = rtc3d.stream_status_t(), rtc3d.output_status_t()
+    loss, count = rtc3d.loss_t(), rtc3d.count_t()
     stream.session = stream.frames_in = stream.clock.offset_us = loss.messages = count.count = number
     stream.frame_rate_hz = stream.lag_ms = stream.clock.drift_ppm = value
     stream.state = stream.last_error = loss.cause = count.name = output.problem = text

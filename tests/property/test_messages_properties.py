@@ -1,9 +1,12 @@
-"""Messages: both byte orders give the same bytes, and no damage crashes a decoder."""
+"""Messages and their keys: both byte orders give the same bytes, and no input crashes or collides."""
 
 import contextlib
 import json
+import re
 import struct
+from urllib.parse import unquote
 
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,6 +17,7 @@ from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.messages.summary import summarise
 from gateway.messages.tool_pose import tool_poses
+from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, zenoh_key
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import Component, ComponentType
@@ -126,3 +130,38 @@ def test_damaged_messages_raise_only_protocol_errors_and_decoded_ones_can_be_sho
         decoded = decode(message)
         assert summarise(decoded)
         assert json.dumps(to_json(decoded), allow_nan=False)
+
+
+# --- keys and channels
+
+
+labels = st.text(max_size=80)
+
+
+@given(labels)
+def test_any_label_becomes_one_chunk_of_a_valid_zenoh_key(label: str) -> None:
+    key = zenoh.KeyExpr(zenoh_key("mocap", "lab", "6d", label))
+    assert len(str(key).split("/")) == 4
+    assert not key.includes("mocap/lab/6d/another")
+
+
+@given(labels)
+def test_a_label_can_be_read_back_from_its_key(label: str) -> None:
+    chunk = escape_key_chunk(label)
+    assert unquote(chunk) == label or (label, chunk) == ("", "%")
+
+
+@given(st.from_regex(r"[A-Za-z0-9_]{1,16}", fullmatch=True), labels, labels)
+def test_any_label_gives_a_valid_lcm_channel(prefix: str, source: str, label: str) -> None:
+    channel = lcm_channel(prefix, source, "6d", label)
+    assert re.fullmatch(re.escape(prefix) + "_[A-Z0-9_]+", channel)
+    assert len(channel) <= 63
+
+
+@given(st.lists(labels, max_size=30), st.integers(4, 63))
+def test_unique_names_differ_and_keep_to_the_length(wanted: list[str], max_length: int) -> None:
+    taken: list[str] = []
+    for name in wanted:
+        taken.append(unique_name(name, taken, max_length))
+    assert len(set(taken)) == len(wanted)
+    assert all(len(name) <= max_length for name in taken)

@@ -78,17 +78,6 @@ any_streams = (
 )
 
 
-@given(packet_lists, st.data())
-def test_any_split_of_a_stream_gives_the_same_packets(packet_list: list[Packet], data: st.DataObject) -> None:
-    reader = new_reader()
-    read = []
-    for piece in data.draw(pieces_of(stream_of(packet_list))):
-        read += reader.feed(piece)
-    assert with_whole_files(read) == (packet_list, b"")
-    assert reader.error is None
-    assert reader.buffered_bytes == 0
-
-
 @settings(max_examples=300)
 @given(pieces(any_streams))
 def test_the_packets_read_from_any_bytes_are_those_in_the_bytes(stream: list[bytes]) -> None:

@@ -26,6 +26,7 @@ from tests.unit.test_gateway import (
     events,  # noqa: F401 - a fixture
     running,
     settings,
+    streaming,
     subscribe,
 )
 from tests.virtual_time import settle
@@ -86,8 +87,7 @@ async def test_a_defect_in_one_source_is_logged_once_and_the_source_recovers(
 ) -> None:
     caplog.set_level(logging.INFO)
     failing = let_fail(monkeypatch, owner, method)
-    async with running(settings("lab", "hall")) as gateway:
-        await connected(gateway)
+    async with streaming(settings("lab", "hall")) as gateway:
         failing.add("lab")
         for _ in range(60):  # the servers send frames, and that of lab breaks off
             for name in ("lab", "hall"):
@@ -114,8 +114,7 @@ async def test_a_defect_in_one_output_does_not_stop_the_others(
     servers: Servers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
 ) -> None:
     let_outputs_fail(monkeypatch, method)
-    async with running(settings(example="broken", other="elsewhere")) as gateway:
-        await connected(gateway)
+    async with streaming(settings(example="broken", other="elsewhere")):
         messages = subscribe("elsewhere")
         for _ in range(5):
             servers["lab"].connection.send_frames(1)
@@ -136,8 +135,7 @@ async def test_a_reload_with_a_defect_in_one_output_is_complete_and_the_next_one
     servers: Servers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
 ) -> None:
     wanted = settings("lab", "hall", example="broken", other="elsewhere")
-    async with running(settings("lab", "yard", other="elsewhere")) as gateway:
-        await connected(gateway)
+    async with streaming(settings("lab", "yard", other="elsewhere")) as gateway:
         servers["yard"].connection.send_frames(1)
         failing = let_outputs_fail(monkeypatch, method)
         changes = await gateway.reload(wanted)
@@ -163,8 +161,7 @@ async def test_messages_that_a_defect_leaves_without_a_publisher_count_as_lost(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     let_outputs_fail(monkeypatch, "publisher")
-    async with running(settings(example="broken")) as gateway:
-        await connected(gateway)
+    async with streaming(settings(example="broken")) as gateway:
         servers["lab"].connection.send_frames(1, 2, 3)
         [(_, status)] = gateway.sources[0].fan_out.outputs
         assert [(loss.cause, loss.frames) for loss in status.losses if loss.frames] == [("defect", 3)]
@@ -180,8 +177,7 @@ async def test_a_reload_with_a_defect_in_one_source_starts_the_others_and_can_be
             super().__init__(settings, *rest)
 
     wanted = settings("lab@other", "hall@other", "yard@other")
-    async with running(settings("lab", "hall", "yard")) as gateway:
-        await connected(gateway)
+    async with streaming(settings("lab", "hall", "yard")) as gateway:
         with monkeypatch.context() as patch:
             patch.setattr("gateway.gateway.Source", Broken)
             with pytest.raises(ZeroDivisionError):
@@ -218,8 +214,7 @@ async def test_a_source_that_had_a_defect_continues_its_numbers_and_shows_why(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing = let_fail(monkeypatch, AutomaticStreams, "check")
-    async with running(settings("lab", "hall")) as gateway:
-        await connected(gateway)
+    async with streaming(settings("lab", "hall")) as gateway:
         messages = subscribe("local", source="lab")
         servers["lab"].connection.send_frames(1)
         failing.add("lab")

@@ -99,9 +99,11 @@ def new_lab(servers: Servers, tmp_path: Path) -> NewLab:
 
 
 @asynccontextmanager
-async def running(lab: Lab) -> AsyncIterator[None]:
+async def running(lab: Lab, sessions: int = 1) -> AsyncIterator[None]:
+    """Run the source, from when it has so many sessions until the block ends."""
     task = asyncio.create_task(lab.source.run())
     try:
+        await lab.connected(sessions)
         yield
     finally:
         task.cancel()
@@ -115,7 +117,6 @@ def messages_of(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:
 async def receive_files(lab: Lab, number: int) -> None:
     """Run the source until it has received files of 600 bytes."""
     async with running(lab):
-        await lab.connected()
         for _ in range(number):
             lab.server.connection.send(packet(5, c3d_file(b"", 600)))
             await settle()
@@ -183,8 +184,7 @@ async def test_a_stream_without_a_clock_is_never_the_best(new_lab: NewLab) -> No
 
 async def test_the_source_shows_streaming_while_any_stream_has_frames(new_lab: NewLab) -> None:
     lab = new_lab(streams=TWO_STREAMS)
-    async with running(lab):
-        await lab.connected(2)
+    async with running(lab, sessions=2):
         assert True not in lab.output.streaming
         first, second = lab.server.connections
         first.send_frames(1)
@@ -213,7 +213,6 @@ async def test_a_file_is_stored_and_announced(
     caplog.set_level(logging.INFO)
     lab, content = new_lab(), c3d_file(b"a file", 600)
     async with running(lab):
-        await lab.connected()
         lab.server.connection.send(packet(5, content))
         await settle()
         [(source, file)] = lab.files
@@ -274,7 +273,6 @@ async def test_a_file_that_breaks_off_with_the_connection_is_logged(
 ) -> None:
     lab = new_lab()
     async with running(lab):
-        await lab.connected()
         lab.server.connection.send(packet(5, c3d_file(b"", 600))[:-1])
         lab.server.connection.end()
         await settle()
@@ -315,8 +313,7 @@ async def test_recording_is_controlled_on_the_first_connection_that_works(new_la
     with pytest.raises(QueryError, match="has no connection") as caught:
         await lab.source.queries.answer(start)
     assert caught.value.code == "no-connection"
-    async with running(lab):
-        await lab.connected(2)
+    async with running(lab, sessions=2):
         first, second = lab.server.connections
         for expected in ((1, 0), (1, 1)):
             answer = await lab.source.queries.answer(start)

@@ -10,8 +10,7 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import ServerParameters
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import SECTIONS
-from tests.servers import markers_frame, packet
+from tests.servers import packet
 from tests.spec_parameters import in_root
 from tests.toy_output import ToyOutput
 from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
@@ -25,7 +24,6 @@ __all__ = ["new_lab"]  # a fixture
 OTHER_XML = packet(2, in_root("<The_3D><Unit>cm</Unit></The_3D>"))
 NO_DATA = packet(4)
 REQUEST = "SendParameters"
-ORIGIN = (0.0, 0.0, 0.0)
 
 
 def sending(xml: bytes, by: Answer = obliging) -> Answer:
@@ -43,22 +41,10 @@ def published(lab: Lab) -> list[tuple[bytes, int, int]]:
     return [parameters[:3] for _, parameters in lab.parameters]
 
 
-async def test_parameters_are_published_with_every_connection(new_lab: NewLab) -> None:
-    lab = new_lab()
-    async with running(lab):
-        await lab.connected()
-        assert published(lab) == [(XML[8:], 1, 1)]
-        lab.server.connection.end()
-        await settle()
-        await lab.connected()
-        assert published(lab)[1:] == [(XML[8:], 2, 1)]
-
-
 async def test_a_server_that_hung_in_the_handshake_is_asked_again(new_lab: NewLab) -> None:
     lab = new_lab()
     lab.server.answer = silent_to(REQUEST)
     async with running(lab):
-        await lab.connected()
         lab.server.connection.send(NO_DATA)
         [status] = lab.source.statuses
         assert "the server did not answer SendParameters" in status.limitations
@@ -67,39 +53,6 @@ async def test_a_server_that_hung_in_the_handshake_is_asked_again(new_lab: NewLa
         assert status.parameters_version == 1
         assert published(lab) == [(XML[8:], 1, 1)]
         assert "the server did not answer SendParameters" not in status.limitations
-
-
-async def test_one_request_per_connection_is_enough(new_lab: NewLab) -> None:
-    sections = ("General", "The_3D", "The_6D", "Analog", "Force", "Events")
-    whole = packet(2, in_root(*(f"<{section}/>" for section in sections)))
-    lab = new_lab(parameters_interval_s=0.0, stall_timeout_s=3600.0)
-    lab.server.answer = sending(whole)
-    async with running(lab):
-        # The frames of the second connection have other numbers, and another number of markers.
-        for frame in (markers_frame(7000, ORIGIN), markers_frame(1, ORIGIN, ORIGIN)):
-            await lab.connected()
-            lab.server.connection.send(frame)
-            for section in SECTIONS:
-                await lab.source.queries.answer(Question("parameters", section))
-            await asyncio.sleep(60)
-            commands = lab.server.connection.commands
-            assert [each for each in commands if each.startswith(REQUEST)] == [REQUEST]
-            lab.server.connection.end()
-            await settle()
-
-
-async def test_streams_that_connect_together_need_one_request(new_lab: NewLab) -> None:
-    lab = new_lab(streams=TWO_STREAMS)
-    async with running(lab):
-        await lab.connected(2)
-        assert lab.count(REQUEST) == 1
-        assert [status.parameters_version for status in lab.source.statuses] == [1, 1]
-        for connection in lab.server.connections:
-            connection.end()
-        lab.server.answer = sending(OTHER_XML)
-        await settle()
-        await lab.connected(2)
-        assert [status.parameters_version for status in lab.source.statuses] == [2, 2]
 
 
 @pytest.mark.parametrize("on_demand", [False, True])
@@ -111,7 +64,6 @@ async def test_parameters_are_read_again_at_the_interval(
     lab = new_lab(streams=(stream,), output=output, stall_timeout_s=3600.0)
     lab.server.answer = sending(tools("Probe"))
     async with running(lab):
-        await lab.connected()
         await asyncio.sleep(9.5)
         assert lab.count(REQUEST) == 1
         assert lab.count("StreamFrames Stop") == on_demand
@@ -129,25 +81,9 @@ async def test_parameters_are_read_again_at_the_interval(
     assert warning.startswith("lab: markers or tools were renamed on the server: 6d 'Probe' to 'Head';")
 
 
-@pytest.mark.parametrize(("answer", "count"), [(refusing(REQUEST), 1), (silent_to(REQUEST), 2)])
-async def test_a_server_that_gives_no_parameters_is_not_asked_for_ever(
-    new_lab: NewLab, answer: Answer, count: int
-) -> None:
-    lab = new_lab()
-    lab.server.answer = answer
-    async with running(lab):
-        await lab.connected()
-        lab.server.connection.send(NO_DATA)
-        lab.source.fan_out.on_items_changed()
-        await asyncio.sleep(100)
-        assert lab.count(REQUEST) == count
-        assert lab.parameters == []
-
-
 async def test_a_changed_number_of_items_requests_the_parameters_once(new_lab: NewLab) -> None:
     lab = new_lab()
     async with running(lab):
-        await lab.connected()
         lab.server.connection.send(NO_DATA)
         before = lab.count(REQUEST)
         for _ in range(3):
@@ -164,7 +100,6 @@ async def test_a_changed_number_of_items_requests_the_parameters_once(new_lab: N
 async def test_a_new_measurement_requests_the_parameters(new_lab: NewLab) -> None:
     lab = new_lab()
     async with running(lab):
-        await lab.connected()
         for sends_data, num_requests in ((True, 1), (False, 1), (True, 2)):
             if sends_data:
                 lab.server.connection.send_frames(num_requests)
@@ -180,7 +115,6 @@ async def test_a_server_that_plays_in_a_loop_is_not_asked_at_every_pass(
 ) -> None:
     lab = new_lab(parameters_interval_s=interval_s)
     async with running(lab):
-        await lab.connected()
         for _ in range(100):
             lab.server.connection.send_frames(5000)
             lab.server.connection.send_frames(1)
@@ -188,28 +122,20 @@ async def test_a_server_that_plays_in_a_loop_is_not_asked_at_every_pass(
         assert lab.count(REQUEST) == pytest.approx(expected, abs=1)
 
 
-@pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST), sending(packet(2, "what?"))])
-async def test_parameters_are_void_if_another_server_gives_none(new_lab: NewLab, answer: Answer) -> None:
+async def test_parameters_are_void_if_another_server_gives_none(new_lab: NewLab) -> None:
     lab = new_lab(output=ToyOutput("toy", has_tool_poses=True))
     lab.server.answer = sending(tools("Probe"))
     async with running(lab):
-        await lab.connected()
         lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
-        lab.server.answer = answer
+        lab.server.answer = refusing(REQUEST)
         lab.server.connection.end()
         await settle()
         assert len(lab.parameters) == 1
-        assert (await lab.source.queries.answer(Question("parameters", stale_ok=True))).payload
         await lab.connected()
         assert published(lab)[1:] == [(b"", 2, 2)]
         lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
         assert lab.output.tool_names()[-1] == "tool 1"
         assert lab.messages("6d")[-1].parameters_version == 2
-        lab.server.answer = sending(tools("Probe"))
-        lab.server.connection.end()
-        await settle()
-        await lab.connected()
-        assert published(lab)[2:] == [(tools("Probe")[8:], 3, 3)]
 
 
 async def test_parameters_are_published_before_the_frames_that_have_their_version(new_lab: NewLab) -> None:
@@ -223,7 +149,6 @@ async def test_parameters_are_published_before_the_frames_that_have_their_versio
 
     lab.source._publish_parameters = publish
     async with running(lab):
-        await lab.connected()
         lab.server.answer = sending(OTHER_XML)
         is_sent.clear()
         lab.source.fan_out.on_items_changed()
@@ -241,18 +166,16 @@ async def test_a_reload_continues_the_version_and_the_parameters_of_another_serv
 ) -> None:
     lab = new_lab()
     async with running(lab):
-        await lab.connected()
         lab.server.answer = sending(OTHER_XML)
         lab.source.fan_out.on_items_changed()
         await settle()
     after = new_lab(lab.source, query_timeout_s=3.0)
     assert after.source.statuses[0].parameters_version == 2
     async with running(after):
-        await after.connected()
         assert published(after) == [(OTHER_XML[8:], 2, 2)]
     after.server.refuses = True
     other = new_lab(after.source, port=3021)
-    async with running(other):
+    async with running(other, sessions=0):
         await settle()
         assert published(other) == [(b"", 2, 3)]
         with pytest.raises(QueryError, match="has no connection"):
@@ -271,8 +194,7 @@ async def test_every_message_carries_the_version_of_the_parameters(new_lab: NewL
         assert newest == [version] * 3
 
     assert [status.parameters_version for status in lab.source.statuses] == [0, 0]
-    async with running(lab):
-        await lab.connected(2)
+    async with running(lab, sessions=2):
         await check_version(1)
         more_frames = parameters_xml("cm", frames_sent=2)
         for xml, version in (

@@ -12,16 +12,11 @@ from gateway.messages import topics
 from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
-from tests.configurations import MODEL, make_settings
+from tests.configurations import MODEL
 from tests.settings import mistakes, source
 
 MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.FORCE
 TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
-
-
-def test_a_configuration_needs_only_one_server() -> None:
-    settings = MODEL.model_validate({"sources": [source()]})
-    assert settings == make_settings(sources=(SourceSettings(name="lab", host="192.0.2.20"),))
 
 
 def test_the_longest_name_and_prefix_fit_a_channel() -> None:

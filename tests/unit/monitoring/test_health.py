@@ -1,4 +1,4 @@
-"""/healthz for streams and outputs in every state."""
+"""/healthz and the status line for streams and outputs in every state."""
 
 import json
 import logging
@@ -11,8 +11,9 @@ from gateway.config.settings import MetricsSettings, SourceSettings, StreamSetti
 from gateway.gateway import Gateway
 from gateway.losses import Losses
 from gateway.monitoring.health import health_page
-from gateway.monitoring.status_line import status_lines
+from gateway.monitoring.status_line import loss_lines, output_lines, source_line, status_lines
 from gateway.outputs.memory import MemoryOutput
+from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.running_clock import running_clock
 from gateway.stream.state import StreamState
@@ -60,13 +61,19 @@ def set_state(status: StreamStatus, state: StreamState, age_s: float | None) -> 
     status.last_frame_s = None if age_s is None else running_clock().time() - age_s
 
 
+def lab_with(state: StreamState, age_s: float | None) -> Lab:
+    """Return a gateway with one stream, of markers, in this state."""
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], state, age_s)
+    return lab
+
+
 @pytest.mark.parametrize("state", StreamState)
 async def test_a_recent_frame_is_healthy_in_every_state_and_others_only_without_a_measurement(
     state: StreamState,
 ) -> None:
     """The page turns unhealthy when the gateway gives up the stream, not later."""
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], state, STALL_TIMEOUT_S - 1)
+    lab = lab_with(state, STALL_TIMEOUT_S - 1)
     assert lab.problem() == ""
     for age_s, text in (
         (STALL_TIMEOUT_S, "no frame for"),
@@ -78,15 +85,13 @@ async def test_a_recent_frame_is_healthy_in_every_state_and_others_only_without_
 
 
 async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.STREAMING, STALL_TIMEOUT_S - 0.5)
+    lab = lab_with(StreamState.STREAMING, STALL_TIMEOUT_S - 0.5)
     time.sleep(0.8)  # noqa: ASYNC251 - the process stands still
     assert lab.problem() == ""
 
 
 async def test_the_problem_names_the_reason_and_what_to_check() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.CONNECTING, None)
+    lab = lab_with(StreamState.CONNECTING, None)
     assert lab.problem() == "no frame so far: connecting to 192.0.2.20:3020"
     set_state(lab.statuses[0], StreamState.WAITING, 41.5)
     lab.statuses[0].record_error("connection refused by 192.0.2.20:3020; is the RT server running?")
@@ -131,8 +136,7 @@ async def test_one_unhealthy_stream_makes_the_gateway_unhealthy() -> None:
 
 
 async def test_an_output_that_cannot_send_is_listed_with_its_problem() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    lab = lab_with(StreamState.STREAMING, 0.01)
     assert lab.health()[0] == 200
     lab.output.close()
     status, body = lab.health()
@@ -142,8 +146,7 @@ async def test_an_output_that_cannot_send_is_listed_with_its_problem() -> None:
 
 
 async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    lab = lab_with(StreamState.STREAMING, 0.01)
     status, body = lab.health()
     assert (status, body["status"], body["reasons"], body["losses"]) == (200, "healthy", [], [])
     for _ in range(436):
@@ -173,8 +176,7 @@ async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200()
 
 
 async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    lab = lab_with(StreamState.STREAMING, 0.01)
     now_s = 1000.0
     lab.statuses[0].losses = Losses(logging.getLogger("tests"), "lab", lambda: now_s)
     lab.statuses[0].frame_skipped(1)
@@ -186,8 +188,7 @@ async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:
 
 
 async def test_a_problem_is_unhealthy_even_if_something_is_lost_and_comes_first() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.WAITING, None)
+    lab = lab_with(StreamState.WAITING, None)
     lab.statuses[0].frame_skipped(1)
     status, body = lab.health()
     assert (status, body["status"], body["healthy"]) == (503, "unhealthy", False)
@@ -196,8 +197,7 @@ async def test_a_problem_is_unhealthy_even_if_something_is_lost_and_comes_first(
 
 @pytest.mark.parametrize("age_s", [None, STALL_TIMEOUT_S + 1])
 async def test_frames_that_are_all_rejected_are_named(age_s: float | None) -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.IDLE, age_s)
+    lab = lab_with(StreamState.IDLE, age_s)
     lab.statuses[0].frame_rejected("3d component of 40 bytes announces 4 items", 1)
     text = "frames come, and all are rejected: 3d component of 40 bytes announces 4 items"
     assert lab.problem() == text
@@ -205,8 +205,7 @@ async def test_frames_that_are_all_rejected_are_named(age_s: float | None) -> No
 
 
 async def test_a_frame_that_is_rejected_among_others_is_only_loss() -> None:
-    lab = Lab(StreamSettings(components=MARKERS))
-    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    lab = lab_with(StreamState.STREAMING, 0.01)
     lab.statuses[0].frame_rejected("too short", 1)
     assert lab.problem() == ""
     assert lab.line() == (
@@ -241,3 +240,47 @@ async def test_a_stream_of_events_needs_none_in_its_frames() -> None:
     set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
     assert lab.problem() == ""
     assert lab.line() == "lab: streaming 0.0 Hz"
+
+
+# --- the status line
+
+
+LAB = SourceSettings(name="lab", host="192.0.2.9")
+STREAMS = tuple(StreamSettings(components=(each,)) for each in (ComponentType.MARKERS, ComponentType.ANALOG))
+TWO = SourceSettings(name="lab", host="192.0.2.9", streams=STREAMS)
+
+
+SERVER = "192.0.2.9:3020"
+
+
+@pytest.mark.parametrize(
+    ("state", "tries", "line"),
+    [
+        (StreamState.STREAMING, 0, "streaming 200.0 Hz"),
+        (StreamState.WAITING, 0, f"waiting for {SERVER}"),
+        (StreamState.WAITING, 1, f"waiting for {SERVER}, 1 try"),
+        (StreamState.CONNECTING, 12, f"waiting for {SERVER}, 12 tries"),
+        (StreamState.HANDSHAKING, 1, f"connected to {SERVER}, handshake in progress"),
+        (StreamState.IDLE, 0, f"connected to {SERVER}, no frames requested"),
+        (StreamState.NO_MEASUREMENT, 0, f"connected to {SERVER}, no measurement running"),
+        (StreamState.STALLED, 0, f"no frames from {SERVER}"),
+    ],
+)
+def test_every_state_has_a_text_that_streams_share(state: StreamState, tries: int, line: str) -> None:
+    streams = [(StreamStatus(name, state=state, tries=tries), 199.96) for name in ("3d", "analog")]
+    assert source_line(LAB, streams[:1]) == source_line(TWO, streams) == f"lab: {line}"
+
+
+def test_streams_with_different_texts_are_listed_by_components() -> None:
+    rates = {"3d": 200.0, "analog": 2000.0}
+    streams = [(StreamStatus(name, state=StreamState.STREAMING), rate_hz) for name, rate_hz in rates.items()]
+    assert source_line(TWO, streams) == "lab: 3d streaming 200.0 Hz, analog streaming 2000.0 Hz"
+
+
+def test_only_outputs_that_cannot_send_or_lose_something_have_a_line() -> None:
+    health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True, "was away")}
+    assert output_lines(health.items()) == ["zenoh: no router"]
+    losses = Losses(logging.getLogger("tests"), "lab to zenoh")
+    losses.lost("no router", "start it", messages=5)
+    lines = loss_lines({"lab to zenoh": losses.report(), "lab to lcm": []}.items())
+    assert lines == ["lab to zenoh: lost in the last minute: 5 messages of 1 frame (no router)"]

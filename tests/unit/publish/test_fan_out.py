@@ -65,20 +65,6 @@ def test_all_topics_are_declared_and_the_source_is_announced_before_the_first_fr
         assert {(topic.source, topic.path) for topic in output.declared} == {("lab", path) for path in paths}
 
 
-def test_each_component_has_its_own_numbers_across_sessions() -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output])
-    publish_full(fan_out)
-    publish_full(fan_out, ONLY_MARKERS)
-    fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2, 1), ALL)
-    messages = [(topic.path, decode(message)) for topic, message in output.messages]
-    counted = {
-        key: [(message.sequence, message.session) for path, message in messages if path == (key,)]
-        for key in ("3d", "analog")
-    }
-    assert counted == {"3d": [(0, 1), (1, 1), (2, 2)], "analog": [(0, 1), (1, 2)]}
-
-
 def test_only_wanted_components_that_a_frame_has_are_published() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
@@ -156,15 +142,6 @@ def test_an_output_failure_is_logged_once_and_its_end_with_the_total(
         (logging.WARNING, f"lab to toy: {NO_ROUTER}"),
         (logging.INFO, "lab to toy: lost within 0.0 s: 5 messages of 1 frame (no router)"),
     ]
-
-
-def test_messages_that_fail_now_and_then_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output])
-    for output.error in [NO_ROUTER, None] * 5:
-        publish_full(fan_out, ONLY_MARKERS)
-    assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert fan_out.outputs[0][1].messages == {"3d": 5}
 
 
 @pytest.mark.interpreted
@@ -281,15 +258,6 @@ def test_a_component_has_subscribers_if_one_output_has_one() -> None:
 
 
 # Outputs that are replaced -------------------------------------------------------------------
-
-
-def test_replacing_an_output_does_not_disturb_the_others() -> None:
-    stays, before, after = ToyOutput("stays"), ToyOutput("side"), ToyOutput("side")
-    fan_out = FanOut("lab", [stays, before])
-    declared = list(stays.declared)
-    fan_out.set_outputs([stays, after])
-    publish_full(fan_out)
-    assert (stays.declared, stays.closed_topics, sequences(stays, "3d")) == (declared, [], [0])
 
 
 @pytest.mark.parametrize("is_removed_first", [False, True])

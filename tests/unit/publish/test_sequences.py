@@ -80,14 +80,6 @@ def test_only_the_skipped_components_are_a_gap() -> None:
     assert sequences(output, "3d") == [2]
 
 
-def test_skipping_a_frame_without_these_components_loses_nothing() -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output])
-    assert fan_out.skip(frame(1, EVENT), stamp(1), SKIPPABLE) == 0
-    publish(fan_out, 2)
-    assert numbered(output, "3d") == [(0, 2)]
-
-
 def test_what_pacing_leaves_out_is_no_gap_and_what_is_skipped_beyond_that_is_one() -> None:
     paced = ToyOutput("paced")
     paced.max_rate_hz = {MARKERS: 50.0, TOOLS: 50.0}

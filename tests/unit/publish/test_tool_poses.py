@@ -94,8 +94,7 @@ def test_new_labels_replace_the_topics() -> None:
 
 
 def test_topics_stay_open_while_the_labels_stay() -> None:
-    output = ToyOutput("toy", "Probe", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
+    output, fan_out = lab(wanted=("Probe",))
     for session in (1, 2):
         fan_out.set_parameters(in_metres(parameters("Probe")))
         fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session, 1), ALL)
@@ -105,8 +104,7 @@ def test_topics_stay_open_while_the_labels_stay() -> None:
 
 
 def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
-    output = ToyOutput("toy", "Probe", "Head", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
+    output, fan_out = lab(wanted=("Probe", "Head"))
     for labels in (["Probe"], ["Head", "Probe"], ["Head", "Probe"]):
         fan_out.set_parameters(in_metres(parameters(*labels)))
         publish_tools(fan_out, len(labels))
@@ -116,8 +114,7 @@ def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
 
 def test_of_more_than_1024_names_those_that_were_used_last_keep_their_numbers() -> None:
     """Whoever watches a tool sees no loss where there is none; names of long ago must not fill the memory."""
-    output = ToyOutput("toy", "0-0", "1-0", has_tool_poses=True)
-    fan_out = FanOut("lab", [output])
+    output, fan_out = lab(wanted=("0-0", "1-0"))
     for group in (0, 1, 2, 3, 0, 4, 0, 1):
         fan_out.set_parameters(in_metres(parameters(*(f"{group}-{number}" for number in range(256)))))
         publish_tools(fan_out, 256)
@@ -133,17 +130,6 @@ def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
     assert (output.tool_names(), output.closed_topics) == (["A", "B", "C"], [])
     counted = {name: [pose.sequence for pose in output.poses(name)] for name in "ABC"}
     assert counted == {"A": [0, 1, 2, 3], "B": [0, 1, 2], "C": [0, 1]}
-
-
-@pytest.mark.parametrize(
-    ("unit", "position_m"), [("mm", (0.1, 0.2, 0.3)), ("m", (100.0, 200.0, 300.0)), ("", (0.1, 0.2, 0.3))]
-)
-def test_poses_are_in_metres_whatever_the_unit_of_the_server(
-    unit: str, position_m: tuple[float, ...]
-) -> None:
-    output, fan_out = lab("Probe", wanted=("Probe",), unit=unit)
-    publish_tools(fan_out, 1)
-    assert output.poses("Probe")[0].position_m == pytest.approx(position_m)
 
 
 def test_the_tools_of_all_6d_components_of_a_frame_count() -> None:

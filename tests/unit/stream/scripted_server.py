@@ -67,6 +67,11 @@ class Connection(asyncio.Transport):
         self.got_eof = False
         self.num_recording_packets = 0
 
+    @property
+    def number(self) -> int:
+        """Its number, from 1, among those that are open."""
+        return [each for each in self._server.connections if each.is_open].index(self) + 1
+
     # The client's side.
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:  # noqa: ARG002 - asyncio's signature
@@ -105,7 +110,7 @@ class Connection(asyncio.Transport):
 
     def _on_command(self, command: str) -> None:
         self.commands.append(command)
-        answer = self._server.answer(command)
+        answer = self._server.answer_on(self, command)
         if answer is not None:
             asyncio.get_running_loop().call_soon(self.send, answer)
 
@@ -126,10 +131,14 @@ class Connection(asyncio.Transport):
 
 
 class ScriptedServer:
-    """A server that answers each command with ``answer``; if ``refuses`` is set, it refuses connections."""
+    """A server that answers each command with ``answer``; if ``refuses`` is set, it refuses connections.
+
+    ``answer_on`` may answer depending on the connection instead.
+    """
 
     def __init__(self, answer: Answer = obliging) -> None:
         self.answer = answer
+        self.answer_on: Callable[[Connection, str], bytes | None] = lambda _, command: self.answer(command)
         self.refuses = False
         self.closes_at_bye = True
         self.connections: list[Connection] = []

@@ -79,7 +79,6 @@ async def test_an_on_demand_stream_stops_once_without_subscribers_and_resumes_wi
         "lab (3d): a subscriber appeared; frames are requested again",
         "lab (3d): no subscribers; the stream is stopped",
     ]
-    lab.changes.cancel()
 
 
 async def test_a_short_absence_of_subscribers_does_not_stop_an_on_demand_stream() -> None:
@@ -88,7 +87,6 @@ async def test_a_short_absence_of_subscribers_does_not_stop_an_on_demand_stream(
         lab.has_subscribers = not lab.has_subscribers
         await asyncio.sleep(4)
     assert requests(lab) == []
-    lab.changes.cancel()
 
 
 async def test_other_streams_run_without_subscribers() -> None:
@@ -124,7 +122,6 @@ async def test_a_reduced_rate_is_requested_again_with_other_components() -> None
     is_full = [lab.changes.is_full_rate]  # the server does not know yet
     await settle()
     assert [*is_full, lab.changes.is_full_rate] == [False, True]
-    lab.changes.cancel()
 
 
 async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCaptureFixture) -> None:
@@ -198,7 +195,6 @@ async def test_a_stopped_stream_stays_stopped_while_its_rate_changes_and_resumes
     lab.has_subscribers = True
     await asyncio.sleep(1)
     assert requests(lab) == [HALF, STOP, "StreamFrames FrequencyDivisor:4"]
-    lab.changes.cancel()
 
 
 async def test_a_refused_resume_is_repeated_until_the_server_accepts_it() -> None:
@@ -218,7 +214,6 @@ async def test_a_refused_resume_is_repeated_until_the_server_accepts_it() -> Non
     lab.server.answer = obliging
     await asyncio.sleep(60)
     assert (lab.status.rate, lab.session.is_open) == ("AllFrames", True)
-    lab.changes.cancel()
 
 
 async def test_a_server_that_refuses_every_resume_is_left_with_a_reason() -> None:
@@ -229,7 +224,6 @@ async def test_a_server_that_refuses_every_resume_is_left_with_a_reason() -> Non
     with pytest.raises(RequestError, match=text):
         await lab.session.monitor(lab.check_silence)
     assert requests(lab).count(START) == MAX_RESUMES
-    lab.changes.cancel()
 
 
 async def test_a_refused_stop_is_repeated_ever_later_and_not_once_frames_are_wanted_again() -> None:
@@ -247,7 +241,6 @@ async def test_a_refused_stop_is_repeated_ever_later_and_not_once_frames_are_wan
     num_before = len(requests(lab))
     await asyncio.sleep(300)
     assert len(requests(lab)) == num_before
-    lab.changes.cancel()
 
 
 async def test_a_defect_ends_the_session() -> None:
@@ -255,7 +248,6 @@ async def test_a_defect_ends_the_session() -> None:
     lab.has_defect = True
     with pytest.raises(DefectError, match="defect in the gateway: ZeroDivisionError: "):
         await lab.session.monitor(lab.check_silence)
-    lab.changes.cancel()
 
 
 async def test_tasks_that_are_cancelled_before_they_start_leave_nothing_behind() -> None:

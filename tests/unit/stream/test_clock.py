@@ -141,31 +141,16 @@ def test_capture_times_do_not_go_back_when_a_better_line_is_lower(seed: int) -> 
 
 
 @pytest.mark.parametrize(
-    ("seconds", "delays_s", "lag_s"),
-    [
-        pytest.param([29.996, 30, 30.004], [0, 1, 0], 1.0, id="one late frame"),
-        pytest.param([29.999, 30, 35], [0, 5, 0], 5.0, id="a pause of the gateway"),
-    ],
-)
-def test_what_is_late_once_does_not_move_the_clock(
-    seconds: Sequence[float], delays_s: Sequence[float], lag_s: float
-) -> None:
-    observed = observe(
-        ServerClock(), delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, seconds, delays_s)
-    )
-    assert observed.lags_s[LEARNED] == pytest.approx(lag_s, abs=0.1)
-    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
-
-
-@pytest.mark.parametrize(
     ("seconds", "delays_s"),
     [
+        pytest.param([29.996, 30, 30.004], [0, 1, 0], id="one late frame"),
+        pytest.param([29.999, 30, 35], [0, 5, 0], id="a pause of the gateway"),
         pytest.param([30, 40, 45, 50], [0, 0.8, 0.8, 0], id="grows and clears"),
         pytest.param([30, 30.2, 50], [0, 0.8, 0], id="begins suddenly and clears slowly"),
         pytest.param([30, 55], [0, 0.02], id="grows by 0.8 ms/s"),
     ],
 )
-def test_congestion_is_lag_and_does_not_move_the_clock(
+def test_lateness_is_lag_and_does_not_move_the_clock(
     seconds: Sequence[float], delays_s: Sequence[float]
 ) -> None:
     frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, seconds, delays_s)

@@ -202,13 +202,6 @@ def test_a_step_of_the_hosts_clock_changes_time_stamps_and_nothing_else(lab: Lab
         assert stamp.capture_utime <= stamp.utime
 
 
-def test_a_restart_of_the_server_is_reported_and_does_not_count_as_lateness(lab: Lab) -> None:
-    lab.receive_at(BOOT_UTIME + 600 * PERIOD_US, frame(3))
-    assert (lab.restarts, lab.status.restarts) == (1, 1)
-    assert [number for number, _ in lab.published] == [3]
-    assert lab.halvings == []
-
-
 def test_lateness_before_a_restart_does_not_count_after_it(lab: Lab) -> None:
     for number in range(600, 600 + RATE_HZ * 9 // 10):  # 0.9 s late: 0.1 s more would halve the rate
         lab.receive(frame(number), late_us=200_000)

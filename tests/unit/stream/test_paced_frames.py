@@ -87,13 +87,3 @@ async def test_finishing_passes_on_everything_and_what_follows_at_once() -> None
     assert lab.numbers == list(range(1000))
     lab.receive(1000, first=1000)
     assert lab.numbers == list(range(2000))
-
-
-async def test_a_defect_while_a_backlog_is_passed_on_is_reported() -> None:
-    lab = Lab()
-    lab.receive(1000)
-    lab.defect = ValueError("broken")
-    await until(lambda: lab.defects)
-    assert lab.defects == [lab.defect]
-    assert lab.paced.is_empty
-    assert lab.reading == [False, True]

@@ -62,16 +62,15 @@ async def test_a_timeout_ends_after_its_time() -> None:
     assert now_s() - began_s == pytest.approx(2.0, abs=0.01)
 
 
-async def test_what_ends_in_time_is_not_disturbed() -> None:
-    async with running_timeout(2.0):
-        await asyncio.sleep(1.9)
-    await asyncio.sleep(10)
-
-
-async def test_a_timeout_does_not_hide_other_errors() -> None:
-    with pytest.raises(ZeroDivisionError):
+async def test_what_ends_in_time_is_not_disturbed_and_its_errors_are_raised() -> None:
+    async def fail() -> None:
         async with running_timeout(2.0):
+            await asyncio.sleep(1.9)
             raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        await fail()
+    await asyncio.sleep(10)
 
 
 async def test_a_stop_of_the_process_is_not_part_of_a_timeout() -> None:

@@ -1,20 +1,22 @@
 """One session with a scripted server: commands and their replies, frames, files, and how it ends."""
 
 import asyncio
+import logging
 import socket
 import struct
+from collections.abc import Callable
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
+from gateway.errors import ClosedError, LinkError, PacketError, ReplyTimeoutError, ServerError, SilenceError
 from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
 from gateway.stream.state import StreamState
 from tests.losses import amounts
-from tests.servers import markers_frame, ok, packet
+from tests.servers import error, markers_frame, ok, packet
 from tests.unit.stream.scripted_server import obliging, refusing, refusing_without_name, silent_to
-from tests.unit.stream.session_lab import Lab, now_s
+from tests.unit.stream.session_lab import NO_DATA, Lab, now_s
 from tests.vectors import STOP_RECORDING
 from tests.virtual_time import settle
 
@@ -82,6 +84,19 @@ async def test_asking_before_connecting_raises(lab: Lab) -> None:
         lab.session.control_recording(start=True)
 
 
+async def test_a_packet_that_answers_nothing_is_shown_with_at_most_200_characters(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream.session")
+    await lab.streaming(1)
+    lab.connection.send(error("x" * 201))
+    lab.connection.send(packet(77, b"new"))
+    assert [f"{record.levelname} {record.getMessage()}" for record in caplog.records] == [
+        f"DEBUG lab: unexpected packet of type 0: {'x' * 200}",
+        "DEBUG lab: unexpected packet of type 77: new",
+    ]
+
+
 # --- replies that name no command
 
 
@@ -133,6 +148,13 @@ async def test_frames_of_one_read_are_passed_on_together_with_the_time(lab: Lab)
     assert (lab.status.state, lab.status.byte_order) == (StreamState.STREAMING, "big")
 
 
+async def test_frames_in_another_byte_order_are_a_limitation(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send(markers_frame(1, (0.0, 0.0, 0.0), order="<"))
+    assert lab.status.byte_order == "little"
+    assert lab.status.limitations == ["the server sends little-endian frames, not the byte order agreed"]
+
+
 async def test_the_control_of_a_recording_goes_out_at_once(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     await lab.session.connect()
     written: list[bytes] = []
@@ -155,14 +177,6 @@ async def test_a_stopped_stream_is_idle_once_the_server_has_answered(lab: Lab) -
     assert lab.status.state is StreamState.IDLE
     lab.connection.send_frames(2)  # was under way
     assert lab.status.state is StreamState.IDLE
-
-
-async def test_a_refused_stop_leaves_the_stream_streaming(lab: Lab) -> None:
-    await lab.streaming(1)
-    lab.server.answer = refusing("StreamFrames Stop")
-    with pytest.raises(ServerError):
-        await lab.session.ask(StopStreaming())
-    assert lab.status.state is StreamState.STREAMING
 
 
 async def test_a_stop_without_an_answer_is_believed_until_the_next_frame(lab: Lab) -> None:
@@ -253,19 +267,26 @@ async def test_packets_above_the_configured_limits_end_the_session(packet_type: 
     lab.connection.send(struct.pack(">II", limit, packet_type) + (limit - 8) * b"\xff")
     assert lab.session.is_open
     lab.connection.send(struct.pack(">II", limit + 1, packet_type))
-    with pytest.raises(ClosedError, match=rf"packet size {limit + 1} \(limit {limit}\), type {packet_type}"):
+    text = rf"packet size {limit + 1} \(limit {limit}\), type {packet_type}"
+    with pytest.raises(ClosedError, match=text) as caught:
         await lab.session.monitor(lab.check_silence)
+    assert isinstance(caught.value.__cause__, PacketError)
 
 
 # --- the end
 
 
 @pytest.mark.parametrize(
-    ("by_gateway", "reason"),
-    [(False, "the connection to 192.0.2.20:3020 was closed by the server"), (True, "closed by the gateway")],
+    ("end", "reason"),
+    [
+        (lambda lab: lab.connection.end(), "the connection to 192.0.2.20:3020 was closed by the server"),
+        (lambda lab: lab.connection.end(OSError("reset by peer")), "192.0.2.20:3020 broke: reset by peer"),
+        (lambda lab: asyncio.create_task(lab.session.close()), "closed by the gateway"),
+    ],
+    ids=["closed by the server", "broken", "closed by the gateway"],
 )
 async def test_the_end_is_raised_by_every_waiting_call_at_once(
-    silent: Lab, *, by_gateway: bool, reason: str
+    silent: Lab, end: Callable[[Lab], asyncio.Task[None] | None], reason: str
 ) -> None:
     silent.server.closes_at_bye = False
     tasks: list[asyncio.Task[Any]] = [
@@ -274,16 +295,14 @@ async def test_the_end_is_raised_by_every_waiting_call_at_once(
     ]
     await settle()
     began_s = now_s()
-    if by_gateway:
-        tasks.append(asyncio.create_task(silent.session.close()))
-    else:
-        silent.connection.end()
+    ending = end(silent)
     await settle()
-    for task in tasks[:2]:
+    for task in tasks:
         assert task.done()
         assert reason in str(task.exception())
     assert (now_s(), silent.session.is_open) == (began_s, False)
-    await asyncio.gather(*tasks, return_exceptions=True)
+    if ending is not None:
+        await ending
 
 
 async def test_the_first_error_wins(lab: Lab) -> None:
@@ -291,19 +310,14 @@ async def test_the_first_error_wins(lab: Lab) -> None:
     lab.connection.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
     await settle()  # the session has aborted the connection, which ended after that
     lab.session.connection_lost(OSError("Connection reset by peer"))
+    lab.session.data_received(NO_DATA)
+    assert lab.status.state is not StreamState.NO_MEASUREMENT
     for late_call in (lab.session.monitor(lab.check_silence), lab.session.ask(Version())):
         with pytest.raises(ClosedError, match="this is not an RTC3D server"):
             await late_call
     with pytest.raises(ClosedError, match="this is not an RTC3D server"):
         lab.session.control_recording(start=True)
     assert not lab.connection.is_open
-
-
-async def test_a_broken_connection_names_its_reason(lab: Lab) -> None:
-    await lab.session.connect()
-    lab.connection.end(OSError("Connection reset by peer"))
-    with pytest.raises(ClosedError, match=r"192\.0\.2\.20:3020 broke: Connection reset by peer"):
-        await lab.session.monitor(lab.check_silence)
 
 
 async def test_closing_sends_bye_once_and_waits_for_the_server_to_close(lab: Lab) -> None:

@@ -34,11 +34,6 @@ async def backlog(count: int = 2000, lab: Lab | None = None) -> Lab:
     return lab
 
 
-async def test_a_few_frames_are_published_at_once() -> None:
-    lab = await backlog(4)
-    assert (lab.numbers, lab.connection.is_read) == ([0, 1, 2, 3], True)
-
-
 @pytest.mark.parametrize(("settings", "takes_s"), [({}, 1.0), ({"backlog_speed": 10.0}, 0.2)])
 async def test_a_backlog_is_published_at_its_speed_while_nothing_is_read(
     settings: dict[str, Any], takes_s: float
@@ -93,16 +88,6 @@ async def test_the_end_of_the_session_publishes_what_waits(*, breaks: bool) -> N
     else:
         await lab.session.close()
     assert (lab.numbers, lab.connection.is_open) == (list(range(2000)), False)
-
-
-async def test_after_bye_frames_are_published_as_they_arrive() -> None:
-    lab = await backlog(1)
-    lab.server.closes_at_bye = False
-    closing = asyncio.create_task(lab.session.close())
-    await settle()
-    lab.connection.send_frames(*range(1, 100))
-    assert (len(lab.frames), lab.connection.is_read) == (100, True)
-    await closing
 
 
 @pytest.mark.parametrize("has_clock", [True, False], ids=["backlog", "flood"])

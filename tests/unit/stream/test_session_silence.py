@@ -5,7 +5,7 @@ import logging
 
 import pytest
 
-from gateway.errors import DefectError, SilenceError
+from gateway.errors import SilenceError
 from gateway.rtc3d.commands import StopStreaming, Version
 from gateway.stream.state import StreamState
 from tests.servers import ok, packet
@@ -48,17 +48,9 @@ async def test_silence_is_measured_from_the_last_frame(lab: Lab, pauses_s: list[
             await asyncio.sleep(pause_s)
             lab.connection.send_frames(2)
         since_s = now_s()
-        with pytest.raises(SilenceError):
-            await monitoring
-    assert now_s() - since_s == pytest.approx(3)
-
-
-async def test_packets_that_are_no_frames_do_not_end_the_silence(lab: Lab) -> None:
-    since_s = now_s()
-    async with lab.monitored() as monitoring:
         for _ in range(2):
             await asyncio.sleep(1)
-            lab.connection.send(packet(77))
+            lab.connection.send(packet(77))  # no frame
         with pytest.raises(SilenceError):
             await monitoring
     assert now_s() - since_s == pytest.approx(3)
@@ -72,16 +64,6 @@ async def test_silence_without_a_measurement_is_checked_every_stall_timeout_from
         await asyncio.sleep(10)
         assert lab.checks_s == pytest.approx([began_s + 3, began_s + 6, began_s + 9])
         assert not monitoring.done()
-
-
-async def test_a_failed_check_of_the_silence_ends_monitoring() -> None:
-    async def fail() -> None:
-        raise SilenceError("no answer")
-
-    lab = Lab()
-    await lab.streaming()
-    with pytest.raises(SilenceError, match="no answer"):
-        await lab.session.monitor(fail)
 
 
 async def test_a_stream_of_events_alone_may_be_silent_during_a_measurement() -> None:
@@ -102,17 +84,6 @@ async def test_frames_may_stop_before_a_slow_server_answers_the_stop() -> None:
         assert not monitoring.done()
         lab.connection.send(obliging("StreamFrames Stop"))
         await stopping
-
-
-async def test_a_defect_in_what_takes_frames_ends_the_session(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lab, "frames", None)
-    lab.connection.send_frames(1)
-    with pytest.raises(DefectError, match="defect in the gateway: TypeError: ") as caught:
-        await lab.session.monitor(lab.check_silence)
-    assert isinstance(caught.value.__cause__, TypeError)
-    assert not lab.connection.is_open
 
 
 # --- a stop of this process

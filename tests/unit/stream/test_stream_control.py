@@ -44,15 +44,6 @@ async def test_little_endian_is_requested_before_the_parameters() -> None:
     assert lab.status.limitations == []
 
 
-async def test_a_frame_before_the_acknowledgement_is_streaming_after_the_handshake() -> None:
-    def answer(command: str) -> bytes | None:
-        early = markers_frame(1, (0.0, 0.0, 0.0)) if command.startswith("StreamFrames") else b""
-        return early + obliging(command)
-
-    lab = await started(answer)
-    assert lab.status.state is StreamState.STREAMING
-
-
 async def test_the_handshake_continues_after_refused_and_ignored_commands(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -106,6 +97,28 @@ async def test_parameters_that_cannot_be_read_are_a_limitation() -> None:
     assert lab.parameters == []
     [limitation] = lab.status.limitations
     assert limitation.startswith("no parameters: ")
+
+
+async def test_repairs_of_the_parameters_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    cells = "<The_3D><Frequency>fast</Frequency></The_3D>" * 2 + "<The_6D><Frequency>x</Frequency></The_6D>"
+    xml = f"<RT_Parameters>{cells}<The_3D><Unit>m</The_3D></RT_Parameters>"
+    repairs = parse_parameters(xml.encode()).recovered
+    lab = await started(lambda command: packet(2, xml) if command == "SendParameters" else obliging(command))
+    lab.status.parameters_repaired(repairs)
+    assert len(repairs) > 3
+    texts = "; ".join(repairs[:3])
+    expected = f"lab (3d): parameters repaired: {texts}; and {len(repairs) - 3} more"
+    assert [text for text in caplog.messages if "repaired" in text] == [expected]
+
+
+async def test_a_server_that_refuses_every_form_ends_the_handshake_with_what_to_check() -> None:
+    lab = Lab(refusing("StreamFrames"))
+    with pytest.raises(LinkError) as caught:
+        await lab.start()
+    text = "refuses StreamFrames in every form that the protocol has; check its real-time output settings"
+    assert str(caught.value) == f"192.0.2.20:3020 {text}"
+    assert (lab.status.state, lab.status.tries) == (StreamState.HANDSHAKING, 1)
 
 
 async def test_a_changed_rate_is_a_fraction_of_the_agreed_one_unless_it_is_refused() -> None:
@@ -194,23 +207,16 @@ async def test_silence_is_checked_with_a_command_that_the_server_has_answered(by
     assert await probes_after(lab, answer) == [probe] * 3
 
 
-async def test_silence_after_a_stop_is_not_checked_by_a_request_for_frames() -> None:
-    answer = silent_to("Version", "SendParameters")
-    lab = await started(answer)
+async def test_silence_is_not_checked_by_a_command_that_would_stop_or_resume_the_stream() -> None:
+    lab = await started(no_measurement(silent_to("Version", "SendParameters")))
     await lab.control.stop()
     async with lab.monitored(by_control=True):
         await asyncio.sleep(10)
-        assert lab.commands[3:] == ["StreamFrames Stop"] * 4
-
-
-async def test_silence_after_a_resume_is_not_checked_by_a_stop() -> None:
-    answer = no_measurement(silent_to("Version", "SendParameters"))
-    lab = await started(answer)
-    await lab.control.stop()
+    assert lab.commands[3:] == ["StreamFrames Stop"] * 4
     await lab.control.request(0)
     async with lab.monitored(by_control=True):
         await asyncio.sleep(10)
-        assert lab.commands[3:] == ["StreamFrames Stop", *[NAMED] * 4]
+    assert lab.commands[7:] == [NAMED] * 4
 
 
 async def test_a_server_that_no_longer_answers_is_not_alive() -> None:
@@ -289,14 +295,6 @@ async def test_a_refused_or_ignored_stop_leaves_the_stream_as_it_is() -> None:
     assert not stopping.done()
     assert await stopping
     assert lab.status.rate == ""
-
-
-async def test_a_paused_stream_has_no_rate_until_it_is_resumed() -> None:
-    lab = await started()
-    await lab.control.stop()
-    assert (lab.commands[-1], lab.status.rate) == ("StreamFrames Stop", "")
-    await lab.control.request(0)
-    assert (lab.commands[-1], lab.status.rate) == (NAMED, "AllFrames")
 
 
 async def test_the_end_of_the_connection_ends_the_handshake() -> None:

@@ -12,8 +12,8 @@ from gateway.stream.state import StreamState
 from tests.servers import error, ok, packet
 from tests.spec_parameters import in_root
 from tests.unit.scripted_sources import Servers
-from tests.unit.stream.scripted_server import Connection, ScriptedServer
-from tests.unit.test_source import HOST, Lab
+from tests.unit.stream.scripted_server import Connection
+from tests.unit.test_source import Lab
 from tests.virtual_time import settle, until
 
 pytestmark = pytest.mark.interpreted  # gateway.source gets another Supervisor
@@ -39,10 +39,10 @@ def parameters(analog_hz: int = 2000, version: str = "1") -> bytes:
     )
 
 
-def answering(xml: bytes) -> Callable[["Numbered", str], bytes | None]:
+def answering(xml: bytes) -> Callable[[Connection, str], bytes | None]:
     """Return an answer to every command, with these parameters; frames are requested while none run."""
 
-    def answer(_connection: "Numbered", command: str) -> bytes | None:
+    def answer(_connection: Connection, command: str) -> bytes | None:
         if command.startswith("SendParameters"):
             return xml
         return ok(f"OK-{command}") + (NO_DATA if command.startswith("StreamFrames") else b"")
@@ -50,50 +50,16 @@ def answering(xml: bytes) -> Callable[["Numbered", str], bytes | None]:
     return answer
 
 
-class Numbered(Connection):
-    """A connection that knows its number, from 1, among those that are open."""
-
-    def __init__(self, server: "Server", session: object) -> None:
-        super().__init__(server, session)  # type: ignore[arg-type]  # a Session
-        self._numbering = server
-
-    @property
-    def number(self) -> int:
-        return [each for each in self._numbering.connections if each.is_open].index(self) + 1
-
-    def _on_command(self, command: str) -> None:
-        self.commands.append(command)
-        answer = self._numbering.answer_on(self, command)
-        if answer is not None:
-            asyncio.get_running_loop().call_soon(self.send, answer)
-
-
-class Server(ScriptedServer):
-    """A server whose answers depend on the connection."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.answer_on = answering(parameters())
-
-    async def connect(self, _source: object, session: object) -> asyncio.Transport:
-        await super().connect(_source, session)  # type: ignore[arg-type]  # a SourceSettings
-        connection = Numbered(self, session)
-        connection.is_open = True
-        self.connections[-1] = connection
-        return connection
-
-    @property
-    def num_open(self) -> int:
-        return sum(each.is_open for each in self.connections)
-
-
 class AutoLab(Lab):
     """A source with ``streams: auto``, checked every second, and its server."""
 
     def __init__(self, servers: Servers, tmp_path: Path) -> None:
-        self.scripted = Server()
-        servers._servers[HOST] = self.scripted
         super().__init__(servers, Spool(tmp_path, max_files=10, max_bytes=1000))
+        self.server.answer_on = answering(parameters())
+
+    @property
+    def num_open(self) -> int:
+        return sum(each.is_open for each in self.server.connections)
 
     @property
     def components(self) -> list[str]:
@@ -137,12 +103,12 @@ async def test_two_connections_stay_although_the_second_one_breaks_at_times(lab:
     async with running(lab):
         await lab.uses_two()
         await asyncio.sleep(3600)
-        assert (lab.scripted.num_open, len(lab.scripted.connections)) == (2, 2)
+        assert (lab.num_open, len(lab.server.connections)) == (2, 2)
         for _ in range(10):
             await asyncio.sleep(20)
-            await end(lab.scripted.connections[-1])
+            await end(lab.server.connections[-1])
             await lab.uses_two()
-        assert (lab.limitations, lab.scripted.connections[0].is_open) == ([], True)
+        assert (lab.limitations, lab.server.connections[0].is_open) == ([], True)
 
 
 @pytest.mark.parametrize(("accepts_commands", "most_connections"), [(False, 2), (True, 3)])
@@ -150,16 +116,16 @@ async def test_a_second_connection_without_frames_is_given_up(
     lab: AutoLab, accepts_commands: bool, most_connections: int
 ) -> None:
     """It may not even reply."""
-    answer = lab.scripted.answer_on
+    answer = lab.server.answer_on
 
-    def without_frames(each: Numbered, command: str) -> bytes | None:
+    def without_frames(each: Connection, command: str) -> bytes | None:
         if each.number > 1 and not accepts_commands:
             return None
         if each.number > 1 and command.startswith("StreamFrames"):
             return ok(f"OK-{command}")
         return answer(each, command)
 
-    lab.scripted.answer_on = without_frames
+    lab.server.answer_on = without_frames
     async with running(lab):
         began_s = asyncio.get_running_loop().time()
         await until(lambda: lab.limitations)
@@ -167,24 +133,24 @@ async def test_a_second_connection_without_frames_is_given_up(
         assert lab.components == [EVERYTHING]
         assert lab.limitations == [NO_FRAMES] or accepts_commands
         await asyncio.sleep(3600)
-        assert lab.scripted.num_open == 1
-        assert len(lab.scripted.connections) <= most_connections
+        assert lab.num_open == 1
+        assert len(lab.server.connections) <= most_connections
 
 
 async def test_frames_on_the_second_connection_only(lab: AutoLab) -> None:
-    answer = lab.scripted.answer_on
+    answer = lab.server.answer_on
 
-    def without_first(each: Numbered, command: str) -> bytes | None:
+    def without_first(each: Connection, command: str) -> bytes | None:
         if each.number == 1 and command.startswith("StreamFrames") and "3D" in command:
             return ok(f"OK-{command}")
         return answer(each, command)
 
-    lab.scripted.answer_on = without_first
+    lab.server.answer_on = without_first
     async with running(lab):
-        await until(lambda: lab.scripted.num_open == 2)
+        await until(lambda: lab.num_open == 2)
         for _ in range(100):
             await asyncio.sleep(0.1)
-            lab.scripted.connections[-1].send_frames(1)
+            lab.server.connections[-1].send_frames(1)
             if lab.limitations:
                 break
         assert lab.components == [EVERYTHING]
@@ -200,26 +166,26 @@ async def test_a_second_connection_that_breaks_twice_in_a_row_is_given_up(
         for lasted_s in (first_lasts_s, 3):
             await lab.uses_two()
             await asyncio.sleep(lasted_s)
-            await end(lab.scripted.connections[-1])
+            await end(lab.server.connections[-1])
         await until(lambda: lab.limitations)
         assert lab.limitations[0].startswith(f"{ONE_CONNECTION}the server accepts one connection only (")
         await asyncio.sleep(3600)
-        assert len(lab.scripted.connections) == 3
+        assert len(lab.server.connections) == 3
 
 
 async def test_the_further_connection_ends_with_the_first(lab: AutoLab) -> None:
     async with running(lab):
         await lab.uses_two()
         await asyncio.sleep(20)
-        first, second = lab.scripted.connections
-        lab.scripted.refuses = True
+        first, second = lab.server.connections
+        lab.server.refuses = True
         first.end()
         await until(lambda: not second.is_open)
         assert "Bye" in second.commands
         await asyncio.sleep(60)
-        lab.scripted.refuses = False
+        lab.server.refuses = False
         await lab.uses_two()
-        assert (len(lab.scripted.connections), lab.limitations) == (4, [])
+        assert (len(lab.server.connections), lab.limitations) == (4, [])
 
 
 async def end(*connections: Connection) -> None:
@@ -229,7 +195,7 @@ async def end(*connections: Connection) -> None:
 
 
 async def end_all(lab: AutoLab) -> None:
-    await end(*lab.scripted.connections)
+    await end(*lab.server.connections)
 
 
 async def test_a_server_that_is_restarted_at_times_keeps_two_connections(lab: AutoLab) -> None:
@@ -248,14 +214,14 @@ async def test_a_server_that_ends_with_every_second_connection_is_remembered(lab
         for _ in range(3):
             await lab.uses_two()
             await end_all(lab)
-        await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
+        await until(lambda: lab.limitations == [ONE_ONLY] and lab.num_open == 1)
         for _ in range(5):
             await asyncio.sleep(3600)
             await end_all(lab)
-            await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
+            await until(lambda: lab.limitations == [ONE_ONLY] and lab.num_open == 1)
             assert lab.components == [EVERYTHING]
-        assert len(lab.scripted.connections) == 3 * 2 + 6
-        lab.scripted.answer_on = answering(parameters(version="2"))
+        assert len(lab.server.connections) == 3 * 2 + 6
+        lab.server.answer_on = answering(parameters(version="2"))
         await end_all(lab)
         await lab.uses_two()
         assert lab.limitations == []
@@ -268,22 +234,22 @@ async def test_a_server_stays_known_when_its_rates_change_on_an_open_connection(
             await lab.uses_two()
             await end_all(lab)
         await until(lambda: lab.limitations == [ONE_ONLY] and lab.states == [StreamState.NO_MEASUREMENT])
-        lab.scripted.answer_on = answering(parameters(1000))
-        lab.scripted.connections[-1].send_frames(1)  # a new measurement
-        lab.scripted.connections[-1].send(NO_DATA)
+        lab.server.answer_on = answering(parameters(1000))
+        lab.server.connections[-1].send_frames(1)  # a new measurement
+        lab.server.connections[-1].send(NO_DATA)
         await until(lambda: lab.limitations == [ONE_ONLY.replace("2000", "1000")])
         await asyncio.sleep(60)
-        assert (lab.components, lab.scripted.num_open) == ([EVERYTHING], 1)
+        assert (lab.components, lab.num_open) == ([EVERYTHING], 1)
 
 
 async def test_a_server_that_refused_is_tried_again_after_ten_minutes(lab: AutoLab) -> None:
-    answer = lab.scripted.answer_on
-    lab.scripted.answer_on = lambda each, command: (
+    answer = lab.server.answer_on
+    lab.server.answer_on = lambda each, command: (
         answer(each, command) if each.number == 1 else error("err-busy")
     )
     async with running(lab):
         await until(lambda: lab.limitations)
-        lab.scripted.answer_on = answer
+        lab.server.answer_on = answer
         await asyncio.sleep(300)
         await end_all(lab)
         await until(lambda: lab.limitations)
@@ -297,8 +263,8 @@ async def test_a_server_that_refused_is_tried_again_after_ten_minutes(lab: AutoL
 async def test_a_server_without_parameters_after_one_with_rates_gets_one_connection(lab: AutoLab) -> None:
     async with running(lab):
         await lab.uses_two()
-        answer = lab.scripted.answer_on
-        lab.scripted.answer_on = lambda each, command: (
+        answer = lab.server.answer_on
+        lab.server.answer_on = lambda each, command: (
             error("err-unknown") if command.startswith("SendParameters") else answer(each, command)
         )
         await asyncio.sleep(20)
@@ -306,4 +272,4 @@ async def test_a_server_without_parameters_after_one_with_rates_gets_one_connect
         await until(lambda: lab.components == [EVERYTHING] and len(lab.limitations) > 1)
         assert "does not announce the rates of its components" in lab.limitations[-1]
         await settle()
-        assert lab.scripted.num_open == 1
+        assert lab.num_open == 1

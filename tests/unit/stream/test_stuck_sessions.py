@@ -114,44 +114,6 @@ def now_s() -> float:
 # --- servers that ignore and refuse
 
 
-@pytest.mark.parametrize("ignored", [("Version",), ("SendParameters",), ("Version", "SendParameters")])
-@pytest.mark.parametrize("known", ["StreamFrames", "StreamFrames FrequencyDivisor:1"])
-async def test_a_server_that_ignores_and_refuses_without_a_name_streams(
-    ignored: tuple[str, ...], known: str
-) -> None:
-    def answer(command: str) -> bytes | None:
-        if command.startswith(ignored):
-            return None
-        return ok("fine") if command == known else error("what?")
-
-    lab = Lab()
-    server = StreamingServer(lab, answer)
-    began_s = now_s()
-    async with serving(lab, server):
-        await until(is_streaming(lab))
-        assert now_s() - began_s < 2 * len(ignored) + 1
-        await asyncio.sleep(60)
-        assert is_streaming(lab)()
-    assert len(lab.server.connections) == 1
-
-
-@pytest.mark.parametrize("acknowledges", [True, False])
-async def test_a_server_that_ignores_all_but_one_form_streams(acknowledges: bool) -> None:
-    lab = Lab()
-    server = StreamingServer(
-        lab,
-        lambda command: ok("ok") if acknowledges and command == BARE else None,
-        accepts=lambda command: command == BARE,
-    )
-    async with serving(lab, server):
-        await until(is_streaming(lab))
-        await lab.ready()
-        await asyncio.sleep(60)
-        assert is_streaming(lab)()
-    assert len(lab.server.connections) == 1
-    assert lab.server.connection.commands[-2] == BARE  # then Bye
-
-
 async def test_frames_show_that_a_form_was_accepted() -> None:
     lab = Lab()
     server = StreamingServer(lab, silent_to(""), accepts=lambda _: True)
@@ -197,18 +159,6 @@ async def test_a_server_that_hangs_streams_within_5_s_of_being_well(
             await asyncio.sleep(20)
             assert is_streaming(lab)(), hang_s
             assert lab.supervisor.session is not None
-
-
-async def test_the_configured_form_is_preferred_after_a_hang() -> None:
-    lab = Lab()
-    server = StreamingServer(lab)
-    server.hangs = True
-    async with serving(lab, server):
-        await until(lambda: lab.server.connections and BARE in lab.server.connection.commands)
-        server.recover()
-        await lab.ready()
-        assert lab.server.connection.commands[-1] == FIRST_FORM
-        assert lab.status.rate == "AllFrames"
 
 
 # --- servers that come back as another program

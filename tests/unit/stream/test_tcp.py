@@ -108,13 +108,6 @@ def test_the_error_of_any_other_failure_of_the_network() -> None:
     )
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "::ffff:127.0.0.1", "fe80::1%lo"])
-def test_a_number_is_not_looked_up(host: str, resolver: Resolver) -> None:
-    resolver.error = AssertionError("looked up")
-    error_of(source(host=host, port=free_port(), connect_timeout_s=0.1))
-    assert resolver.names == []
-
-
 async def connected_address(port: int, timeout_s: float) -> str:
     settings = source(host="lab-pc", port=port, connect_timeout_s=timeout_s)
     transport = await open_connection(settings, asyncio.Protocol())

@@ -113,13 +113,6 @@ def test_the_speed_can_be_chosen(played: Played) -> None:
     assert played.newest == 2999
 
 
-def test_labels_are_known_after_a_jump(played: Played) -> None:
-    played.drag_to(20.0)
-    wait_until(lambda: played.newest > 2000)
-    [source] = played.live.update()
-    assert source.newest_parameters.markers is not None
-
-
 def test_a_take_with_a_damaged_end_has_a_length(tmp_path: Path) -> None:
     path = write_take(
         tmp_path / "walk.lcmlog", [description(), *(markers(1, number) for number in range(100))]
