@@ -28,6 +28,7 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.rtc3d.server_description import only_components
 from gateway.stream.parameters import UNANSWERED, Connection
+from gateway.stream.source_warnings import SourceWarnings
 from gateway.stream.state import StreamState
 from gateway.stream.status import SessionNumbers, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
@@ -56,7 +57,7 @@ class Source:
         before: "Source | None" = None,
     ) -> None:
         self.settings = settings
-        self._newest_losses_s: dict[str, float] = {}  # by cause, of all streams
+        self._warnings = SourceWarnings(settings.name)
         self.defects: DefectLog = DefectLog(logger, settings.name, None if before is None else before.defects)
         """The log of defects in handling this source."""
         self.spool = spool
@@ -238,7 +239,7 @@ class Source:
             sessions=self.sessions,
             parameters_version=self.parameters_version,
             known_defects=self.defects,
-            newest_losses_s=self._newest_losses_s,
+            warnings=self._warnings,
         )
         return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
 

@@ -9,6 +9,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, RequestError
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.defects import defect_error
+from gateway.stream.running_clock import running_clock
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
@@ -72,9 +73,9 @@ class ChangeTasks:
             self._halvings = halvings
             self._changed.set()
         elif halvings:
-            self._status.lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
+            self._status.frames_late(self._status.lag_s, running_clock().longest_delay_s())
         else:
-            self._status.lateness.recovered("frames arrive in time again")
+            self._status.frames_in_time()
 
     def request_components(self, components: Sequence[ComponentType]) -> None:
         """Start to request these components instead of the former ones; return at once."""
@@ -156,15 +157,15 @@ class ChangeTasks:
 
     async def _change_rate(self) -> None:
         """Request another rate. If the server refuses, it keeps the rate, and another one may be accepted."""
-        lag_ms = 1000 * self._status.lag_s
+        lag_s = self._status.lag_s
         await self._request_rate()
         request = f"asked the server for {self._status.rate or 'its default rate'}"
-        if lag_ms > self._source.max_lag_ms:
-            self._status.lateness.failed(f"frames arrive {lag_ms:.0f} ms late; {request}")
+        if 1000 * lag_s > self._source.max_lag_ms:
+            self._status.frames_late(lag_s, running_clock().longest_delay_s(), request)
         elif self._halvings:
             logger.debug("%s: frames arrive in time; %s", self._status.name, request)
         else:
-            self._status.lateness.recovered(f"frames arrive in time again; {request}")
+            self._status.frames_in_time(f"; {request}")
 
     async def _follow_demand(self) -> None:
         """Want no frames while there are no subscribers, and frames within DEMAND_POLL_S of the first one."""

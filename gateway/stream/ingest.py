@@ -12,6 +12,7 @@ from gateway.stream.frame_numbers import FrameNumbers
 from gateway.stream.paced_frames import MAX_TOGETHER
 from gateway.stream.rate_control import MAX_HALVINGS, LagControl
 from gateway.stream.rate_watch import Arrivals
+from gateway.stream.running_clock import running_clock
 from gateway.stream.status import FRAME_REJECTED, StreamStatus
 
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
@@ -201,7 +202,8 @@ class Ingest:
             return
         num_missing = numbers.observe(frame_number, timestamp_us)
         if num_missing:
-            self._status.frames_unsent(num_missing, num_missing * self._num_skippable)
+            held_up_s = running_clock().longest_delay_s()
+            self._status.frames_unsent(num_missing, num_missing * self._num_skippable, held_up_s)
 
     def _follow(
         self, first_component_type: ComponentType | None, frame_number: int, timestamp_us: int

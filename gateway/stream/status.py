@@ -3,7 +3,6 @@
 import logging
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -15,6 +14,7 @@ from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.safe_text import safe_text
 from gateway.stream.clock import ServerClock
+from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
 
 MAX_ERROR_LENGTH: Final = 500
@@ -22,9 +22,6 @@ MAX_ERROR_LENGTH: Final = 500
 
 MAX_UNKNOWN_TYPES: Final = 8
 """How many types that §7.2 does not define are listed for a connection."""
-
-MAX_LIMITATIONS: Final = 20
-"""How many limitations of a connection are kept, and how many logged ones are remembered."""
 
 _LATE_BEFORE_A_GAP_S: Final = 0.5
 """A server that nobody reads from leaves out frames only when buffers are full: after this long at least."""
@@ -85,9 +82,8 @@ class StreamStatus:
     output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
     components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the first
     of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
-    ``known_defects`` has the defects that are logged already, and ``newest_losses_s`` when the streams of the
-    source last lost something, by cause: they log one warning together. ``events`` logs what the server can
-    cause again and again, ``lateness`` late frames.
+    ``known_defects`` has the defects that are logged already, and ``warnings`` what the streams of the source
+    log together. ``events`` logs what the server can cause again and again.
     """
 
     components: str
@@ -118,24 +114,23 @@ class StreamStatus:
     last_error_utime: int = 0
     last_error_s: float = -math.inf
     known_defects: DefectLog | None = None
-    newest_losses_s: dict[str, float] | None = None
+    warnings: SourceWarnings | None = None
     _phase: Phase = field(default=Phase.WAITING, init=False)
     events: EventLog = field(init=False)
-    lateness: FailureLog = field(init=False)
     _failures: FailureLog = field(init=False)
     _defects: DefectLog = field(init=False)
     _unknown_types: set[int] = field(default_factory=set, init=False)  # of this connection, those listed
     _unknown_text: str = field(default_factory=str, init=False)  # compiled, a default would not be assigned
-    _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
+    _warnings: SourceWarnings = field(init=False)
     _logged_request: str = field(init=False)
 
     def __post_init__(self) -> None:
         """Create the logs of losses, lost connections, defects and other events."""
         self.events = EventLog(logger, self)
-        self.lateness = FailureLog(logger, self)
+        self._warnings = self.warnings or SourceWarnings(self)
         self._failures = FailureLog(logger, self, HOLD_S)
         self._defects = DefectLog(logger, self, self.known_defects)
-        self.losses = Losses(logger, self, newest_by_cause_s=self.newest_losses_s)
+        self.losses = Losses(logger, self, newest_by_cause_s=self._warnings.newest_losses_s)
         self._logged_request = ""  # here, because mypyc ignores the default of a field that __init__ lacks
 
     def __str__(self) -> str:
@@ -262,23 +257,41 @@ class StreamStatus:
             messages=num_messages,
         )
 
-    def frames_unsent(self, num_frames: int, num_messages: int) -> None:
+    def frames_late(self, lag_s: float, held_up_s: float, request: str = "") -> None:
+        """Log that frames are late; ``request`` is what the server was asked for.
+
+        ``held_up_s`` is how long the event loop of this gateway did not run lately.
+        """
+        lag_ms = 1000 * lag_s
+        text = f"frames arrive {lag_ms:.0f} ms late"
+        if request:
+            text = f"frames arrive {lag_ms:.0f} ms late; {request}"
+        if held_up_s >= lag_s / 2:
+            text = f"{text}; this gateway did not run for {held_up_s:.1f} s: check the load of this computer"
+        self._warnings.failed(id(self), text)
+
+    def frames_in_time(self, request: str = "") -> None:
+        """Log that frames are no longer late; ``request`` is as in ``frames_late``."""
+        self._warnings.in_time(id(self), f"frames arrive in time again{request}")
+
+    def frames_unsent(self, num_frames: int, num_messages: int, held_up_s: float) -> None:
         """Count frames that the server numbered and did not send.
 
-        If nobody took its frames, those before the gap waited in buffers, and arrived late.
+        A server leaves out frames if nobody takes those before: ``held_up_s`` is how long this gateway did
+        not run lately. Frames that waited elsewhere are late.
         """
-        if not self.clock.has_clock:
-            reason = "check the load of the server's computer and of this one"
-        elif self.lag_s >= _LATE_BEFORE_A_GAP_S:
+        if held_up_s >= _LATE_BEFORE_A_GAP_S:
             reason = (
-                f"those before arrived {self.lag_s:.1f} s late, because this gateway or the network was held "
-                "up; check the load of this computer, then the network"
+                f"this gateway did not run for {held_up_s:.1f} s, and did not take those before; "
+                "check the load of this computer"
+            )
+        elif self.clock.has_clock and self.lag_s >= _LATE_BEFORE_A_GAP_S:
+            reason = (
+                f"those before arrived {self.lag_s:.1f} s late, although this gateway was running; "
+                "check the network, then the load of both computers"
             )
         else:
-            reason = (
-                "those before arrived in time, so this gateway read them; "
-                "check the load of the server's computer"
-            )
+            reason = "this gateway was running and read those before; check the load of the server's computer"
         self.losses.lost(
             NOT_SENT,
             f"the server did not send {num_frames} of the frames that it numbered; {reason}",
@@ -318,8 +331,8 @@ class StreamStatus:
         """Log what was repaired in the server's parameters, once for each text unless there are many."""
         rest = f"; and {len(repairs) - _MAX_REPAIRS} more" if len(repairs) > _MAX_REPAIRS else ""
         text = f"parameters repaired: {'; '.join(repairs[:_MAX_REPAIRS])}{rest}"
-        if text not in self._logged_limitations:
-            self._logged_limitations.append(text)
+        if text not in self._warnings.logged:
+            self._warnings.logged.append(text)
             self.events.log(logging.INFO, text, "parameters repaired")
 
     def rate_agreed(self, rate: str) -> None:
@@ -334,10 +347,10 @@ class StreamStatus:
         text = safe_text(text)  # it may quote the server
         if not self._list_limitation(text):
             return
-        if text in self._logged_limitations:
+        if text in self._warnings.logged:
             logger.debug("%s: %s", self.name, text)
             return
-        self._logged_limitations.append(text)
+        self._warnings.logged.append(text)
         self.events.log(logging.WARNING, text, "limitation", MAX_LIMITATIONS)
 
     def _list_limitation(self, text: str) -> bool:
@@ -363,6 +376,8 @@ class StreamStatus:
     def _enter(self, phase: Phase, event: str, cause: str) -> None:
         """Enter a phase in which earlier frames or No Data from the server do not matter."""
         self._phase = phase
+        if phase is Phase.WAITING:
+            self._warnings.in_time(id(self), "the connection with late frames has ended")
         self._update_state(ProtocolState.IDLE, event, cause)
 
     def _update_state(self, protocol_state: ProtocolState, event: str, cause: str) -> None:

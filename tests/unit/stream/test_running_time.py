@@ -43,6 +43,23 @@ async def test_the_clock_never_goes_back() -> None:
     assert times_s == sorted(times_s)
 
 
+async def test_the_longest_delay_of_the_last_half_minute_is_known() -> None:
+    """It tells a gap that this gateway caused from one that the server caused."""
+    clock = running_clock()
+    await asyncio.sleep(1)
+    assert clock.longest_delay_s() == 0
+    stop_process(3.0)
+    assert clock.longest_delay_s() == pytest.approx(3.0, abs=0.11)  # before any timer
+    await asyncio.sleep(1)
+    stop_process(0.5)
+    await asyncio.sleep(1)
+    assert clock.longest_delay_s() == pytest.approx(3.0, abs=0.11)
+    await asyncio.sleep(28)
+    assert clock.longest_delay_s() == pytest.approx(0.5, abs=0.11)
+    await asyncio.sleep(5)
+    assert clock.longest_delay_s() == 0
+
+
 async def test_each_event_loop_has_one_clock() -> None:
     clock = running_clock()
     assert running_clock() is clock

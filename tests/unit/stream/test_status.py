@@ -16,8 +16,9 @@ from gateway.monitoring.status_line import source_line
 from gateway.publish.status_messages import status_message
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.running_clock import running_clock
+from gateway.stream.source_warnings import MAX_LIMITATIONS
 from gateway.stream.state import Phase, StreamState, stream_state
-from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
+from gateway.stream.status import MAX_ERROR_LENGTH, FrameRate, StreamStatus
 from gateway.stream.status_text import message_texts, source_text, unusable_frames
 from tests.losses import amounts
 
