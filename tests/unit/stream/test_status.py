@@ -8,7 +8,7 @@ import pytest
 import rtc3d
 
 from gateway.config.settings import SourceSettings
-from gateway.errors import ClosedError
+from gateway.errors import ClosedError, LinkError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
@@ -16,7 +16,7 @@ from gateway.monitoring.status_line import source_line
 from gateway.publish.status_messages import status_message
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.running_clock import running_clock
-from gateway.stream.source_warnings import MAX_LIMITATIONS
+from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, FrameRate, StreamStatus
 from gateway.stream.status_text import message_texts, source_text, unusable_frames
@@ -181,24 +181,63 @@ def test_repeated_events_are_added_up() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lag_s", "reason"),
+    ("held_up_s", "lag_s", "reason"),
     [
-        (None, "check the load of the server's computer and of this one"),
-        (0.02, "those before arrived in time, so this gateway read them"),
-        (3.2, "those before arrived 3.2 s late, because this gateway or the network was held up"),
+        (3.1, 0.02, "this gateway did not run for 3.1 s, and did not take those before"),
+        (3.1, None, "this gateway did not run for 3.1 s, and did not take those before"),
+        (0.06, 3.2, "those before arrived 3.2 s late, although this gateway was running; check the network"),
+        (0.06, 0.02, "this gateway was running and read those before; check the load of the server's comp"),
+        (0.06, None, "this gateway was running and read those before; check the load of the server's comp"),
     ],
 )
-def test_a_gap_says_whether_anybody_read_the_frames_before_it(
-    lag_s: float | None, reason: str, caplog: pytest.LogCaptureFixture
+def test_a_gap_says_whether_this_gateway_was_running(
+    held_up_s: float, lag_s: float | None, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The log asked the reader whether the server was too busy or the gateway did not read."""
+    """The gateway measures whether it could read; late frames alone do not show who caused a gap."""
     status = StreamStatus("3d", name="lab (3d)")
     for number in range(1000 if lag_s is not None else 0):
         status.clock.observe(10_000 * number, number, 10_000 * number)
     status.lag_measured(lag_s or 0.0)
-    status.frames_unsent(100, 100)
+    status.frames_unsent(100, 100, held_up_s)
     [text] = [message for message in caplog.messages if "did not send" in message]
     assert text.startswith(f"lab (3d): the server did not send 100 of the frames that it numbered; {reason}")
+
+
+def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_late_frames_are_one_line_for_all_streams_of_a_source(caplog: pytest.LogCaptureFixture) -> None:
+    """A busy host delays all streams at once; a line for each says nothing more."""
+    shared = SourceWarnings("lab")
+    first, second, third = (StreamStatus(each, name=f"lab ({each})", warnings=shared) for each in "abc")
+    first.frames_late(0.12, 0.0)
+    second.frames_late(0.13, 0.0)
+    third.frames_late(0.14, 0.0)
+    assert warnings_of(caplog) == ["lab: frames arrive 120 ms late"]
+    caplog.clear()
+    first.frames_in_time()
+    second.disconnected(LinkError("the test"))
+    assert not [message for message in caplog.messages if "late" in message or "in time" in message]
+    third.frames_in_time()
+    [over] = [message for message in caplog.messages if "in time" in message]
+    assert over.startswith("lab: frames arrive in time again, after ")
+    caplog.clear()
+    second.frames_late(2.0, 1.9)
+    cause = "this gateway did not run for 1.9 s: check the load of this computer"
+    assert warnings_of(caplog) == [f"lab: frames arrive 2000 ms late; {cause}"]
+
+
+def test_a_limitation_that_all_streams_of_a_source_have_is_one_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Each stream opens a session with the same server, which refuses the same commands in each."""
+    shared = SourceWarnings("lab")
+    for name in ("lab (3d)", "lab (analog)"):
+        status = StreamStatus("3d", name=name, warnings=shared)
+        status.add_limitation("the server refused Version 1.0")
+        assert status.limitations == ["the server refused Version 1.0"]
+    assert warnings_of(caplog) == ["lab (3d): the server refused Version 1.0"]
 
 
 # --- the rule for the state
