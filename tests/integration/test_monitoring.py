@@ -28,6 +28,7 @@ from gateway.gateway import Gateway
 from gateway.monitoring.health import health_page
 from gateway.monitoring.server import MonitoringServer
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
@@ -50,6 +51,12 @@ STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS, ComponentType.TOOLS)),
     StreamSettings(components=(ComponentType.ANALOG,)),
 )
+TLS = {
+    "shared_memory": {"enabled": False},
+    "link": {"tls": {"root_ca_certificate": str(ROOT / "tests/data/certificates/far.crt")}},
+}
+"""A certificate that is not used without TLS, but has an end."""
+
 PROMETHEUS_LABELS = {"job", "instance"}
 """Labels that Prometheus adds."""
 
@@ -64,12 +71,15 @@ class Lab:
         self.gateway = Gateway(
             make_settings(
                 sources=(SourceSettings(**source, reconnect=reconnect, stall_timeout_s=60.0),),
-                zenoh=ZenohSettings(config=zenoh_keys("peer")),
+                zenoh=ZenohSettings(config=zenoh_keys("peer") | {"transport": TLS}),
                 lcm=LcmSettings(url="memq://"),
                 metrics=MetricsSettings(port=port),
             )
         )
         self.source = self.gateway.sources[0]
+        # Only for the metrics: the output itself publishes no status.
+        takes = TakesSettings(enabled=True, directory="/tmp")
+        self.gateway.settings = self.gateway.settings.model_copy(update={"takes": takes})
 
     async def get(self, path: str) -> tuple[int, str]:
         """Return the HTTP status and the body of a page."""
@@ -118,8 +128,10 @@ def families() -> dict[str, Metric]:
         async with simulator() as server, running_lab(server.port) as lab:
             await lab.until_all(lambda status: status.clock.has_clock)
             await wait_until_async(lambda: all(s.messages["status"] for _, s in lab.source.fan_out.outputs))
-            status, body = await lab.get("/metrics")
-            assert status == 200
+            body = ""
+            while "certificate_not_after_timestamp_seconds{" not in body:  # read in a thread
+                status, body = await lab.get("/metrics")
+                assert status == 200
             return {family.name: family for family in text_string_to_metric_families(body)}
 
     return uvloop.run(run())

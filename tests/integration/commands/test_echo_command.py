@@ -124,7 +124,9 @@ async def test_values_have_the_units_of_the_parameters_which_are_asked_for_once(
                 assert (done.status, done.stderr) == (0, "")
                 assert [line.endswith(end) for line in done.stdout.splitlines()] == [True] * 20
         for output in gateway.outputs:
-            assert 3 <= output.query_results["lab"]["ok"] < 20
+            results = output.query_results
+            assert results is not None
+            assert 3 <= results["lab"]["ok"] < 20
 
 
 async def test_rates_count_the_messages_of_the_component(lab: Lab) -> None:
