@@ -259,6 +259,11 @@ class OutputSettings(Section):
         """The TCP addresses that the gateway listens on, except those in URLs of Zenoh and LCM."""
         return ()
 
+    @property
+    def certificates(self) -> Mapping[str, Path]:
+        """The files with TLS certificates that the output uses, by the names of the keys that name them."""
+        return {}
+
 
 def folder_of(configured: str | None, name: str) -> Path:
     """Return the folder in use: the configured one, or ``name`` in the state directory.

@@ -25,6 +25,7 @@ from gateway.gateway import Gateway
 from gateway.log import defect_total
 from gateway.losses import Loss
 from gateway.messages.host_time import host_clock
+from gateway.monitoring.disk_facts import DiskFacts
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.outputs.status import WHOLE_FRAME, OutputStatus
@@ -149,10 +150,10 @@ _LOSS_COUNTERS: Final[Mapping[str, Sequence[tuple[str, str, Callable[[Loss], int
 """Name, help text and value of the counters of what is lost."""
 
 
-def metrics_registry(gateway: Gateway, loop_delay: LoopDelay) -> CollectorRegistry:
+def metrics_registry(gateway: Gateway, loop_delay: LoopDelay, disk_facts: DiskFacts) -> CollectorRegistry:
     """Return the registry of all metrics of ``gateway``."""
     registry = CollectorRegistry()
-    registry.register(GatewayCollector(gateway, loop_delay))
+    registry.register(GatewayCollector(gateway, loop_delay, disk_facts))
     return registry
 
 
@@ -164,8 +165,9 @@ def metrics_page(registry: CollectorRegistry) -> Page:
 class GatewayCollector(Collector):
     """Reads a gateway's counters. ``collect`` must run in the thread of the event loop."""
 
-    def __init__(self, gateway: Gateway, loop_delay: LoopDelay) -> None:
+    def __init__(self, gateway: Gateway, loop_delay: LoopDelay, disk_facts: DiskFacts) -> None:
         self._gateway = gateway
+        self._disk_facts = disk_facts
         self._loop_delay = loop_delay
         self._build = {
             "version": __version__,
@@ -189,6 +191,7 @@ class GatewayCollector(Collector):
         )
         yield from self._routes()
         yield from self._outputs()
+        yield from self._disks()
         yield from self._process()
 
     def _streams(self) -> Iterator[Metric]:
@@ -286,6 +289,21 @@ class GatewayCollector(Collector):
                     (output.name,), sum(map(Counter, results.values()), Counter()), ("ok",)
                 )
             ],
+        )
+
+    def _disks(self) -> Iterator[Metric]:
+        facts = self._disk_facts
+        yield _gauge(
+            "certificate_not_after_timestamp_seconds",
+            "When a TLS certificate ends, since the Unix epoch; of several in one file, the first to end.",
+            ("output", "key"),
+            list(facts.certificate_ends_s.items()),
+        )
+        yield _gauge(
+            "takes_free_bytes",
+            "Room on the disk of the takes; absent while the output takes is off.",
+            (),
+            [] if facts.takes_free_bytes is None else [((), facts.takes_free_bytes)],
         )
 
     def _process(self) -> Iterator[Metric]:

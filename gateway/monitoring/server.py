@@ -8,6 +8,7 @@ from typing import Final
 from gateway.config.settings import MetricsSettings
 from gateway.errors import system_reason
 from gateway.gateway import Gateway
+from gateway.monitoring.disk_facts import DiskFacts
 from gateway.monitoring.health import health_page
 from gateway.monitoring.http_pages import HttpPages
 from gateway.monitoring.loop_delay import LoopDelay
@@ -29,8 +30,9 @@ class MonitoringServer:
         limits = limits or ProcessLimits()
         self._settings = settings
         self._loop_delay = LoopDelay()
+        self._disk_facts = DiskFacts(gateway)
         self._look_up: asyncio.Task[None] | None = None
-        registry = metrics_registry(gateway, self._loop_delay)
+        registry = metrics_registry(gateway, self._loop_delay, self._disk_facts)
         self._pages = HttpPages(
             {
                 "/metrics": lambda: metrics_page(registry),
@@ -47,6 +49,7 @@ class MonitoringServer:
         if not self._settings.enabled:
             return
         self._loop_delay.start()
+        self._disk_facts.start()
         address = self._settings.host
         if is_address(address):
             await self._listen([address])
@@ -83,6 +86,7 @@ class MonitoringServer:
     async def close(self) -> None:
         """Stop listening."""
         self._loop_delay.close()
+        self._disk_facts.close()
         if self._look_up is not None:
             self._look_up.cancel()
         await self._pages.close()

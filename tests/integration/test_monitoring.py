@@ -24,6 +24,7 @@ from gateway.config.settings import (
 )
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
@@ -45,20 +46,30 @@ STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS, ComponentType.TOOLS)),
     StreamSettings(components=(ComponentType.ANALOG,)),
 )
+TLS = {
+    "shared_memory": {"enabled": False},
+    "link": {"tls": {"root_ca_certificate": str(ROOT / "tests/data/certificates/far.crt")}},
+}
+"""A certificate that is not used without TLS, but has an end."""
+
 PROMETHEUS_LABELS = {"job", "instance"}
 """Labels that Prometheus adds."""
 
 
 def lab(server_port: int, port: int) -> Gateway:
     """Return a gateway for the source "lab" on Zenoh and LCM."""
-    return Gateway(
+    gateway = Gateway(
         make_settings(
             sources=(local_source(server_port, streams=STREAMS, stall_timeout_s=60.0),),
-            zenoh=ZenohSettings(config=zenoh_keys("peer")),
+            zenoh=ZenohSettings(config=zenoh_keys("peer") | {"transport": TLS}),
             lcm=LcmSettings(url="memq://"),
             metrics=MetricsSettings(port=port),
         )
     )
+    # Only for the metrics: the output itself publishes no status.
+    takes = TakesSettings(enabled=True, directory="/tmp")
+    gateway.settings = gateway.settings.model_copy(update={"takes": takes})
+    return gateway
 
 
 async def until_all(gateway: Gateway, condition: Callable[[StreamStatus], object]) -> None:
@@ -86,7 +97,9 @@ def families() -> dict[str, Metric]:
             await until_all(gateway, lambda status: status.clock.has_clock)
             outputs = gateway.sources[0].fan_out.outputs
             await wait_until_async(lambda: all(status.messages["status"] for _, status in outputs))
-            page = await asyncio.to_thread(read_metrics, port)
+            page = ""
+            while "certificate_not_after_timestamp_seconds{" not in page:  # read in a thread
+                page = await asyncio.to_thread(read_metrics, port)
             return {family.name: family for family in text_string_to_metric_families(page)}
 
     return uvloop.run(run())
@@ -270,6 +283,15 @@ CASES: Final[list[tuple[str, str, str, str, bool]]] = [
         f'rtc3d_gateway_output_drops_total{{{_DROPS},output="takes"}}',
         "0+1x30",
         "7+0x30",
+        False,
+    ),
+    ("TakesDiskFilling", 'rtc3d_gateway_takes_free_bytes{instance="a"}', "1e9+0x30", "9e10+0x30", False),
+    ("TakesDiskFilling", 'rtc3d_gateway_takes_free_bytes{instance="a"}', "9e10-1.7e9x30", "9e10+0x30", False),
+    (
+        "CertificateEnds",
+        'rtc3d_gateway_certificate_not_after_timestamp_seconds{output="zenoh",key="connect_certificate"}',
+        "2500000+0x30",
+        "2700000+0x30",
         False,
     ),
     ("SourceSilent", f"rtc3d_gateway_last_frame_timestamp_seconds{{{_SOURCE}}}", "0+0x30", "0+60x30", True),

@@ -24,6 +24,7 @@ from gateway.errors import ConfigError
 from gateway.findings import Result
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
+from gateway.monitoring.disk_facts import DiskFacts
 from gateway.monitoring.health import health_page
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
@@ -94,7 +95,7 @@ class Lab:
         return found()
 
     def metric(self, name: str, **labels: str) -> float:
-        page = metrics_page(metrics_registry(self.gateway, LoopDelay()))
+        page = metrics_page(metrics_registry(self.gateway, LoopDelay(), DiskFacts(self.gateway)))
         [value] = [
             sample.value
             for family in text_string_to_metric_families(page.body.decode())

@@ -13,7 +13,7 @@ from gateway.config.section import expects, validation_error
 from gateway.config.settings import OutputSettings
 from gateway.config.values import ByteLimit, MaxRates, QueryRate, Switch
 from gateway.config.words import describe
-from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_config, zenoh_reason
 
 DEFAULT_ZENOH_PREFIX: Final = "mocap"
 
@@ -77,6 +77,10 @@ ZenohConfig = Annotated[
 """YAML: a path, or a mapping."""
 
 
+_CERTIFICATES: Final = ("root_ca_certificate", "listen_certificate", "connect_certificate")
+"""The keys of Zenoh's transport/link/tls that name files with certificates."""
+
+
 class ZenohSettings(OutputSettings):
     """The settings of the Zenoh output."""
 
@@ -113,3 +117,9 @@ class ZenohSettings(OutputSettings):
 
     max_reply_bytes_per_s: ByteLimit = 16 * 1024 * 1024
     """How many bytes a second to send in replies. Those of more than 1 MiB (C3D files) count apart."""
+
+    @property
+    def certificates(self) -> Mapping[str, Path]:
+        """See OutputSettings. Reads the file of Zenoh's configuration; raises ConfigError."""
+        tls = json.loads(zenoh_config(self.config).get_json("transport/link/tls"))
+        return {key: Path(tls[key]) for key in _CERTIFICATES if tls[key]}

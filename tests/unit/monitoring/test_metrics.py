@@ -16,6 +16,7 @@ from gateway.gateway import Gateway
 from gateway.log import DefectLog
 from gateway.messages.host_time import HostClock, host_clock
 from gateway.messages.stamp import Stamp
+from gateway.monitoring.disk_facts import DiskFacts
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
 from gateway.rtc3d.components import ComponentType, encode_component
@@ -45,7 +46,7 @@ class Lab:
         self.source = self.gateway.sources[0]
         self.markers, self.analog = self.source.statuses
         self.loop_delay = LoopDelay()
-        self._registry = metrics_registry(self.gateway, self.loop_delay)
+        self._registry = metrics_registry(self.gateway, self.loop_delay, DiskFacts(self.gateway))
 
     def families(self) -> list[Metric]:
         page = metrics_page(self._registry)

@@ -209,6 +209,7 @@ def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def test_late_frames_are_one_line_for_all_streams_of_a_source(caplog: pytest.LogCaptureFixture) -> None:
     """A busy host delays all streams at once; a line for each says nothing more."""
+    caplog.set_level(logging.INFO)
     shared = SourceWarnings("lab")
     first, second, third = (StreamStatus(each, name=f"lab ({each})", warnings=shared) for each in "abc")
     first.frames_late(0.12, 0.0)
