@@ -116,7 +116,7 @@ def test_a_stream_that_cannot_open_is_reported_and_signals_are_ignored(
 def test_a_process_that_hangs_is_killed_and_replaced(
     processes: LslProcesses, monkeypatch: pytest.MonkeyPatch, sends: bool
 ) -> None:
-    monkeypatch.setattr(supervisor, "SILENCE_S", 3.0)
+    monkeypatch.setattr(supervisor, "SILENCE_S", 6.0)
     first = start(processes)
     os.kill(first, signal.SIGSTOP)
     large = Message(Kind.TEXTS, 1, bytes(1_000_000))
@@ -125,7 +125,7 @@ def test_a_process_that_hangs_is_killed_and_replaced(
         sent += 1
         assert sent < 100
     assert problem(processes) in {
-        "the process for LSL has not answered for 3 s; it is started again",
+        "the process for LSL has not answered for 6 s; it is started again",
         "the process for LSL ended by SIGKILL; it is started again",
     }
     assert start(processes) != first
