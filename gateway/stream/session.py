@@ -187,12 +187,16 @@ class Session:
                     await self._ended.wait()
 
     def _check_stall(self) -> None:
-        """Raise SilenceError if frames have stopped although a measurement runs.
+        """Raise SilenceError if no frame is accepted although a measurement runs.
 
-        Events are rare, so a stream that has only events may be silent.
+        Events are rare, so a stream that has only events may be silent. Frames that are rejected after No Data
+        belong to a new measurement.
         """
         is_stopping = isinstance(self._protocol.pending_command, StopStreaming)
-        if self._protocol.state is ProtocolState.STREAMING and not self._only_events and not is_stopping:
+        is_measuring = self._protocol.state is ProtocolState.STREAMING or (
+            self._protocol.state is ProtocolState.NO_MEASUREMENT and self.rejection
+        )
+        if is_measuring and not self._only_events and not is_stopping:
             text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
             reason = f"{text} although a measurement runs"
             if self.rejection:

@@ -35,8 +35,12 @@ async def test_silence_while_a_measurement_runs_ends_the_session(
     assert caplog.messages[-1] == f"lab (3d): {text}"
 
 
-async def test_frames_that_are_all_rejected_are_not_called_silence(lab: Lab) -> None:
-    asyncio.get_running_loop().call_later(2, lab.connection.send, BROKEN_FRAME)
+@pytest.mark.parametrize("before", [b"", NO_DATA], ids=["during a measurement", "of the next one"])
+async def test_frames_that_are_all_rejected_are_not_called_silence(lab: Lab, before: bytes) -> None:
+    """A new connection detects the byte order again; waiting for a measurement would never end."""
+    asyncio.get_running_loop().call_later(2, lab.connection.send, before + BROKEN_FRAME)
+    if before:
+        asyncio.get_running_loop().call_later(4, lab.connection.send, BROKEN_FRAME)
     with pytest.raises(SilenceError, match=r"all frames from 192\.0\.2\.20:3020 are rejected: component"):
         await lab.session.monitor(lab.check_silence)
 
