@@ -189,8 +189,8 @@ class Session:
     def _check_stall(self) -> None:
         """Raise SilenceError if no frame is accepted although a measurement runs.
 
-        Events are rare, so a stream that has only events may be silent. Frames that are rejected after No Data
-        belong to a new measurement.
+        Events are rare, so a stream that has only events may be silent. Frames that are rejected after No
+        Data belong to a new measurement.
         """
         is_stopping = isinstance(self._protocol.pending_command, StopStreaming)
         is_measuring = self._protocol.state is ProtocolState.STREAMING or (

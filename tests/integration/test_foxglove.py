@@ -51,13 +51,16 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
                 await viewer.wait_for("/lab/analog", len(viewer.received["/lab/analog"]) + 100)
                 schemas = viewer.topics
                 description = viewer.received["/lab/parameters"][0].content
+                [take] = (tmp_path / "takes").glob("*/*.lcmlog")
+                job = ExportJob(take, tmp_path / "take.mcap")
+                export_take(job)
+                assert job.notes == []
+                exported = raw_messages(tmp_path / "take.mcap")
+                for name in FRAMES:
+                    received, (last_ns, _) = viewer.received[f"/lab/{name}"], exported[f"/lab/{name}"][-1]
+                    await viewer.wait_until(lambda: received[-1].time_ns >= last_ns)  # noqa: B023
                 losses = {output.name: status.losses for output, status in gateway.sources[0].fan_out.outputs}
                 assert not losses["foxglove"]
-    [take] = (tmp_path / "takes").glob("*/*.lcmlog")
-    job = ExportJob(take, tmp_path / "take.mcap")
-    export_take(job)
-    assert job.notes == []
-    exported = raw_messages(tmp_path / "take.mcap")
     assert exported.keys() | {"/lab/analog/cdr", "/lab/loads/cdr"} == schemas.keys()
     for name in FRAMES:
         live = [(log.time_ns, log.data) for log in viewer.received[f"/lab/{name}"]]

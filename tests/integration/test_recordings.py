@@ -111,7 +111,7 @@ def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) 
         bits = items.view(">u4").reshape(len(items), -1)[:, : expected.shape[2]]
         np.testing.assert_array_equal(bits, expected[number % len(expected)])
         seen.add(number % len(expected))
-    assert len(seen) >= 0.1 * len(expected)
+    assert len(seen) >= 0.02 * len(expected)  # a busy computer skips frames
 
 
 @pytest.mark.takes

@@ -123,7 +123,7 @@ def assert_nothing_is_lost(gateway: GatewayProcess, simulator_log: Path) -> None
 @pytest.mark.netns
 @pytest.mark.parametrize(
     ("scene", "rate_hz", "stops_s"),
-    [pytest.param(LAB, 200, (0.3, 2.0), id="lab"), pytest.param(DENSE, 500, (0.3, 1.5), id="dense")],
+    [pytest.param(LAB, 200, (0.3, 2.0), id="lab"), pytest.param(DENSE, 500, (0.3, 1.0), id="dense")],
 )
 def test_stops_of_the_gateway_lose_nothing(
     tmp_path: Path, scene: tuple[str, ...], rate_hz: int, stops_s: tuple[float, ...]
