@@ -28,6 +28,9 @@ from gateway.outputs.send_thread import SendThread
 from gateway.outputs.status import OutputHealth
 
 _STATUS: Final = ("status",)
+_UNDECLARE_S: Final = 0.5
+"""How long to wait for this before the session is closed: the router may have stopped reading."""
+
 _HUNG_S: Final = 2.0
 """A router that takes no message for this long does not read. Its connection counts as up for up to 60 s."""
 
@@ -187,5 +190,15 @@ class Ros2Output(Output):
         """Close the session. The node and its topics disappear from ROS."""
         sender, self._sender = self._sender, None
         if sender is not None:
+            # Zenoh never frees what a session had declared when it was closed.
+            with contextlib.suppress(TimeoutError, CancelledError):
+                sender.submit(self._undeclare_all).result(_UNDECLARE_S)
             sender.close()
         self._router.close()
+
+    def _undeclare_all(self) -> None:
+        """Remove all topics, in the sending thread."""
+        for source in list(self._sources.values()):
+            source.topics.undeclare()
+        for topic in (self._tf, self._diagnostics):
+            topic.undeclare()
