@@ -9,8 +9,8 @@ import struct
 
 class take_details_t(object):
     """
-    Who and what a take is about, as somebody said who started or saved it. It is in files only, after take_t, and not in
-    those of takes without such details. Of several in a take, the newest one counts.
+    Who and what a take is about, as somebody said who started or saved it. It is in files only, after take_t, and only
+    if something was said.
     """
 
     __slots__ = ["utime", "source", "subject", "session", "note"]
