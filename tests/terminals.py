@@ -29,7 +29,7 @@ LISTS: Final = ("rtc3d-gateway list", "rtc3d-gateway params", "rtc3d-gateway tak
 
 TIMEOUT_S: Final = 120
 
-_NUMBER: Final = r"-?\d+(?:,\d{3})*(?:\.\d+)?"
+_NUMBER: Final = r"(?:-?\d+(?:,\d{3})*(?:\.\d+)?|\bnan\b)"
 _SIZE: Final = rf"{_NUMBER}\s+(?:bytes|[kMG]B)\b"
 _DURATION: Final = rf"(?:\d+\s+h\s+)?(?:\d+\s+min\s+)?{_NUMBER}\s+s\b"
 _VARIABLE: Final = {"size": _SIZE, "duration": _DURATION, "number": _NUMBER}

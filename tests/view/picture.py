@@ -14,7 +14,7 @@ from gateway.takes.component_rows import Array
 
 Position = tuple[float, float, float]
 
-TIMEOUT_MS: Final = 60_000
+TIMEOUT_MS: Final = 180_000
 """Chromium that renders in software takes a while on a busy computer."""
 
 _NODES: Final = "() => window.__viserSceneTree?.getState() ?? {}"

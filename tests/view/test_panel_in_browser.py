@@ -24,7 +24,7 @@ __all__ = ["chromium", "new_page"]
 HOSTILE: Final = ("<img src=x onerror=alert(1)>", "[x](http://192.0.2.1)")
 SPIKE: Final = 500.0
 
-TIMEOUT_MS: Final = 60_000
+TIMEOUT_MS: Final = 180_000
 """Chromium that renders in software takes a while on a busy computer."""
 
 _PLOTS: Final = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(plot => plot.chart)"
