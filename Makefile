@@ -39,7 +39,7 @@ test-slow: .venv/installed build/wheelhouse/complete
 COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/test_log.py $(wildcard tests/unit/outputs/test_*.py) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries recorder rtc3d stream) \
-    $(addprefix tests/unit/,subscriber takes) $(addprefix tests/integration/test_,gateway.py streams.py)
+    $(addprefix tests/unit/,subscriber takes) tests/integration/test_streams.py tests/unit/test_gateway.py
 
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
