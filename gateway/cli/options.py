@@ -171,7 +171,6 @@ def checked_take_name(text: str | None) -> str | None:
     """Check that an argument can be the name of a take."""
     if text is None:
         return None
-    from gateway.errors import QueryError
     from gateway.takes.names import check_name
 
     try:

@@ -12,7 +12,7 @@ from rich.text import Text
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.safe_text import safe_text
 from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
-from gateway.takes.reader import is_gateways_channel
+from gateway.takes.reader import DESCRIPTIONS, is_gateways_channel
 from gateway.takes.source_statistics import SourceStatistics
 from gateway.takes.statistics import TakeStatistics
 
@@ -82,7 +82,7 @@ def _components_table(statistics: TakeStatistics, source: SourceStatistics) -> T
     rows = [
         _row(statistics, source, key, [part])
         for key, part in parts.items()
-        if "/" not in key and key not in ("take", "details", "end")
+        if "/" not in key and key not in DESCRIPTIONS
     ]
     if poses:
         rows.insert(len(source.components), _row(statistics, source, _count(len(poses), "pose"), poses))

@@ -92,7 +92,7 @@ def _ends_s(pem: str) -> Iterator[float]:
 
 
 def _end_s(certificate: bytes) -> float:
-    """Return when a certificate ends (RFC 5280, 4.1). Python tells it of peers only."""
+    """Return when a certificate ends (RFC 5280, 4.1). Python's ssl has this for peers only."""
     fields = _elements(_elements(_elements(certificate, 1)[0][1], 1)[0][1], 5)
     fields = fields[fields[0][0] == _VERSION :]  # the version may be absent
     validity = fields[3]  # after serial number, algorithm and issuer

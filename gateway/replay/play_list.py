@@ -7,10 +7,9 @@ from typing import Final, NamedTuple
 
 from gateway.replay.seek_index import SeekIndex, SeekPoint
 from gateway.replay.timeline import ReplayTimeline
-from gateway.takes.reader import FIRST_PLACE, TakeReader
+from gateway.takes.reader import DESCRIPTIONS, FIRST_PLACE, TakeReader
 
 _PARAMETERS: Final = "parameters"
-_DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
 _MAX_CACHED: Final = 10_000
 
 
@@ -37,7 +36,7 @@ class Selection:
 
     def has(self, source: str, key: str) -> bool:
         """Return whether messages of this source and key are selected, wherever they are in the take."""
-        if key in _DESCRIPTIONS or (self.sources is not None and source not in self.sources):
+        if key in DESCRIPTIONS or (self.sources is not None and source not in self.sources):
             return False
         return self.components is None or key == _PARAMETERS or key.partition("/")[0] in self.components
 

@@ -44,6 +44,10 @@ _KEYS: Final[dict[type[Any], str]] = {
 }
 
 
+DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
+"""The keys of messages that are in files only, without numbers."""
+
+
 class TakeMessage(NamedTuple):
     """One message of a take.
 

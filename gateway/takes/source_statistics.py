@@ -18,6 +18,7 @@ from gateway.takes.clock_steps import ClockSteps
 from gateway.takes.component_rows import decode_rows
 from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
 from gateway.takes.description import NO_DETAILS, decoded_details, has_end
+from gateway.takes.reader import DESCRIPTIONS
 
 MAX_LISTED_CHANGES: Final = 100
 """How many changes of the parameters are listed; all are counted."""
@@ -26,7 +27,6 @@ _MAX_VERSIONS: Final = 32
 """How many versions of the parameters are kept to label what follows."""
 _MAX_TEXTS: Final = 20
 _MAX_KEYS: Final = 1000
-_DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
 _HEAD_BYTES: Final = FINGERPRINT_BYTES + PREFIX.size
 
 
@@ -132,14 +132,14 @@ class SourceStatistics:
     def _add_others(self, key: str, messages: list[bytes]) -> None:
         statistics = self.others.setdefault(key, MessageStatistics())
         statistics.num_bytes += sum(map(len, messages))
-        whole = [message for message in messages if len(message) >= _HEAD_BYTES or key in _DESCRIPTIONS]
+        whole = [message for message in messages if len(message) >= _HEAD_BYTES or key in DESCRIPTIONS]
         statistics.malformed += len(messages) - len(whole)
         for message in whole if "/" not in key and key != "clock" else ():
             try:
                 self._describe(key, decode(message))
             except ProtocolError:
                 statistics.malformed += 1
-        if key in _DESCRIPTIONS or key == "parameters":  # repeated in each file, or without numbers
+        if key in DESCRIPTIONS or key == "parameters":  # repeated in each file, or without numbers
             statistics.num_messages += len(whole)
         else:
             heads = np.frombuffer(b"".join([message[8:32] for message in whole]), ">i8").reshape(-1, 3)

@@ -67,7 +67,7 @@ class FileHeader:
 
     def messages(self, name: str, utime: int) -> list[tuple[bytes, bytes]]:
         """Return the first messages of a file, each with its channel."""
-        messages = [*self.description.messages(name, utime)]
+        messages = self.description.messages(name, utime)
         if self.parameters is not None:
             messages.append((self.parameters_channel, published_again(self.parameters, utime)))
         return messages

@@ -70,7 +70,7 @@ async def test_without_a_gateway_all_commands_say_the_same(side: str) -> None:
 
 
 async def test_a_source_that_nobody_serves_is_named_with_those_that_exist(lab: Lab) -> None:
-    """A typing error is told apart from a gateway that does not run."""
+    """A user sees whether a name is mistyped or the gateway does not run."""
     commands = [(side, name) for side in SIDES for name in ("list", "echo")]
     commands += [("zenoh", "top --once"), ("zenoh", "params --timeout 3")]
     ended = await asyncio.gather(

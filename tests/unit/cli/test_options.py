@@ -179,7 +179,7 @@ def test_check_can_print_json(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_value_of_an_option_has_the_status_2(command: str) -> None:
-    """A script can tell its own mistakes from failures, such as a full disk or no gateway."""
+    """A script sees whether it made a mistake, or something failed, such as a full disk."""
     assert run_in_process(*command.split()).returncode == 2
 
 

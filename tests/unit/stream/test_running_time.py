@@ -44,7 +44,7 @@ async def test_the_clock_never_goes_back() -> None:
 
 
 async def test_the_longest_delay_of_the_last_half_minute_is_known() -> None:
-    """It tells a gap that this gateway caused from one that the server caused."""
+    """It shows whether this gateway or the server caused a gap."""
     clock = running_clock()
     await asyncio.sleep(1)
     assert clock.longest_delay_s() == 0
