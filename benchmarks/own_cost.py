@@ -21,12 +21,12 @@ from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workloads import DENSE, Frames
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
-from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState

@@ -14,7 +14,7 @@ import lcm
 import uvloop
 import zenoh
 
-from gateway.outputs.encodings import LCM
+from gateway.messages.decode import LCM
 from gateway.outputs.zenoh.config import zenoh_config
 
 

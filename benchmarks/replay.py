@@ -15,13 +15,12 @@ import rtc3d
 
 from benchmarks.processes import Worker, run_measured
 from benchmarks.report import Goal, Progress, Table
-from gateway.messages.encode import encode_content
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp, encode_content
 from gateway.outputs.lcm.connection import receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from gateway.takes.event_log import encode_event
+from gateway.takes.files.event_log import encode_event
 
 TITLE: Final = "A replay of 4400 messages/s as recorded"
 MAX_LATENESS_MS: Final = 5.0

@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.ros2.message_types import TF_MESSAGE
+from gateway.outputs.ros2.messages import TF_MESSAGE
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import Declared, RosTopic
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component

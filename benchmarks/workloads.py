@@ -9,7 +9,7 @@ import numpy as np
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import PACKET_HEADER
-from gateway.rtc3d_server.frame_builder import FrameBuilder
+from gateway.rtc3d_server.measurement import FrameBuilder
 from gateway.simulator.synthetic import SyntheticScene
 
 _EVENT_US: Final = 500_000

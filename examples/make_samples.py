@@ -17,16 +17,16 @@ import rtc3d
 from walking import WalkingPerson
 
 from gateway.config.settings import MetricsSettings, Settings, SourceSettings
-from gateway.export.formats import export_take
-from gateway.export.job import ExportJob
-from gateway.gateway import Gateway
 from gateway.outputs.registry import settings_type
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.stream.state import StreamState
-from gateway.takes.reader import TakeReader
-from gateway.takes.recording import LogFile
+from gateway.takes.export.formats import export_take
+from gateway.takes.export.job import ExportJob
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.recording import LogFile
 
 SOURCE: Final = "lab"
 NAME: Final = "walk"

@@ -31,10 +31,9 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
-from gateway.rtc3d_server.computed_scene import ComputedScene
+from gateway.rtc3d_server.measurement import ComputedScene
 from gateway.rtc3d_server.scene import SampleNumbers
-from gateway.simulator.force_plates import ForcePlates
-from gateway.simulator.noise import Noise
+from gateway.simulator.bodies import ForcePlates, Noise
 
 Floats = npt.NDArray[np.float64]
 

@@ -27,7 +27,7 @@ _FORKS: Final = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
     [
         *(f"gateway.cli.{module.name}" for module in pkgutil.iter_modules(gateway.cli.__path__)),
-        *("gateway.doctor.all_checks", "gateway.top.app", "zenoh", "tests.command_process"),
+        *("gateway.doctor.all_checks", "gateway.display.top.app", "zenoh", "tests.command_process"),
     ]
 )
 

@@ -8,6 +8,7 @@ import gc
 import itertools
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ import uvloop
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling, Scheduling
 
-from gateway.log import HOLD_S
+from gateway.logs.failures import HOLD_S
 from tests.needs import need
 
 # uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection
@@ -56,6 +57,20 @@ _NEEDS: Final = {
 """For each marker: whether the machine has what it needs, and what to do if not."""
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Take a worker's connection to pytest away from the processes that it forks.
+
+    Otherwise pytest would not notice the end of a worker that crashes, or is ended by its time-out, while one
+    of them lives.
+    """
+    for plugin in config.pluginmanager.get_plugins():
+        if type(plugin).__name__ == "WorkerInteractor":
+            connection = plugin.channel.gateway._io
+            null = os.open(os.devnull, os.O_RDWR)
+            for file in (connection.infile, connection.outfile):
+                os.register_at_fork(after_in_child=partial(os.dup2, null, file.fileno()))
+
+
 def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
     return {"uvloop": uvloop.new_event_loop}
 
@@ -83,4 +98,4 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture
 def no_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make FailureLog report a recovery at the first success: its clock advances by HOLD_S per reading."""
-    monkeypatch.setattr("gateway.log.monotonic", itertools.count(0.0, HOLD_S).__next__)
+    monkeypatch.setattr("gateway.logs.failures.monotonic", itertools.count(0.0, HOLD_S).__next__)

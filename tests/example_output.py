@@ -11,13 +11,20 @@ from typing import Any, Final
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
 from gateway.errors import OutputError
-from gateway.losses import Losses
-from gateway.messages.stamp import Stamp
+from gateway.logs.losses import Losses
+from gateway.messages.decode import TEXT
+from gateway.messages.encode import Stamp
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Answer, Command, Output, QueryService, ServerFile, ServerParameters
-from gateway.outputs.encodings import TEXT
+from gateway.outputs.contract import (
+    Answer,
+    Command,
+    Output,
+    OutputHealth,
+    QueryService,
+    ServerFile,
+    ServerParameters,
+)
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, SubscriptionRequest
-from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.doctor.all_checks import run_checks
-from gateway.findings import Finding, Result
+from gateway.outputs.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests import servers

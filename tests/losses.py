@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from gateway.losses import Loss
+from gateway.logs.losses import Loss
 
 
 def amounts(losses: Iterable[Loss]) -> dict[str, tuple[int, int]]:

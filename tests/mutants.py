@@ -28,10 +28,10 @@ ROOT: Final = Path(__file__).parents[1]
 LEAST_PERCENT: Final = 85
 
 TESTS: Final[dict[str, tuple[str, ...]]] = {
-    "stream": ("unit/stream/test_* unit/test_*source* unit/test_*streams* property/*_clock_*",),
+    "stream": ("unit/stream/test_* unit/service/test_*source* property/*_clock_*",),
     "publish": ("unit/publish/test_* property/*_pacing_*",),
-    "queries": ("unit/queries/test_* unit/test_source*",),
-    "takes": ("unit/takes/test_* property/*takes* property/*_seek_* property/*_components_*",),
+    "queries": ("unit/queries/test_* unit/service/test_source*",),
+    "takes/files": ("unit/takes/files/test_* property/*takes* property/*_seek_* property/*_components_*",),
 } | {
     f"outputs/{name}": (f"unit/outputs/{name}/test_* unit/outputs/test_*", f"contract/test_* -k {name}")
     for name in ("zenoh", "ros2", "rtc3d", "takes", "lcm")

@@ -99,6 +99,11 @@ class FuzzingProxy:
         if self._tasks:
             await asyncio.wait(self._tasks)
 
+    @property
+    def num_connections(self) -> int:
+        """How many clients the proxy has connected to the server."""
+        return len(self._connections)
+
     def cut(self, *, reset: bool = False) -> None:
         """Close all connections between two bytes: with FIN after all sent bytes, or with RST."""
         for connection in list(self._connections):

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import zenoh
 
 from gateway.config.settings import SpoolSettings
-from gateway.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.service.gateway import Gateway
 from tests.configurations import local_settings, local_source
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.running_gateway import running_gateway

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.rtc3d_server.frame_builder import exact_rate
+from gateway.rtc3d_server.measurement import exact_rate
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from tests.takes import START_UTIME, Message, description, frame, parameters, write_take

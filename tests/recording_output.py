@@ -13,14 +13,14 @@ import rtc3d
 from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic
-from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.takes.event_log import Event
-from gateway.takes.reader import TakeReader
-from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
-from gateway.worker_thread import WorkerThread, make_call
+from gateway.takes.files.event_log import Event
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.recording import MAX_QUEUED_BYTES, Recorder
+from gateway.workers import WorkerThread, make_call
 from tests.settable_clock import Clock
 from tests.waiting import wait_until_async
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import FramePublisher, ServerParameters
 from gateway.outputs.ros2.output import Ros2Output
 from gateway.outputs.ros2.settings import Ros2Settings

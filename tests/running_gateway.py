@@ -5,8 +5,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Final
 
-from gateway.gateway import Gateway
-from gateway.monitoring.server import MonitoringServer
+from gateway.service.gateway import Gateway
+from gateway.service.monitoring.server import MonitoringServer
 
 _STOP_TIMEOUT_S: Final = 60.0
 

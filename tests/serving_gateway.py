@@ -4,11 +4,11 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Protocol
 
-from gateway.gateway import Gateway
 from gateway.outputs.contract import Output
 from gateway.outputs.rtc3d.live_server import LiveServer
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from tests.configurations import local_settings, local_source
 from tests.networks import free_port

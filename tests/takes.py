@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import rtc3d
 
-from gateway.messages.encode import encode_message
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp, encode_message
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType, encode_component
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.takes.description import TakeDetails, encode_take_details
-from gateway.takes.event_log import encode_event
+from gateway.takes.files.description import TakeDetails, encode_take_details
+from gateway.takes.files.event_log import encode_event
 
 START_UTIME = 1_700_000_000_000_000
 

@@ -4,8 +4,7 @@ from typing import Any
 
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Output
-from gateway.outputs.status import OutputHealth
+from gateway.outputs.contract import Output, OutputHealth
 
 
 class ToyOutput(Output):

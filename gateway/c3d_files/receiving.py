@@ -1,16 +1,244 @@
-"""The C3D files of one source: taken from its streams in pieces, checked, and passed on to the disk."""
+"""The C3D files of one source: taken from its streams in pieces, checked, and passed on to the disk.
+
+A C3D file has blocks of 512 bytes. The first one is the header: byte 0 is the number, from 1, of the block
+where the parameters begin, byte 1 is the key 0x50.
+"""
 
 import asyncio
+import contextlib
+import math
+import struct
+from collections import deque
 from collections.abc import Callable
-from typing import Final
+from functools import partial
+from typing import Final, NamedTuple
 
-from gateway.c3d_files.format_check import HEAD_BYTES, problem_of_c3d
-from gateway.c3d_files.incoming import IncomingFile
-from gateway.c3d_files.spool import Spool, StoredFile
+from gateway.c3d_files.spool import Spool, StoredFile, UnfinishedFile
 from gateway.errors import SpoolError
+from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.packets import FilePiece
 from gateway.token_bucket import TokenBucket
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
+
+HEAD_BYTES: Final = 2
+PARAMETERS_END_BYTES: Final = 1024 * 1024
+"""The parameters are within these first bytes: they begin in one of 255 blocks and have at most 255."""
+
+_BLOCK_BYTES: Final = 512
+_KEY: Final = 0x50
+_FIRST_PARAMETER_BLOCK: Final = 2
+_DATA_BLOCK_OFFSET: Final = 16
+"""Where the header has the number of the block where the frames begin."""
+_DEC, _BIG_ENDIAN = 85, 86  # of the types of processors; the usual one is 84, little-endian
+_FORMATS: Final = {1: "B", 2: "H", 4: "f"}
+
+
+class _Record(NamedTuple):
+    """A parameter: the number of its group, its name, and where its values are."""
+
+    group: int
+    name: str
+    element_bytes: int
+    values_offset: int
+    num_bytes: int
+
+
+def problem_of_c3d(head: bytes, file_bytes: int) -> str:
+    """Return why a file of ``file_bytes`` is no C3D file; "" if ``head``, its first HEAD_BYTES, is one's."""
+    if file_bytes == 0:
+        return "it is empty"
+    if file_bytes < _BLOCK_BYTES:
+        return f"it has {file_bytes} bytes, and the header of a C3D file has {_BLOCK_BYTES}"
+    if head[1] != _KEY:
+        return "its first bytes are not those of a C3D file"
+    if not _FIRST_PARAMETER_BLOCK <= head[0] <= 1 + file_bytes // _BLOCK_BYTES:
+        return "its parameters would begin outside of it"
+    return ""
+
+
+def problem_of_sizes(head: bytes, file_bytes: int) -> str:
+    """Return which size stated in a C3D file cannot be true; "" if none.
+
+    ``head`` is its first PARAMETERS_END_BYTES. Check it before a reader allocates what it states.
+    """
+    start = (head[0] - 1) * _BLOCK_BYTES
+    if len(head) < start + 4:
+        return "it ends before its parameters"
+    processor = head[start + 3]
+    order = ">" if processor == _BIG_ENDIAN else "<"
+    (data_block,) = struct.unpack_from(f"{order}H", head, _DATA_BLOCK_OFFSET)
+    data_start = max(data_block - 1, 0) * _BLOCK_BYTES
+    stated_end = max(data_start, start + head[start + 2] * _BLOCK_BYTES)
+    end = stated_end if start < stated_end <= file_bytes else file_bytes
+    groups, records = _records(head[:end], start + 4, order)
+    numbers: dict[str, float] = {}
+    for record in records:
+        name = f"{groups.get(record.group, record.group)}:{record.name}"
+        if record.values_offset + record.num_bytes > end:
+            return f"its parameter {safe_text(name)} would have {record.num_bytes} bytes, more than it has"
+        if record.num_bytes == record.element_bytes in _FORMATS and record.values_offset + 4 <= len(head):
+            value_format = order + _FORMATS[record.element_bytes]
+            (numbers[name],) = struct.unpack_from(value_format, head, record.values_offset)
+    rates_hz = numbers.get("ANALOG:RATE", 0.0), numbers.get("POINT:RATE", 0.0)
+    ratio = rates_hz[0] / rates_hz[1] if processor != _DEC and rates_hz[1] > 0 else 1.0
+    samples = ratio if math.isfinite(ratio) else 1.0
+    values = 4 * numbers.get("POINT:USED", 0) + numbers.get("ANALOG:USED", 0) * samples
+    room = max(file_bytes - data_start, 0)
+    if 2 * values > room:
+        return f"each of its frames would have at least {2 * values:.0f} bytes, and it has {room} for all"
+    return ""
+
+
+def _records(head: bytes, position: int, order: str) -> tuple[dict[int, str], list[_Record]]:
+    """Return the names of the groups by their numbers, and all parameters, as far as they can be read."""
+    groups: dict[int, str] = {}
+    records = []
+    while position + 2 <= len(head):
+        length, group = struct.unpack_from("bb", head, position)
+        name = head[position + 2 : position + 2 + abs(length)].decode("latin-1").strip().upper()
+        at = position + 2 + abs(length)
+        if length == 0 or group == 0 or at + 4 > len(head):
+            break
+        (offset,) = struct.unpack_from(f"{order}H", head, at)
+        if group < 0:
+            groups[-group] = name
+        else:
+            element_bytes = abs(struct.unpack_from("b", head, at + 2)[0])
+            sizes = head[at + 4 : at + 4 + head[at + 3]]
+            values_offset = at + 4 + len(sizes)
+            num_bytes = element_bytes * math.prod(sizes)
+            records.append(_Record(group, name, element_bytes, values_offset, num_bytes))
+        if offset == 0:
+            break
+        position = at + offset
+    return groups, records
+
+
+_MIB: Final = 1024 * 1024
+
+
+class IncomingFile:
+    """A C3D file that arrives in pieces; ``thread`` writes them.
+
+    The methods without underscore are called in the event loop, and so is ``on_end``, once: with the file if
+    it was stored, or with the reason why it is lost.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        file_bytes: int,
+        spool: Spool,
+        thread: WorkerThread,
+        on_end: Callable[["IncomingFile", StoredFile | SpoolError], None],
+    ) -> None:
+        self._source = source
+        self._name = f"a C3D file of {file_bytes} bytes from {source}"
+        self._spool = spool
+        self._thread = thread
+        self._on_end = on_end
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[bytes] = deque()  # pieces; the thread takes them out
+        self._num_bytes = 0
+        self._is_ended = False
+        self._unfinished: UnfinishedFile | None = None  # used by the thread only, like _has_failed
+        self._has_failed = False
+
+    def add(self, piece: bytes) -> None:
+        """Have a piece written. If there is no memory for it, the file is lost."""
+        if self._is_ended:
+            return
+        if not self._spool.memory.reserve(self._source, piece):
+            held_mib = self._spool.memory.held_bytes // _MIB
+            self._end(
+                SpoolError(
+                    f"{self._name} is dropped: {held_mib} MiB of C3D files are waiting to be written; "
+                    "is the disk slow, or the server faulty?"
+                )
+            )
+            return
+        self._num_bytes += len(piece)
+        self._waiting.append(piece)
+        self._thread.submit(self._write_next)
+
+    def complete(self) -> None:
+        """Store the file, which is complete, under its name."""
+        self._thread.submit(self._keep)
+
+    def interrupt(self, reason: str) -> None:
+        """Give up the file, because no further piece of it will come."""
+        self._end(SpoolError(f"{self._name} broke off after {self._num_bytes} bytes: {reason}"))
+
+    def give_up_disk(self) -> None:
+        """Give up the file, because the disk does not respond."""
+        self._end(
+            SpoolError(
+                f"{self._name} is dropped: the disk of {self._spool.directory} does not respond; "
+                "check it, and whether it is mounted"
+            )
+        )
+
+    def _end(self, result: StoredFile | SpoolError) -> None:
+        """Report the end of the file, once. If it is lost, free its memory and have it deleted."""
+        if self._is_ended:
+            return
+        self._is_ended = True
+        with contextlib.suppress(IndexError):  # the thread may take the last piece
+            while True:
+                self._spool.memory.release(self._source, self._waiting.popleft())
+        self._thread.submit(self._discard)
+        self._on_end(self, result)
+
+    # In the thread.
+
+    def _write_next(self) -> None:
+        try:
+            piece = self._waiting.popleft()
+        except IndexError:  # the file is lost
+            return
+        try:
+            if self._has_failed:
+                return
+            if self._unfinished is None:
+                self._unfinished = self._spool.begin()
+            self._unfinished.write(piece)
+        except OSError as error:
+            self._fail(error)
+        finally:
+            self._spool.memory.release(self._source, piece)
+
+    def _keep(self) -> None:
+        unfinished = self._unfinished
+        if unfinished is None or self._is_ended:
+            return
+        try:
+            stored = self._spool.keep(self._source, unfinished)
+        except OSError as error:
+            self._fail(error)
+        else:
+            self._unfinished = None
+            self._report(stored)
+
+    def _discard(self) -> None:
+        """Delete the file, unless it was stored."""
+        if self._unfinished is not None:
+            self._unfinished.discard()
+            self._unfinished = None
+
+    def _fail(self, error: OSError) -> None:
+        self._has_failed = True
+        self._discard()
+        self._report(
+            SpoolError(
+                f"{self._name} cannot be stored in {self._spool.directory}: {error.strerror}; "
+                "check spool.directory and the space on it"
+            )
+        )
+
+    def _report(self, result: StoredFile | SpoolError) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the gateway has stopped
+            self._loop.call_soon_threadsafe(partial(self._end, result))
+
 
 _MAX_UNSTORED_FILES: Final = 4
 """How many files of a source may arrive, or wait for the disk, at the same time."""

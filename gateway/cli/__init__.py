@@ -1,1 +1,15 @@
-"""The command line, one module per command."""
+"""The command line: one module per command, and the modules that print its results.
+
+``main`` has the table of commands and imports the module of a command only when it is needed: help and
+completion must be quick. The module of a command therefore has its options and little else, and imports what
+it needs to do its work within the function; ``options`` has the options that several commands share.
+
+- Running: ``run``, ``simulate``, ``demo`` (with ``demo_lab``), ``doctor``, ``config``.
+- Listening: ``list_gateways``, ``echo``, ``top``, ``view``, ``params``. ``found_sources`` finds gateways,
+  ``gateway_clients`` asks them questions on Zenoh and LCM.
+- Takes: ``record``, ``replay``, ``export``, ``take``. ``take_gateway`` asks gateways to start and stop takes,
+  ``take_report`` prints what is in one.
+
+Modules named after a command (``echo_rates``, ``params_output``, ``record_output``, ``replay_run``) do its
+work. The exit statuses are in docs/reference/commands.md.
+"""

@@ -52,9 +52,8 @@ def _take_on_the_line(context: typer.Context) -> Path | None:
 
 
 def _sources_of_take(path: Path) -> list[str]:
-    from gateway.takes.event_log import EventLogReader
-    from gateway.takes.reader import log_paths
-    from gateway.takes.source_names import SourceNames
+    from gateway.takes.files.event_log import EventLogReader
+    from gateway.takes.files.reader import SourceNames, log_paths
 
     events = EventLogReader(log_paths(path)[0]).events()
     return SourceNames(islice(events, _MAX_EVENTS)).names

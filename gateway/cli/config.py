@@ -10,7 +10,7 @@ import typer
 from gateway.cli.options import ConfigOption, ServerOption
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.errors import ConfigError
-from gateway.safe_text import safe_json
+from gateway.logs.safe_text import safe_json
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
 
@@ -71,7 +71,7 @@ def show(config: ConfigOption = None, server: ServerOption = None) -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of configuration files, for editors; same as config/gateway.schema.json."""
-    from gateway.config.schema import schema_text
+    from gateway.config.show import schema_text
     from gateway.outputs.registry import settings_type
 
     print(schema_text(settings_type()), end="")

@@ -16,10 +16,10 @@ from gateway.cli.options import (
     ToolsOption,
     check_exists,
 )
-from gateway.service.log_format import LogLevel, set_up_log
+from gateway.logs.log_format import LogLevel, set_up_log
 
 if TYPE_CHECKING:
-    from gateway.cli.demo_view import ViewProcess
+    from gateway.cli.demo_lab import ViewProcess
     from gateway.rtc3d_server.scene import Scene
 
 
@@ -52,7 +52,7 @@ def demo(
     check_exists("--c3d", c3d)
     import uvloop
 
-    from gateway.cli.demo_view import view_is_installed, view_process
+    from gateway.cli.demo_lab import view_is_installed, view_process
     from gateway.simulator.c3d_scene import C3dScene
     from gateway.simulator.synthetic import SyntheticScene
 
@@ -85,7 +85,7 @@ async def _run(scene: "Scene", seconds: float | None, udpm: bool, view: "ViewPro
 
     from rich.console import Console
 
-    from gateway.demo import run_demo
+    from gateway.cli.demo_lab import run_demo
 
     stop = asyncio.Event()
     if seconds is None:

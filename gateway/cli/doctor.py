@@ -8,8 +8,8 @@ import typer
 
 from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption, check_exists
 from gateway.errors import ConfigError
-from gateway.safe_text import safe_lines
-from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+from gateway.logs.log_format import LogFormat, LogLevel, set_up_log
+from gateway.logs.safe_text import safe_lines
 
 if TYPE_CHECKING:
     from gateway.doctor.report import Report

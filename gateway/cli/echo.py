@@ -49,9 +49,8 @@ def echo(
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
 
     from gateway.cli.echo_messages import Limits, print_messages
-    from gateway.cli.echo_units import Units
+    from gateway.cli.echo_sources import Silence, Units
     from gateway.cli.gateway_queries import exit_with
-    from gateway.cli.silence import Silence
     from gateway.errors import QueryError
     from gateway.outputs.kind import SubscriptionRequest
 

@@ -18,11 +18,11 @@ from rich.live import Live
 from rich.text import Text
 
 from gateway.cli.echo_messages import POLL_S, Limits, Subscribe
-from gateway.cli.silence import Silence
+from gateway.cli.echo_sources import Silence
+from gateway.display.terminal.lists import list_table, write_records
+from gateway.logs.safe_text import safe_json, safe_text
 from gateway.messages.host_time import now_utime
 from gateway.outputs.kind import SubscriptionRequest
-from gateway.safe_text import safe_json, safe_text
-from gateway.terminal.lists import list_table, write_records
 
 WINDOW_S: Final = 10.0
 MIN_WINDOW: Final = 10

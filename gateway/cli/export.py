@@ -9,8 +9,8 @@ import typer
 
 from gateway.cli.options import NoProgressOption, SourceOption
 from gateway.config.words import join_or
-from gateway.export.extensions import EXTENSIONS
-from gateway.safe_text import safe_text
+from gateway.logs.safe_text import safe_text
+from gateway.takes.export.extensions import EXTENSIONS
 
 
 def export(
@@ -35,8 +35,8 @@ def export(
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
     from gateway.cli.export_progress import ExportProgress
-    from gateway.export.formats import export_take
-    from gateway.export.job import ExportJob
+    from gateway.takes.export.formats import export_take
+    from gateway.takes.export.job import ExportJob
 
     job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
     with ExportProgress() if sys.stderr.isatty() and not quiet else nullcontext() as progress:

@@ -1,13 +1,27 @@
-"""The sources that ``list`` and ``echo`` find, with what their gateways report about them."""
+"""The sources that gateways serve, found on Zenoh or LCM, with what the gateways report about them."""
 
+import queue
+import re
+import time
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import rtc3d
+import zenoh
 
-from gateway.errors import ProtocolError
+from gateway.cli.gateway_queries import RETRY_S
+from gateway.errors import OutputError, ProtocolError
+from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
-from gateway.safe_text import safe_text
+from gateway.messages.topics import lcm_channel, zenoh_key
+from gateway.outputs.discovery import DISCOVERY_S, missing_source
+from gateway.outputs.kind import SubscriptionRequest
+from gateway.outputs.lcm.connection import open_lcm, receiving_url
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
+from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
+from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, open_zenoh, served_sources
 from gateway.stream.status_text import message_texts
 
 MAX_SOURCES: Final = 1000
@@ -137,3 +151,142 @@ def _stream(text: tuple[str, str], stream: rtc3d.stream_status_t) -> FoundStream
     return FoundStream(
         *text, safe_text(stream.state), safe_text(stream.problem), stream.frame_rate_hz, stream.tries
     )
+
+
+_ANSWER_S: Final = 2.0
+"""How long a gateway may take to reply with its status."""
+
+
+def find_on_zenoh(session: zenoh.Session, prefix: str, source: str | None = None) -> FoundSources:
+    """Return the sources of all gateways that are found, or only ``source``."""
+    served = _served(session, prefix)
+    wanted = [name for name in served if source in {None, name}]
+    found = FoundSources()
+    for name in served:
+        found.hear(name)
+    received: set[tuple[str, str]] = set()
+    end_s = time.monotonic() + _ANSWER_S
+    while wanted:
+        _query(session, zenoh_key(prefix, source or "*", "status"), prefix, found, received)
+        silent = set(wanted).difference(name for name, _ in received)
+        if not silent or time.monotonic() >= end_s:
+            found.add_silent(sorted(silent))
+            break
+        time.sleep(RETRY_S)
+    return found
+
+
+def _served(session: zenoh.Session, prefix: str) -> list[str]:
+    """Return the sources that are served; gateways are found one after the other."""
+    end_s = time.monotonic() + DISCOVERY_S
+    served: list[str] = []
+    while True:
+        left_s = end_s - time.monotonic()
+        found = sorted({*served, *served_sources(session, prefix, max(1.0, left_s))})
+        if found == served != [] or left_s <= 0:
+            return found
+        served = found
+        time.sleep(RETRY_S)
+
+
+def _query(
+    session: zenoh.Session, selector: str, prefix: str, found: FoundSources, received: set[tuple[str, str]]
+) -> None:
+    """Query every status once. Errors are ignored: the query is repeated."""
+    # NONE keeps the replies of all gateways: several may serve sources of the same name.
+    for reply in session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=_ANSWER_S):
+        if reply.ok is None:
+            continue
+        name = str(reply.ok.key_expr).removeprefix(f"{prefix}/").partition("/")[0]
+        gateway = "" if reply.replier_id is None else str(reply.replier_id.zid)
+        if (name, gateway) not in received:
+            received.add((name, gateway))
+            found.add_status(reply.ok.payload.to_bytes(), name, gateway)
+
+
+_LISTEN_S: Final = 1.5
+"""Every gateway sends a status within this time. If none is heard, this listens for DISCOVERY_S."""
+
+_READ_S: Final = 1.0
+"""How long to read what has arrived, if it is much."""
+
+_MAX_WAITING: Final = 10_000
+
+_CHANNEL: Final = re.compile("_STATUS(_[0-9]+)?$")
+"""The end of a channel. Another source with a similar name has a number behind it (topics.unique_name)."""
+
+
+def find_on_lcm(url: str, prefix: str, source: str | None = None) -> FoundSources:
+    """Return the sources that are heard on ``url``, or only ``source``. Raises OutputError."""
+    found = FoundSources()
+    num_unread = 0
+    received: queue.Queue[tuple[str, bytes]] = queue.Queue(_MAX_WAITING)
+
+    def receive(channel: str, message: bytes) -> None:
+        nonlocal num_unread
+        try:
+            received.put_nowait((channel, message))
+        except queue.Full:
+            num_unread += 1
+
+    subscriber = LcmSubscriber(
+        open_lcm(receiving_url(url)), f"{re.escape(prefix)}_.+{_CHANNEL.pattern}", receive
+    )
+    start_s = time.monotonic()
+    try:
+        while (left_s := start_s + (_LISTEN_S if found.sources else DISCOVERY_S) - time.monotonic()) > 0:
+            with suppress(queue.Empty):
+                _add(found, prefix, source, *received.get(timeout=left_s))
+    finally:
+        subscriber.close()
+    while not received.empty() and time.monotonic() < start_s + DISCOVERY_S + _READ_S:
+        _add(found, prefix, source, *received.get())
+    found.num_left_out += received.qsize() + num_unread
+    return found
+
+
+def _add(found: FoundSources, prefix: str, wanted: str | None, channel: str, message: bytes) -> None:
+    """Add the source of a status, unless another is wanted, or it has a longer prefix: MOCAP_HALL."""
+    if not found.takes(message):
+        return
+    source = read_status(message, "")
+    if not source.name:
+        source = source._replace(
+            name=safe_text(_CHANNEL.split(channel)[0].removeprefix(f"{prefix}_").lower())
+        )
+    channels = lcm_channel(prefix, source.name)
+    if channel.startswith(channels):
+        found.hear(source.name)
+        if wanted is None or channels == lcm_channel(prefix, wanted):
+            found.add(source)
+
+
+def find_sources(output: str, request: SubscriptionRequest) -> tuple[FoundSources, str]:
+    """Return what is found on an output, zenoh or lcm, and why nothing is; "" if something is.
+
+    The component of ``request`` does not matter. Raises OutputError if LCM does not open.
+    """
+    find = _find_on_lcm if output == "lcm" else _find_on_zenoh
+    found, no_gateway = find(request)
+    if not found.heard:
+        return found, no_gateway
+    wanted = () if request.source is None or found.sources else (request.source,)
+    return found, missing_source(wanted, found.heard)
+
+
+def _find_on_zenoh(request: SubscriptionRequest) -> tuple[FoundSources, str]:
+    prefix = request.prefix or DEFAULT_ZENOH_PREFIX
+    try:
+        session = open_zenoh(request.address, request.config)
+    except OutputError as error:
+        return FoundSources(), str(error)
+    try:
+        return find_on_zenoh(session, prefix, request.source), no_gateway_on_zenoh(prefix, (), ())
+    finally:
+        session.close()
+
+
+def _find_on_lcm(request: SubscriptionRequest) -> tuple[FoundSources, str]:
+    prefix, url = request.prefix or DEFAULT_LCM_PREFIX, effective_lcm_url(request.address)
+    channels = prefix if request.source is None else lcm_channel(prefix, request.source)
+    return find_on_lcm(url, prefix, request.source), no_gateway_on_lcm(channels, url)

@@ -8,8 +8,8 @@ from typing import Final
 import typer
 
 from gateway.errors import QueryError
+from gateway.logs.safe_text import safe_lines
 from gateway.outputs.discovery import DISCOVERY_S
-from gateway.safe_text import safe_lines
 
 EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}
 """Exit status by the code of the first problem; 1 for every other code."""

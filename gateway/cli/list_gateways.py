@@ -35,7 +35,7 @@ def list_gateways(
 
     from rich.console import Console
 
-    from gateway.cli.find_sources import find_sources
+    from gateway.cli.found_sources import find_sources
     from gateway.cli.gateway_queries import exit_with
     from gateway.cli.list_output import notes, sources_json, write_sources
     from gateway.errors import QueryError

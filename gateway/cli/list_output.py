@@ -11,9 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
-from gateway.safe_text import safe_json
+from gateway.display.terminal.lists import list_table, write_records
+from gateway.logs.safe_text import safe_json
 from gateway.stream.status_text import Level, source_text, stream_level
-from gateway.terminal.lists import list_table, write_records
 
 _COLOURS: Final = {Level.GOOD: "green", Level.WAITING: "yellow", Level.BAD: "red"}
 _NARROW: Final = range(80, 110)

@@ -16,12 +16,12 @@ from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
 from gateway.errors import QueryError
+from gateway.logs.log_format import LogFormat, LogLevel
 from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
-from gateway.service.log_format import LogFormat, LogLevel
 
 if TYPE_CHECKING:
-    from gateway.takes.description import TakeDetails
+    from gateway.takes.files.description import TakeDetails
 
 _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
 """The values of ``--component`` for commands that read or write recordings."""
@@ -171,7 +171,7 @@ def checked_take_name(text: str | None) -> str | None:
     """Check that an argument can be the name of a take."""
     if text is None:
         return None
-    from gateway.takes.names import check_name
+    from gateway.takes.files.new_file import check_name
 
     try:
         check_name(text)
@@ -286,7 +286,7 @@ def check_transport(
 
 def checked_details(subject: str | None, session: str | None, note: str | None) -> "TakeDetails":
     """Return who and what a recording is about. Raises BadParameter."""
-    from gateway.takes.description import TakeDetails
+    from gateway.takes.files.description import TakeDetails
 
     try:
         return TakeDetails(subject or "", session or "", note or "").checked()

@@ -59,9 +59,8 @@ def params(
         raise typer.BadParameter(f"unknown section {min(unknown)!r}; known sections: {', '.join(SECTIONS)}")
 
     from gateway.cli.gateway_queries import exit_with
-    from gateway.cli.params_lcm import query_lcm
     from gateway.cli.params_output import write_replies
-    from gateway.cli.params_zenoh import query_zenoh
+    from gateway.cli.params_queries import query_lcm, query_zenoh
     from gateway.outputs.lcm.settings import effective_lcm_url
     from gateway.outputs.zenoh.subscriber import open_zenoh
 

@@ -22,12 +22,12 @@ from gateway.cli.options import (
     check_transport,
     checked_details,
 )
-from gateway.cli.stop_signals import StopSignals
+from gateway.cli.run import StopSignals
 
 if TYPE_CHECKING:
-    from gateway.cli.record_progress import RecordProgress
-    from gateway.recorder.take_recording import TakeRecording
+    from gateway.cli.record_output import RecordProgress
     from gateway.subscriber.subscribe import GatewaySubscriber
+    from gateway.takes.recorder.take_recording import TakeRecording
 
 _TICK_S: Final = 0.1
 
@@ -64,13 +64,11 @@ def record(
     """
     check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
     details = checked_details(subject, session, note)
-    from gateway.cli.record_progress import RecordProgress
-    from gateway.cli.record_summary import print_summary
-    from gateway.recorder.file_sink import FileSink
-    from gateway.recorder.take_recording import TakeRecording
-    from gateway.recorder.target import Target
+    from gateway.cli.record_output import RecordProgress, print_summary
     from gateway.subscriber.lcm_subscriber import START_S
     from gateway.subscriber.subscribe import Transport, close_in_time, subscribe_all
+    from gateway.takes.recorder.take_recording import TakeRecording
+    from gateway.takes.recorder.target import FileSink, Target
 
     stop = StopSignals(_end_at_once)
     target = Target(file)

@@ -18,8 +18,8 @@ from gateway.cli.options import (
     ZenohConfigOption,
     checked_key_prefix,
 )
-from gateway.replay.timeline import MAX_GAP_S
-from gateway.service.log_format import LogLevel, set_up_log
+from gateway.logs.log_format import LogLevel, set_up_log
+from gateway.takes.replay.timeline import MAX_GAP_S
 
 _SWITCH_S: Final = 0.0005
 """How long another thread that runs Python, such as that of the progress, may keep the replay waiting."""
@@ -98,9 +98,9 @@ def replay(
     import uvloop
 
     from gateway.cli.replay_run import ReplayRun
-    from gateway.replay.destinations import ZenohAddress, lcm_destination, zenoh_destination
-    from gateway.replay.play_list import Selection
-    from gateway.takes.reader import TakeReader
+    from gateway.takes.files.reader import TakeReader
+    from gateway.takes.replay.play_list import Selection
+    from gateway.takes.replay.replay import ZenohAddress, lcm_destination, zenoh_destination
 
     set_up_log(LogLevel.WARNING)
     sys.setswitchinterval(_SWITCH_S)

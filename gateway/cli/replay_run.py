@@ -1,25 +1,179 @@
-"""One run of ``replay``: the player, the keys, the progress, the report."""
+"""One run of ``replay``: the player, the keys, the progress, and the report."""
 
 import asyncio
 import contextlib
 import signal
+import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from typing import Final
 
 from rich.console import Console
+from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.replay_report import Progress, jump_text, print_report
-from gateway.replay.destinations import Destination
-from gateway.replay.play_list import Selection
-from gateway.replay.player import Player
-from gateway.replay.publication import Publication
-from gateway.replay.replay import open_publication, playing
-from gateway.replay.take_length import take_length_us
-from gateway.replay.timeline import Jump
-from gateway.takes.reader import TakeReader
-from gateway.terminal.keyboard import keys
+from gateway.display.terminal.screen import keys
+from gateway.logs.safe_text import safe_text
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.replay.play_list import Selection, take_length_us
+from gateway.takes.replay.player import Player
+from gateway.takes.replay.publication import MAX_SOURCES, MAX_TOPICS, Publication
+from gateway.takes.replay.replay import Destination, open_publication, playing
+from gateway.takes.replay.timeline import Jump, time_text
+
+LINE_S: Final = 5.0
+"""How often a line is printed if stderr is no terminal."""
+
+_MAX_LISTED: Final = 10
+_ORDER: Final = (*(component.key for component in WIRE_ORDER), "6d/tool", "status", "clock", "parameters")
+
+
+def jump_text(jump: Jump) -> str:
+    """Return a line that says what happens where the time of the messages jumps."""
+    where, source = time_text(jump.position_us), safe_text(jump.source)
+    if not jump.is_skipped:
+        return f"{where}  nothing was recorded for {jump.jump_us / 1e6:.1f} s"
+    length = time_text(abs(jump.jump_us))
+    if jump.jump_us < 0:
+        return f"{where}  the time of {source} goes back by {length}: its clock was set; the replay goes on"
+    return (
+        f"{where}  nothing was recorded for {length}, or the clock of {source} was set; "
+        "the replay goes on at once"
+    )
+
+
+class Progress:
+    """One line on ``console`` that is kept up to date; without a terminal, one every few seconds.
+
+    If it is ``quiet``, there is none.
+    """
+
+    def __init__(
+        self, console: Console, player: Player, length_us: int | None, hints: str, *, quiet: bool
+    ) -> None:
+        self._player = player
+        self._length_us = length_us
+        self._hints = hints
+        self._console = console
+        self._quiet = quiet
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._before = time.monotonic(), player.position_us, 0, 0
+        self._line_s = time.monotonic()
+        if console.is_terminal and not quiet:
+            self._live.start()
+
+    def show(self) -> None:
+        """Show where the replay is. Call it a few times a second."""
+        if self._quiet:
+            return
+        if self._console.is_terminal:
+            self._live.update(Text(self._text(), no_wrap=True, overflow="ellipsis"), refresh=True)
+        elif time.monotonic() - self._line_s >= LINE_S:
+            self._line_s = time.monotonic()
+            self._console.print(self._text(), soft_wrap=True, highlight=False)
+
+    def close(self) -> None:
+        """Remove the line."""
+        self._live.stop()
+
+    def _text(self) -> str:
+        player = self._player
+        now_s, position_us, num_messages = time.monotonic(), player.position_us, player.num_messages
+        before_s, before_us, before_messages, before_passes = self._before
+        self._before = now_s, position_us, num_messages, player.num_passes
+        passed_s = max(now_s - before_s, 1e-6)
+        parts = [time_text(position_us)]
+        if self._length_us:
+            parts[0] += f" of {time_text(self._length_us)}"
+        if player.num_passes:
+            parts.append(f"repetition {player.num_passes}")
+        if player.is_paused:
+            parts.append("paused")
+        else:
+            if position_us >= before_us and player.num_passes == before_passes:
+                parts.append(f"{(position_us - before_us) / 1e6 / passed_s:,.2f}×")
+            parts.append(f"{(num_messages - before_messages) / passed_s:,.0f} messages/s")
+            if player.lateness.num_messages:
+                parts.append(f"late by {1e3 * player.lateness.quantile_s(0.99):.1f} ms (p99)")
+        if self._hints:
+            parts.append(self._hints)
+        return "  ".join(parts)
+
+
+def print_report(
+    console: Console, notes: Console, player: Player, publication: Publication, reader: TakeReader
+) -> None:
+    """Print the messages per component on ``console``, and on ``notes`` what was left out and why."""
+    outputs = sorted({refusal.output for refusal in publication.refusals})
+    table = Table()
+    for heading in ("component", "messages", *(f"refused by {output}" for output in outputs)):
+        table.add_column(heading, justify="left" if heading == "component" else "right")
+    for key in sorted(publication.num_messages, key=_place):
+        refused: Counter[str] = Counter()
+        for refusal, count in publication.refusals.items():
+            if refusal.key == key:
+                refused[refusal.output] += count
+        cells = [f"{refused[output]:,}" for output in outputs]
+        table.add_row(key, f"{publication.num_messages[key]:,}", *cells)
+    console.print(table)
+    total, seconds = publication.num_messages.total(), player.seconds
+    text = f"{total:,} messages in {seconds:.1f} s ({total / max(seconds, 1e-6):,.0f} messages/s)"
+    late = player.lateness
+    if late.num_messages:
+        p50, p99 = late.quantile_s(0.5), late.quantile_s(0.99)
+        text += (
+            f"; late by {1e3 * p50:.1f} ms (p50), {1e3 * p99:.1f} ms (p99), {1e3 * late.max_s:.1f} ms at most"
+        )
+    console.print(text, highlight=False, soft_wrap=True)
+    for note in _notes(player, publication, reader):
+        notes.print(Text(note), soft_wrap=True)
+
+
+def _place(key: str) -> tuple[int, str]:
+    return (_ORDER.index(key) if key in _ORDER else len(_ORDER)), key
+
+
+def _notes(player: Player, publication: Publication, reader: TakeReader) -> list[str]:
+    notes = [
+        f"{refusal.output} did not take {count:,} messages of {refusal.key} ({refusal.cause})"
+        for refusal, count in publication.refusals.items()
+    ]
+    if player.stalled_s:
+        notes.append(
+            f"the replay stood still for {player.stalled_s:.1f} s, because the process was stopped, or the "
+            "disk or an output did not respond; it did not catch up"
+        )
+    notes += [
+        f"the take has no parameters of {safe_text(source)} at the beginning, so no labels and units"
+        for source in sorted(publication.without_parameters)
+    ]
+    notes += [
+        f"{count:,} messages of {safe_text(source)} are damaged and were left out"
+        for source, count in publication.num_unreadable.items()
+    ]
+    if publication.num_surplus:
+        notes.append(
+            f"{publication.num_surplus:,} messages were left out, because the take has more than "
+            f"{MAX_SOURCES} sources or {MAX_TOPICS} keys"
+        )
+    if reader.unknown:
+        channels = [safe_text(channel) for channel, _ in reader.unknown.most_common(_MAX_LISTED)]
+        more = ", …" if len(reader.unknown) > _MAX_LISTED else ""
+        notes.append(
+            f"{reader.unknown.total():,} messages of other programs or versions were left out, on "
+            f"{', '.join(channels)}{more}"
+        )
+    notes += [
+        f"{log.path} is damaged: {log.damaged_bytes:,} bytes in {log.num_damaged:,} places were left out"
+        for log in reader.logs
+        if log.damaged_bytes
+    ]
+    notes += [f"left out: {safe_text(problem)}" for problem in reader.empty_files.values()]
+    return notes
+
 
 _SEEK_US: Final = 10_000_000
 _SHOW_S: Final = 0.25

@@ -2,8 +2,12 @@
 
 import gc
 import logging
+import os
+import select
 import signal
 import sys
+from collections.abc import Callable
+from types import FrameType
 from typing import Final
 
 from gateway.cli.options import (
@@ -15,8 +19,35 @@ from gateway.cli.options import (
     VerboseOption,
     chosen_log_level,
 )
-from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+from gateway.logs.log_format import LogFormat, LogLevel, set_up_log
 from gateway.service.process_end import end_at_once
+
+
+class StopSignals:
+    """Waits for Ctrl-C, SIGTERM or SIGHUP; the second one calls ``end_at_once``, which ends the process.
+
+    A threading.Event cannot be set in a signal handler: the handler may interrupt its ``wait`` while that
+    holds the lock that ``set`` needs. A pipe has no lock. Create it in the main thread.
+    """
+
+    def __init__(self, end_at_once: Callable[[int], object]) -> None:
+        self._end_at_once = end_at_once
+        self._is_set = False
+        self._reading, self._writing = os.pipe()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup, and shells for `&`
+                signal.signal(number, self._handle)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the first signal; return whether it has come."""
+        return bool(select.select([self._reading], [], [], timeout_s)[0])
+
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
+        if self._is_set:
+            self._end_at_once(number)
+        self._is_set = True
+        os.write(self._writing, b"\0")
+
 
 logger = logging.getLogger(__name__)
 
@@ -40,8 +71,8 @@ def run(
     import uvloop
 
     from gateway.cli.configuration import chosen_file, configuration_from_options
+    from gateway.logs.log_format import LogLimit
     from gateway.service.daemon import serve
-    from gateway.service.log_limit import LogLimit
 
     limit = LogLimit()
     set_up_log(level, log_format, limit)

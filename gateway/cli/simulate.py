@@ -27,17 +27,16 @@ from gateway.cli.options import (
     chosen_log_level,
 )
 from gateway.cli.run import SWITCH_INTERVAL_S
+from gateway.logs.log_format import LogFormat, LogLevel, set_up_log
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
-from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 
 if TYPE_CHECKING:
-    from gateway.simulator.scenario import Scenario
-    from gateway.simulator.simulator import Simulator
+    from gateway.simulator.simulator import Scenario, Simulator
 
 
 def _list_faults(context: typer.Context, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
-        from gateway.simulator.faults.kinds import describe_kinds
+        from gateway.simulator.faults.control import describe_kinds
 
         print(describe_kinds())
         raise typer.Exit
@@ -118,10 +117,9 @@ def simulate(
 
     from gateway.rtc3d_server.scene import Scene
     from gateway.simulator.c3d_scene import C3dScene
-    from gateway.simulator.faults.kinds import parse_fault
-    from gateway.simulator.recorded.take_scene import TakeScene
-    from gateway.simulator.scenario import Scenario, load_scenario
-    from gateway.simulator.simulator import Simulator
+    from gateway.simulator.faults.control import parse_fault
+    from gateway.simulator.simulator import Scenario, Simulator, load_scenario
+    from gateway.simulator.take_scene import TakeScene
 
     set_up_log(level, log_format)
     scene_options: dict[str, float] = {

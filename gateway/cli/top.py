@@ -22,11 +22,11 @@ from gateway.cli.options import (
     check_transport,
 )
 from gateway.errors import QueryError
-from gateway.safe_text import safe_lines, safe_text
-from gateway.service.log_format import LogLevel, set_up_log
+from gateway.logs.log_format import LogLevel, set_up_log
+from gateway.logs.safe_text import safe_lines, safe_text
 
 if TYPE_CHECKING:
-    from gateway.live.live_data import LiveData
+    from gateway.display.live.live_data import LiveData
     from gateway.subscriber.subscribe import GatewaySubscriber, Transport
 
 _MAX_TITLE: Final = 60
@@ -63,7 +63,7 @@ def top(
 
 
 def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: bool) -> None:
-    from gateway.live.live_data import LiveData
+    from gateway.display.live.live_data import LiveData
     from gateway.subscriber.subscribe import close_in_time, subscribe_all
 
     is_shown = not (is_once or as_json) and has_screen(sys.stdout, os.environ)
@@ -105,9 +105,8 @@ class _Notices(logging.Handler):
 
 
 def _show(live: "LiveData", subscriber: "GatewaySubscriber", notices: "deque[str]", title: str) -> None:
-    from gateway.terminal.keyboard import Keyboard
-    from gateway.terminal.screen import Screen
-    from gateway.top.app import App
+    from gateway.display.terminal.screen import Keyboard, Screen
+    from gateway.display.top.app import App
 
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored by nohup
         signal.signal(signal.SIGHUP, signal.default_int_handler)
@@ -119,8 +118,8 @@ def _show(live: "LiveData", subscriber: "GatewaySubscriber", notices: "deque[str
 def _print(
     live: "LiveData", subscriber: "GatewaySubscriber", wanted: list[str], *, is_once: bool, as_json: bool
 ) -> None:
-    from gateway.terminal.screen import has_colours
-    from gateway.top.reports import (
+    from gateway.display.terminal.screen import has_colours
+    from gateway.display.top.reports import (
         json_line,
         missing_sources,
         print_json_lines,

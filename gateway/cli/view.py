@@ -20,15 +20,15 @@ from gateway.cli.options import (
     check_transport,
     checked_host,
 )
-from gateway.cli.stop_signals import StopSignals
+from gateway.cli.run import StopSignals
+from gateway.logs.safe_text import safe_text
 from gateway.outputs.listen_address import is_loopback
-from gateway.safe_text import safe_text
 
 if TYPE_CHECKING:
-    from gateway.live.live_data import LiveData
+    from gateway.display.live.live_data import LiveData
+    from gateway.display.view.server import ViewServer
+    from gateway.display.view.viewer import Viewer
     from gateway.subscriber.subscribe import GatewaySubscriber, Transport
-    from gateway.view.server import ViewServer
-    from gateway.view.viewer import Viewer
 
 VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
@@ -86,10 +86,10 @@ def _live_data(
     transport: "Transport", sources: Sequence[str], server: "ViewServer"
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Subscribe, and provide a viewer of what arrives."""
-    from gateway.live.live_data import LiveData
+    from gateway.display.live.live_data import LiveData
+    from gateway.display.view.server import RunningTakes
+    from gateway.display.view.viewer import Viewer
     from gateway.subscriber.subscribe import close_in_time, subscribe_all
-    from gateway.view.running_takes import RunningTakes
-    from gateway.view.viewer import Viewer
 
     live = LiveData()
     subscriber = subscribe_all(transport, sources, None, live)
@@ -113,9 +113,8 @@ def _take(
     path: Path, sources: Sequence[str], server: "ViewServer"
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Open a take, and provide a viewer that plays it."""
-    from gateway.live.live_data import LiveData
-    from gateway.view.playback import Playback
-    from gateway.view.viewer import Viewer
+    from gateway.display.live.live_data import LiveData
+    from gateway.display.view.viewer import Playback, Viewer
 
     live = LiveData()
     playback = Playback(path, sources, live)
@@ -129,7 +128,7 @@ def _take(
 def _open_server(host: str, port: int) -> "ViewServer":
     """Return the server of the page. Raises ViewError."""
     try:
-        from gateway.view.server import open_server
+        from gateway.display.view.server import open_server
     except ImportError as error:
         if not (error.name or "").startswith("viser"):
             raise
@@ -144,7 +143,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
 
 def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     """Print where the page is, and open it. A computer without a browser is no error."""
-    from gateway.view.server import address_of
+    from gateway.display.view.server import address_of
 
     address = address_of(host, port)
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)

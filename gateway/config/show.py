@@ -1,4 +1,4 @@
-"""The effective configuration as YAML, with the origin of each value: a file, a variable, a default."""
+"""The effective configuration as YAML with the origin of each value, and the JSON schema for editors."""
 
 import json
 import math
@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import yaml
+from pydantic.json_schema import GenerateJsonSchema
 
 from gateway.config.loading import Configuration
 from gateway.config.secrets import mask_secrets
@@ -110,3 +111,19 @@ def _flow(value: Any) -> str:
         return json.dumps(value)
     text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=math.inf)
     return text.removesuffix("...\n").strip()
+
+
+_DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+
+
+class _WithoutTitles(GenerateJsonSchema):
+    """Omits the titles of keys, which only repeat the key."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002 - no key has one
+        return False
+
+
+def schema_text(model: type[Settings]) -> str:
+    """Return the JSON schema of ``model``, the content of ``config/gateway.schema.json``."""
+    schema = model.model_json_schema(schema_generator=_WithoutTitles)
+    return json.dumps({"$schema": _DIALECT, **schema, "title": "RTC3D gateway"}, indent=2) + "\n"

@@ -1,11 +1,12 @@
-"""What the items of a component are called, and their units and rates, from the server's parameters (§6)."""
+"""What the server's parameters (§6) call the items of a component, their units and rates, and its events."""
 
-from collections.abc import Iterable
-from typing import Final, NamedTuple, TypeVar
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import EventDefinition, EventParameter, Parameters
 
 _Value = TypeVar("_Value")
 
@@ -121,3 +122,90 @@ def _unique_labels(labels: Iterable[str], noun: str, num_items: int) -> tuple[st
         numbers[base] = number
         names[name] = None
     return tuple(names)[-num_items:] if num_items else ()
+
+
+def fitting_labels(
+    labels: Sequence[str], fit: Callable[[str], str], max_bytes: int, noun: str
+) -> tuple[str, ...]:
+    """Return labels after ``fit``, of at most ``max_bytes`` in UTF-8 and each different.
+
+    An empty one is called by its position, such as "marker 3". One that another item has already gets _2,
+    _3, ….
+    """
+    fitted: dict[str, None] = {}
+    numbers: dict[str, int] = {}
+    for position, label in enumerate(labels, start=1):
+        base = cut(fit(label), max_bytes) or fit(f"{noun} {position}")
+        name, number = base, numbers.get(base, 1)
+        while name in fitted:
+            number += 1
+            suffix = f"_{number}"
+            name = cut(base, max_bytes - len(suffix)) + suffix
+        numbers[base] = number
+        fitted[name] = None
+    return tuple(fitted)
+
+
+def printable(text: str) -> str:
+    """Return a text with "_" in place of each character that is not printable."""
+    return "".join(character if character.isprintable() else "_" for character in text).strip()
+
+
+def cut(text: str, max_bytes: int) -> str:
+    """Return a text of at most ``max_bytes`` in UTF-8, cut between two characters."""
+    return text.encode(errors="replace")[:max_bytes].decode(errors="ignore").strip()
+
+
+UNUSED: Final = -1
+"""An event's parameter that is not used (0xFFFFFFFF)."""
+
+MAX_EVENT_AGE_US: Final = 1_000_000
+"""An event's own time stamp is used if it is as near as this to that of its frame."""
+
+
+class EventText(NamedTuple):
+    """What an event is called, and the names and values of its parameters, such as "State" and "ON"."""
+
+    label: str
+    values: tuple[tuple[str, str], ...]
+
+    @property
+    def description(self) -> str:
+        """All parameters, such as "Button id number: 3; ON/OFF state: ON"."""
+        return "; ".join(f"{name}: {value}" for name, value in self.values)
+
+
+def event_text(parameters: Parameters, item: Any) -> EventText:
+    """Return the texts of one event, an item with the fields of LONG_EVENT."""
+    definition = _definition(parameters, int(item["id"]))
+    values = [int(item[name]) for name in ("param1", "param2", "param3")]
+    described = definition.parameters if definition else ()
+    found = []
+    for index, value in enumerate(values):
+        if index < len(described):
+            name = described[index].description or f"param{index + 1}"
+            if value != UNUSED:
+                found.append((name, _value(described[index], value)))
+        elif value != UNUSED:
+            found.append((f"param{index + 1}", str(value)))
+    label = definition.label.strip() if definition else ""
+    return EventText(label or f"event {int(item['id'])}", tuple(found))
+
+
+def _definition(parameters: Parameters, number: int) -> EventDefinition | None:
+    definitions = parameters.events.events if parameters.events else ()
+    return next((found for found in definitions if event_number(found.id) == number), None)
+
+
+def _value(parameter: EventParameter, value: int) -> str:
+    """Return a parameter's value as its type (int, float or 4 characters), or the label that it has."""
+    data = struct.pack(">i", value)
+    match parameter.type.strip().lower():
+        case "float":
+            text = f"{struct.unpack('>f', data)[0]:.9g}"
+        case "string":
+            text = data.decode("latin-1").rstrip("\0 ")
+        case _:
+            text = str(value)
+    labels = {expected.value.strip(): expected.label.strip() for expected in parameter.expected_values}
+    return labels.get(text) or text

@@ -6,7 +6,7 @@ from typing import Final
 from gateway.config.settings import SourceSettings
 from gateway.config.transform import RollPitchYaw
 from gateway.messages.coordinate_frame import CoordinateFrame, Quaternion, product
-from gateway.messages.tool_pose import metres_per_unit
+from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import Parameters
 
 _Y_UP_TO_Z_UP: Final[Quaternion] = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))

@@ -1,19 +1,63 @@
 """All checks, layer by layer, so that a fault is found before its consequences."""
 
-from collections.abc import AsyncIterator, Iterator, Mapping
+import time
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from functools import partial
+from typing import Final
 
 from gateway.config.settings import OutputSettings, Settings
-from gateway.doctor.clock_check import check_clock
+from gateway.doctor.computer_checks import check_clock
 from gateway.doctor.gateway_checks import CHECKS as GATEWAY_CHECKS
-from gateway.doctor.gateway_checks import check_gateway
-from gateway.doctor.output_checks import check_output
-from gateway.doctor.running_gateway import HealthReport, address_text, read_health
+from gateway.doctor.gateway_checks import HealthReport, address_text, check_gateway, read_health
 from gateway.doctor.source_checks import CHECKS, SourceChecks
 from gateway.errors import ConfigError
-from gateway.findings import NO_CONFIGURATION, Finding, MessageLoad, Subject
+from gateway.outputs.findings import NO_CONFIGURATION, Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.kind import OPENS, OutputKind
 from gateway.outputs.registry import OUTPUTS
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
+
+_POLL_S: Final = 0.05
+
+
+def check_output(
+    kind: OutputKind,
+    settings: OutputSettings,
+    sources: Sequence[str],
+    loads: Sequence[MessageLoad],
+    seconds: float,
+) -> list[Finding]:
+    """Run the checks of one output; blocks for about ``seconds``.
+
+    ``sources`` are the names of all sources, ``loads`` the messages that they make.
+    """
+    if not settings.enabled:
+        subject = Subject(kind.name)
+        return [subject.disabled(check) for check in kind.checks]
+    if kind.run_checks is not None:
+        return kind.run_checks(settings, sources, loads, seconds)
+    return [_check_opens(kind, settings, seconds)]
+
+
+def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> Finding:
+    """Check that the output opens, as in the gateway, within ``seconds``; then close it."""
+    subject = Subject(kind.name)
+    default_remedy = f"Correct {kind.name} in the configuration."
+    try:
+        output = kind.create(settings)
+    except ConfigError as error:
+        return subject.failing(OPENS, str(error), default_remedy)
+    output.start()
+    deadline_s = time.monotonic() + seconds
+    while not output.health().connected and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        output.maintain()
+    health = output.health()
+    output.close()
+    if health.connected:
+        return subject.passing(OPENS, "the output opens")
+    found, _, remedy = health.problem.partition("; ")
+    return subject.failing(OPENS, found, as_sentence(remedy) if remedy else default_remedy)
+
 
 _configuration = Subject("configuration")
 

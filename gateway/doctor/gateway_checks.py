@@ -1,11 +1,135 @@
 """Checks of the running gateway, by its own health page: streams, outputs, and what was lost."""
 
+import asyncio
+import http.client
+import json
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
-from gateway.doctor.running_gateway import HealthReport, NoReport, RunningLoss, RunningOutput, RunningStream
-from gateway.findings import Finding, Subject, as_sentence
+from pydantic import BaseModel, ValidationError
+
+from gateway.config.settings import MetricsSettings
+from gateway.logs.losses import counts_text, route_name
+from gateway.outputs.findings import Finding, Subject, as_sentence
+from gateway.outputs.listen_address import from_this_computer, host_in_url
 from gateway.stream.state import StreamState
+from gateway.workers import WorkerThread
+
+_TIMEOUT_S: Final = 3.0
+_MAX_PAGE_BYTES: Final = 4 << 20
+_DISCONNECTED: Final = {StreamState.WAITING.value, StreamState.CONNECTING.value}
+
+
+class RunningStream(BaseModel):
+    """One stream on the health page."""
+
+    source: str
+    stream: str
+    server: str
+    state: str
+    session: int
+    frames: int
+    frame_rate_hz: float
+    last_frame_age_s: float | None
+    limitations: list[str]
+    problem: str
+
+    @property
+    def name(self) -> str:
+        """The name in texts: "lab (3d 6d)"."""
+        return f"{self.source} ({self.stream})"
+
+
+class RunningOutput(BaseModel):
+    """One output on the health page."""
+
+    output: str
+    problem: str
+
+
+class RunningLoss(BaseModel):
+    """What was lost for one cause, of one stream before any output, or of one source on one output."""
+
+    source: str
+    stream: str | None
+    output: str | None
+    cause: str
+    messages: int
+    frames: int
+    messages_last_minute: int
+    frames_last_minute: int
+    age_s: float
+    text: str
+
+    @property
+    def found(self) -> str:
+        """What was lost, where, and when."""
+        route = route_name(self.source, self.stream, self.output)
+        total = counts_text([(self.cause, self.messages, self.frames)])
+        if not self.messages_last_minute:
+            return f"{route}: lost since the start: {total}; nothing in the last minute"
+        recent = counts_text([(self.cause, self.messages_last_minute, self.frames_last_minute)])
+        return f"{route}: lost in the last minute: {recent}; since the start: {total}"
+
+
+class HealthReport(BaseModel):
+    """The health page of a running gateway. ``process`` are the problems of the whole process."""
+
+    process: list[str] = []
+    streams: list[RunningStream]
+    outputs: list[RunningOutput]
+    losses: list[RunningLoss]
+
+    def connected_hosts(self, port: int) -> set[str]:
+        """Return the hosts of the servers on ``port`` to which the gateway is connected."""
+        servers = [each.server.rpartition(":") for each in self.streams if each.state not in _DISCONNECTED]
+        return {host for host, _, server_port in servers if server_port == str(port)}
+
+
+class NoReport(NamedTuple):
+    """Why there is no health page. If something answers on the address, it may be a gateway in trouble."""
+
+    reason: str
+    something_answers: bool
+
+
+def address_text(metrics: MetricsSettings) -> str:
+    """Return where a gateway with these settings serves its health page, for example "127.0.0.1:9464"."""
+    return f"{host_in_url(from_this_computer(metrics.host))}:{metrics.port}"
+
+
+async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
+    """Read the health page of the gateway that serves it at these settings, within 3 s."""
+    if not metrics.enabled:
+        return NoReport("metrics.enabled is false, so a running gateway cannot be asked", False)
+    where = address_text(metrics)
+    try:
+        async with asyncio.timeout(2 * _TIMEOUT_S):  # includes looking up a host name
+            page = await WorkerThread("health page").run(
+                lambda: _get(from_this_computer(metrics.host), metrics.port)
+            )
+    except ConnectionRefusedError:
+        return NoReport(f"no gateway runs here: nothing listens on {where}", False)
+    except TimeoutError:
+        return NoReport(f"{where} does not answer within {_TIMEOUT_S:g} s", True)
+    except (OSError, http.client.HTTPException) as error:
+        return NoReport(
+            f"{where} gives no health page: {error}", isinstance(error, http.client.HTTPException)
+        )
+    try:
+        return HealthReport.model_validate(json.loads(page))
+    except (ValueError, ValidationError):
+        return NoReport(f"the program on {where} is not a gateway of this version", True)
+
+
+def _get(host: str, port: int) -> bytes:
+    connection = http.client.HTTPConnection(host, port, timeout=_TIMEOUT_S)
+    try:
+        connection.request("GET", "/healthz")
+        return connection.getresponse().read(_MAX_PAGE_BYTES)
+    finally:
+        connection.close()
+
 
 CHECKS: Final = ("health", "stream", "output", "loss")
 """The checks in order. All but the first are made once for each stream, output and loss."""

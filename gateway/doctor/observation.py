@@ -8,22 +8,21 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.findings import MessageLoad
 from gateway.messages.encode import ITEMS_OFFSET
+from gateway.outputs.findings import MessageLoad
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.files import IgnoredFiles
-from gateway.stream.parameters import Connection
 from gateway.stream.plan import StreamPlan, plan_streams
-from gateway.stream.running_clock import running_clock
-from gateway.stream.session import Session
+from gateway.stream.process_clock import running_clock
+from gateway.stream.replies import Connection
+from gateway.stream.session import IgnoredFiles, Session
 from gateway.stream.status import StreamStatus
-from gateway.stream.stream_control import StreamControl
+from gateway.stream.stream_requests import StreamControl
 from gateway.stream.supervisor import component_keys, stream_name
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
 
 COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 """The components whose items can be out of view."""

@@ -7,8 +7,8 @@ from typing import Final
 from rich.console import Console
 from rich.text import Text
 
-from gateway.findings import Finding, Result
-from gateway.safe_text import safe_json, safe_lines
+from gateway.logs.safe_text import safe_json, safe_lines
+from gateway.outputs.findings import Finding, Result
 
 _MARKS: Final = {
     Result.PASSING: ("ok", "bold green"),

@@ -7,17 +7,16 @@ from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.descriptions.source_frame import source_frame, unknown_unit_text
-from gateway.doctor.frame_checks import check_byte_order, check_frames, check_visibility
+from gateway.doctor.computer_checks import check_receive_buffer
+from gateway.doctor.frame_checks import check_byte_order, check_frames, check_rate, check_visibility
+from gateway.doctor.gateway_checks import HealthReport
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
-from gateway.doctor.rate_check import check_rate
-from gateway.doctor.receive_buffer_check import check_receive_buffer
-from gateway.doctor.running_gateway import HealthReport
 from gateway.errors import ConnectError, LinkError, PacketError
-from gateway.findings import Finding, MessageLoad, Result, Subject, as_sentence
+from gateway.logs.safe_text import quoted
+from gateway.outputs.findings import Finding, MessageLoad, Result, Subject, as_sentence
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
-from gateway.safe_text import quoted
-from gateway.stream.names import is_address, look_up
+from gateway.stream.tcp import is_address, look_up
 
 CHECKS: Final = (
     "name",

@@ -23,7 +23,7 @@ from foxglove.messages import (
     Vector3,
 )
 
-from gateway.descriptions.plate_forces import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
+from gateway.descriptions.force_plates import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
 from gateway.foxglove_schemas.topics import FoxgloveMessage, timestamp, topic_of
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.rtc3d.components import Items

@@ -20,21 +20,23 @@ from foxglove.messages import (
     Vector3,
 )
 
-from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
-from gateway.descriptions.labels import describe, event_labels
-from gateway.foxglove_schemas.float_topics import MAX_FIELDS, FloatRecord, FloatTopics, field_names
+from gateway.descriptions.labels import MAX_EVENT_AGE_US, describe, event_labels, event_text
 from gateway.foxglove_schemas.forces import ForceScene
 from gateway.foxglove_schemas.topics import (
+    MAX_FIELDS,
     MAX_UTIME,
+    FloatRecord,
+    FloatTopics,
     FoxgloveMessage,
     Topic,
+    field_names,
     json_topic,
     timestamp,
     topic_of,
 )
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.json_text import json_text
-from gateway.messages.tool_pose import metres_per_unit
+from gateway.messages.decode import json_text
+from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items
 from gateway.rtc3d.parameters import Parameters
 

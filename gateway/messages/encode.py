@@ -1,4 +1,4 @@
-"""LCM messages of components: the type's fingerprint, the gateway's prefix, the component's content.
+"""LCM messages as the gateway publishes them: the type's fingerprint, the prefix, and the content.
 
 LCM writes big-endian without padding, and RTC3D sends big-endian. The message types in lcm_types/ have the
 component's own fields in the same order, so the content is copied and no value is decoded or encoded.
@@ -6,13 +6,15 @@ component's own fields in the same order, so the content is copied and no value 
 A content in *LCM form* can be copied: it is big-endian, with events of 24 bytes (field note 6).
 """
 
+import math
 import struct
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 import rtc3d
 
-from gateway.messages.stamp import PREFIX, Stamp
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
     LONG_EVENT,
@@ -23,6 +25,64 @@ from gateway.rtc3d.components import (
     big_endian_content,
 )
 from gateway.rtc3d.frames import ComponentLayout
+
+PREFIX: Final = struct.Struct(">qqqii")
+"""The fields after the fingerprint: utime, capture_utime, sequence, session, parameters_version."""
+
+NOT_PUBLISHED: Final = -1
+"""The sequence number of a message that only answers a query and is published on no output."""
+
+_pack: Final = PREFIX.pack
+_NO_SEQUENCE: Final = 1 << 63  # larger than any sequence number: those are signed 64-bit integers
+
+
+class Stamp:
+    """The part of the prefix that all messages of one frame share.
+
+    ``utime`` is when the frame arrived and ``capture_utime`` when the server captured it, both in µs since
+    the Unix epoch. ``session`` is the number of the connection. ``parameters_version`` grows whenever the
+    server's parameters change; 0 before the first. ``has_clock`` is False if the server's time stamps cannot
+    be used as a clock; then both times are equal.
+    """
+
+    __slots__ = (
+        "_prefix",
+        "_sequence",
+        "capture_utime",
+        "has_clock",
+        "parameters_version",
+        "session",
+        "utime",
+    )
+
+    def __init__(
+        self,
+        utime: int,
+        capture_utime: int,
+        session: int,
+        parameters_version: int,
+        has_clock: bool = True,
+    ) -> None:
+        self.utime = utime
+        self.capture_utime = capture_utime
+        self.session = session
+        self.parameters_version = parameters_version
+        self.has_clock = has_clock
+        self._sequence = _NO_SEQUENCE  # the number in _prefix
+        self._prefix = b""
+
+    def prefix(self, sequence: int) -> bytes:
+        """Return the prefix, 32 bytes, of a message with this sequence number.
+
+        Most messages of a frame have the same number, so it caches the last prefix (benchmarks/own_cost.py).
+        """
+        if sequence != self._sequence:
+            self._sequence = sequence
+            self._prefix = _pack(
+                self.utime, self.capture_utime, sequence, self.session, self.parameters_version
+            )
+        return self._prefix
+
 
 MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
     ComponentType.MARKERS: rtc3d.markers_t,
@@ -98,3 +158,41 @@ def with_sequence(message: bytes, sequence: int) -> bytes:
 def message_timestamp_us(message: bytes) -> int:
     """Return the server's time stamp, in µs, from a component's message."""
     return int.from_bytes(message[_TIMESTAMP_OFFSET : _TIMESTAMP_OFFSET + 8], "big", signed=True)
+
+
+_FINGERPRINT: Final[bytes] = rtc3d.tool_pose_t._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
+# Frame number, time stamp, visible, position, orientation, error.
+_CONTENT: Final = struct.Struct(">iq?8f")
+_NO_POSE: Final = (math.nan,) * 8
+_UNITS: Final = {
+    1.0: "m metre metres meter meters",
+    1e-1: "dm decimetre decimetres decimeter decimeters",
+    1e-2: "cm centimetre centimetres centimeter centimeters",
+    1e-3: "mm millimetre millimetres millimeter millimeters",
+    1e-6: "um µm microm micron microns micrometre micrometres micrometer micrometers",
+    0.0254: "in inch inches",
+    0.3048: "ft foot feet",
+}
+_METRES: Final = {name.casefold(): metres for metres, names in _UNITS.items() for name in names.split()}
+
+
+def metres_per_unit(unit: str) -> float | None:
+    """Return the length in metres of ``unit`` in the 3D parameters (§6.2); None if it is unknown."""
+    return _METRES.get(unit.strip().casefold() or "mm")
+
+
+def tool_poses(
+    component: Component, stamp: Stamp, sequences: Sequence[int], frame: CoordinateFrame
+) -> list[bytes]:
+    """Return one ``tool_pose_t`` message per tool of a 6D component, with poses in ``frame``.
+
+    Positions and errors are in metres; quaternions have the order x, y, z, w. ``sequences`` has one sequence
+    number per tool. The unit of ``frame`` must be known.
+    """
+    head = (component.frame_number, component.timestamp_us)
+    return [
+        _FINGERPRINT
+        + stamp.prefix(sequence)
+        + (_CONTENT.pack(*head, False, *_NO_POSE) if pose is None else _CONTENT.pack(*head, True, *pose))
+        for pose, sequence in zip(frame.poses(component.items(), accept_zeros=True), sequences, strict=True)
+    ]

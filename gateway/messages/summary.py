@@ -7,8 +7,8 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.errors import ParametersError
-from gateway.losses import counts_text
-from gateway.messages.parameters_text import xml_bytes
+from gateway.logs.losses import counts_text
+from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4

@@ -1,1 +1,20 @@
-"""The outputs: one contract for all, and a module or package for each."""
+"""The outputs: one contract for all, and a package for each.
+
+Start with ``contract``: an ``Output`` opens (``start``), gives a ``Publisher`` for each topic, reports its
+health and closes. Everything else that an output can do has a default that does nothing. The tests in
+tests/contract/ hold every output to it, and ``guard`` keeps an output that breaks it from hurting the others.
+
+``registry`` lists the outputs. Each has a package with the same modules:
+
+- ``settings``: its section of the configuration.
+- ``output``: the class that the contract describes, and often its publishers.
+- ``checks``: what the doctor checks.
+- ``kind``: its entry in the registry.
+
+What several outputs need is here: ``admission`` limits the questions of peers, ``threads`` has a thread for
+calls that may block and one with an event loop of its own, ``listen_address`` says who can connect to a
+server, ``pacing`` leaves out frames, and ``memory`` is an output for tests.
+
+Calls of the contract come from the gateway's event loop and must not block there. An output that may wait for
+a network or a disk does so in a thread, behind a queue with a limit, and counts what it drops.
+"""

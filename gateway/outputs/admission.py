@@ -4,6 +4,7 @@ A question is admitted or refused where it arrives, in a thread of the output's 
 questions costs the event loop no more than the questions that are answered.
 """
 
+import logging
 import threading
 import time
 from collections import Counter, OrderedDict
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from gateway.errors import QueryError
+from gateway.logs.failures import DefectLog
 from gateway.token_bucket import TokenBucket
 
 MAX_KEYS: Final = 256
@@ -145,3 +147,16 @@ class Admission:
         else:
             self._keys.move_to_end(key)
         return bucket
+
+
+class QueryDefects:
+    """Logs defects of one output with ``logger``, each once for each source. Any thread may call it."""
+
+    def __init__(self, logger: logging.Logger) -> None:
+        self._logger = logger
+        self._logs: dict[str, DefectLog] = {}  # by source
+
+    def log(self, source: str, defect: Exception, query: str) -> QueryError:
+        """Log the defect that a query about ``source`` met; return the error for its peer."""
+        self._logs.setdefault(source, DefectLog(self._logger, source)).log(defect, text=query)
+        return QueryError(f"a defect in the gateway: {defect!r}", code="defect")

@@ -7,18 +7,45 @@ caller checks the class of an output.
 
 import asyncio
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
-from gateway.losses import Losses
+from gateway.logs.losses import Loss, Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.messages.topics import Topic
-from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
+
+WHOLE_FRAME: Final = "frame"
+"""What stands for the component in the counters of an output that takes whole frames."""
+
+
+@dataclass
+class OutputStatus:
+    """The counters of one output for one source: messages and their bytes by component, losses by cause.
+
+    ``takes_frames`` is whether the output takes whole frames instead of components.
+    """
+
+    name: str
+    messages: Counter[str] = field(default_factory=Counter)
+    losses: Sequence[Loss] = ()
+    message_bytes: Counter[str] = field(default_factory=Counter)
+    takes_frames: bool = False
+
+
+@dataclass(frozen=True)
+class OutputHealth:
+    """Whether an output can send, and if not, what is wrong and what to do."""
+
+    connected: bool
+    problem: str = ""
+
 
 KeyPath = tuple[str, ...]
 """A key below PREFIX/SOURCE/, split at its slashes: ("parameters", "3d")."""
@@ -336,3 +363,15 @@ class Output(ABC):
     def commands(self) -> Mapping[str, Command]:
         """The output's own commands by name. Peers call them as keys below PREFIX/SOURCE/."""
         return {}
+
+
+class IgnoringPublisher:
+    """Accepts messages and does nothing with them: for outputs of whole frames, which have no topics."""
+
+    wanted = False
+
+    def publish(self, message: bytes) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -7,19 +7,19 @@ from logging import getLogger
 from typing import Any, ParamSpec, TypeVar
 
 from gateway.errors import OutputError
-from gateway.log import DefectLog, defect_text
-from gateway.losses import Losses
+from gateway.logs.failures import DefectLog, defect_text
+from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import (
     Command,
     FramePublisher,
     Output,
+    OutputHealth,
     Publisher,
     QueryService,
     ServerFile,
     ServerParameters,
 )
-from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import FrameLayout
 

@@ -10,8 +10,19 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.config.settings import OutputSettings
-from gateway.findings import Finding, MessageLoad
+from gateway.errors import ConfigError
 from gateway.outputs.contract import Output
+from gateway.outputs.findings import Finding, MessageLoad
+
+
+def missing_package(output: str, extra: str, error: ImportError) -> ConfigError:
+    """Return the error for an output that is enabled, but whose package is not installed."""
+    package = error.name or extra
+    return ConfigError(
+        f"{output}.enabled is true, but the package {package!r} is not installed; install it with "
+        f"pip install 'rtc3d-gateway[{extra}]', or set {output}.enabled to false"
+    )
+
 
 Receive = Callable[[str, bytes], None]
 """Takes the key or channel, and the message. Called in a thread of the subscription."""

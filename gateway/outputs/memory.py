@@ -4,8 +4,7 @@ from collections import deque
 
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Output
-from gateway.outputs.status import OutputHealth
+from gateway.outputs.contract import Output, OutputHealth
 
 
 class MemoryPublisher:

@@ -4,7 +4,7 @@ from typing import Final
 
 import rtc3d
 
-from gateway.messages.parameters_text import xml_text
+from gateway.messages.texts import xml_text
 from gateway.outputs.contract import ServerParameters
 
 _UTIME: Final = slice(8, 16)

@@ -9,13 +9,11 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
-from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name, message_timestamp_us, with_sequence
-from gateway.messages.stamp import Stamp
+from gateway.logs.losses import Losses
+from gateway.messages.encode import MESSAGE_TYPES, Stamp, lcm_type_name, message_timestamp_us, with_sequence
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import FramePublisher, Output
+from gateway.outputs.contract import WHOLE_FRAME, FramePublisher, Output, OutputStatus
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.status import WHOLE_FRAME, OutputStatus
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 

@@ -7,10 +7,10 @@ from typing import Final
 import rtc3d
 
 from gateway import __version__
-from gateway.losses import Loss
+from gateway.logs.losses import Loss
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
-from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.status import StreamStatus
 from gateway.stream.status_text import unusable_frames

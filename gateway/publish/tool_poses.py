@@ -7,8 +7,7 @@ import rtc3d
 
 from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
-from gateway.messages.tool_pose import tool_poses
+from gateway.messages.encode import Stamp, tool_poses
 from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.publish.routes import OutputRoute, TopicRoute

@@ -8,15 +8,16 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 from gateway.errors import ParametersError
-from gateway.log import EventLog
-from gateway.queries.answers import parameters_json
-from gateway.queries.payloads import JsonPayload
-from gateway.rtc3d.parameters import SECTIONS, Parameters, without_statistics
-from gateway.rtc3d.parameters_changes import (
+from gateway.logs.failures import EventLog
+from gateway.queries.answers import JsonPayload, parameters_json
+from gateway.rtc3d.parameters import (
+    SECTIONS,
+    Parameters,
     changed_sections,
     describe_renames,
     differ_in_statistics_only,
     statistics_xml,
+    without_statistics,
 )
 from gateway.rtc3d.parameters_xml import (
     MAX_XML_BYTES,
@@ -24,7 +25,7 @@ from gateway.rtc3d.parameters_xml import (
     extract_sections,
     parse_parameters,
 )
-from gateway.stream.parameters import XmlThread
+from gateway.stream.replies import XmlThread
 
 Sections = tuple[str, ...]
 """The parameter sections of a query, as in SECTIONS; () for all."""

@@ -6,11 +6,11 @@ from typing import Final, Literal, NamedTuple
 import rtc3d
 
 from gateway.errors import QueryError
+from gateway.logs.safe_text import quoted
 from gateway.outputs.contract import KeyPath
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from gateway.safe_text import quoted
-from gateway.takes.names import check_name
+from gateway.takes.files.new_file import check_name
 
 SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 """The message types, and the types they contain."""

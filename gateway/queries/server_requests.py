@@ -1,20 +1,22 @@
-"""Commands that peers' queries send to the server of one source: one at a time, and shared where equal."""
+"""Commands that peers' queries send to the server of one source, and the recordings that they start."""
 
 import asyncio
+import contextlib
 import logging
 import time
-from collections.abc import Callable, Coroutine, Hashable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Awaitable, Callable, Coroutine, Hashable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.config.settings import SourceSettings
-from gateway.errors import GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
-from gateway.log import DefectLog
-from gateway.rtc3d.commands import Command
+from gateway.errors import CommandError, GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
+from gateway.logs.failures import DefectLog
+from gateway.rtc3d.commands import Command, ControlRecording, recording_duration_s, recording_options
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.packets import Packet
-from gateway.stream.parameters import Connection
-from gateway.stream.running_time import running_timeout
+from gateway.rtc3d.packets import Packet, decode_text
+from gateway.stream.process_timeout import running_timeout
+from gateway.stream.replies import Connection
 from gateway.stream.status import StreamStatus
+from gateway.takes.files.new_file import name_of_file
 
 _Result = TypeVar("_Result")
 
@@ -133,3 +135,159 @@ class ServerRequests:
         error = task.exception()  # retrieve it, even if no caller waits any more
         if error is not None and not isinstance(error, GatewayError):
             self._defects.log(error)
+
+
+class RecordingAccess(NamedTuple):
+    """What starts and stops recordings of one source (True starts).
+
+    ``send_packet`` sends the packet of field note 16, and returns False if there is no connection.
+    ``follow`` lets the outputs follow a recording: see Output.follow_recording.
+    """
+
+    send_packet: Callable[[bool], bool]
+    follow: Callable[[bool, str], Awaitable[Mapping[str, Any]]]
+
+
+_NOT_ACCEPTED: Final = {"refused", "timeout"}
+
+_MAX_OPTIONS_CHARS: Final = 500
+"""Enough for the longest path of Windows and some options."""
+
+_MAX_REPLY_CHARS: Final = 1000
+
+_FOLLOW_S: Final = 1.0
+"""How long outputs still follow a recording whose duration is over: its last frames may be on the way."""
+
+Done = tuple[dict[str, Any], str]
+"""What the peer gets, and the text of the server's reply; "" if the server sent none."""
+
+
+class Recordings:
+    """Starts and stops recordings.
+
+    Servers can be asked in two ways, neither in the specification: with a packet that cannot name the file
+    (field note 16), and with commands that can (field notes 18 and 26). Without a name, the packet is sent,
+    which gets no reply. With a name, the command is sent, and the packet if the server does not accept the
+    command. With options, only the command is sent: without them, it would be another recording.
+
+    ``before`` are the recordings of the source that this one replaces after a reload.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        requests: ServerRequests,
+        access: RecordingAccess,
+        before: "Recordings | None" = None,
+    ) -> None:
+        self._source = source
+        self._requests = requests
+        self._access = access
+        # Whether the command started the recording, and what waits for the end of its duration.
+        self._is_named: bool = False if before is None else before._is_named  # noqa: SLF001 - the same class
+        self._ending: asyncio.Task[None] | None = None if before is None else before._ending  # noqa: SLF001
+        self._lock = asyncio.Lock()
+
+    async def start(self, name: str, options: str = "") -> Done:
+        """Start a recording with a name, and with options for the server (field note 26). Raises QueryError.
+
+        The options are sent unchanged.
+        """
+        sent = _start_options(name, options)
+        async with self._lock:
+            self._check_connected()
+            self._forget_duration()
+            return await self._start(sent, needs_command=bool(options))
+
+    async def stop(self) -> Done:
+        """Stop the recording. Raises QueryError."""
+        async with self._lock:
+            self._check_connected()
+            self._forget_duration()
+            reply = await self._ask(ControlRecording(start=False)) if self._is_named else None
+            if reply is None:
+                self._send(start=False)
+            self._is_named = False
+            content = {"source": self._source, "sent": "stop", **await self._access.follow(False, "")}
+            return content, reply or ""
+
+    async def _start(self, options: str, *, needs_command: bool) -> Done:
+        name = recording_options(options).get("file", "")
+        following = asyncio.ensure_future(self._access.follow(True, name_of_file(name)))
+        await asyncio.sleep(0)  # takes begin before the recording, which does not wait for their disk
+        try:
+            reply = None
+            if options:
+                reply = await self._ask(ControlRecording(start=True, options=options), must=needs_command)
+            self._is_named = reply is not None
+            if reply is None:
+                self._send(start=True)
+        except QueryError:
+            await following
+            await self._access.follow(False, "")
+            raise
+        if reply is not None:
+            name = recording_options(reply).get("file") or name  # the server may use another one
+            self._limit_following(options)
+        named = {"name": name, "is_named": self._is_named} if name else {}
+        return {"source": self._source, "sent": "start", **named, **await following}, reply or ""
+
+    async def _ask(self, command: ControlRecording, *, must: bool = False) -> str | None:
+        """Send a command; return the text of its reply, None if the server does not accept the command.
+
+        A reply without text counts as the usual one.
+
+        Raises QueryError if the server ``must`` accept it.
+        """
+        try:
+            _, packet = await self._requests.send(command)
+        except QueryError as error:
+            # A command without an answer may have been carried out. If so, a command has to stop it.
+            self._is_named = self._is_named or error.code == "timeout"
+            if must or error.code not in _NOT_ACCEPTED:
+                raise
+            return None
+        return decode_text(packet.body)[:_MAX_REPLY_CHARS] or f"OK-{command}"
+
+    def _send(self, *, start: bool) -> None:
+        if not self._access.send_packet(start):
+            raise self._requests.no_connection_error()
+
+    def _check_connected(self) -> None:
+        if not self._requests.is_connected:
+            raise self._requests.no_connection_error()
+
+    def _limit_following(self, options: str) -> None:
+        """Let the outputs follow the recording no longer than its duration, if it has one."""
+        with contextlib.suppress(CommandError):  # the server may know more units
+            duration_s = recording_duration_s(options)
+            if duration_s is not None:
+                self._ending = asyncio.create_task(self._end_following(duration_s + _FOLLOW_S))
+
+    async def _end_following(self, after_s: float) -> None:
+        await asyncio.sleep(after_s)
+        await self._access.follow(False, "")
+
+    def _forget_duration(self) -> None:
+        if self._ending is not None:
+            self._ending.cancel()
+            self._ending = None
+
+
+def _start_options(name: str, options: str) -> str:
+    """Return what follows Start in the command; "" without name and options. Raises QueryError."""
+    if options and options[0] not in ", ":
+        options = f",{options}"
+    if name and "file" in recording_options(options):
+        raise QueryError("name is the file on the server, and options have file=, too; use one of them")
+    sent = f",file={name}{options}" if name else options
+    if not sent.isascii():
+        raise QueryError(
+            "the name of a recording on the server can have ASCII letters only, as commands do (§5.1)"
+        )
+    if len(sent) > _MAX_OPTIONS_CHARS or not sent.isprintable():
+        raise QueryError(
+            f"the options of a recording can have {_MAX_OPTIONS_CHARS} characters, without line ends and "
+            "other control characters"
+        )
+    return sent

@@ -1,22 +1,232 @@
-"""The query service: it finds the source, or the output's own command, that answers a peer's query."""
+"""The query service: it finds the source, or the output's own command, that answers a peer's query.
+
+The server gets one request at a time, and equal questions at the same time share its answer.
+"""
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial
+from typing import Any, Final
 
-from gateway.errors import QueryError
+from gateway.config.settings import SourceSettings
+from gateway.descriptions.source_frame import source_frame
+from gateway.errors import FrameError, QueryError
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.decode import JSON, XML, json_bytes, prefix_of
+from gateway.messages.encode import NOT_PUBLISHED, Stamp, encode_message
+from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
+from gateway.queries.answers import JsonPayload, NewestJson, message_answer, schema_answer
+from gateway.queries.known_parameters import Announce
+from gateway.queries.parameter_cache import ParameterCache
 from gateway.queries.questions import (
     RECORDING,
+    Question,
     accepted_keys,
     check_sections,
     known_keys,
     parse_question,
     parse_questions,
 )
-from gateway.queries.source_queries import SourceQueries
-from gateway.rtc3d.parameters import SECTIONS
+from gateway.queries.server_requests import RecordingAccess, Recordings, ServerRequests, StreamAccess
+from gateway.rtc3d.commands import SendCurrentFrame
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
+from gateway.rtc3d.frames import detect_byte_order, split_frame
+from gateway.rtc3d.packets import PacketType
+from gateway.rtc3d.parameters import SECTIONS, Parameters
+from gateway.stream.state import StreamState
+from gateway.token_bucket import TokenBucket
+
+CONTROLS_PER_S: Final = 4.0
+"""How many commands a second that start, stop or change something are carried out."""
+
+
+class SourceQueries:
+    """Answers questions about one source; ``parameters`` has those of its server.
+
+    ``newest_message`` returns the newest message of a component as the output of a name numbers it.
+    ``last_c3d`` raises QueryError if there is no file. ``announce_parameters`` takes the server's parameters
+    when they change. ``before`` are the queries of the source that this one replaces after a reload; its
+    parameters continue.
+    """
+
+    def __init__(
+        self,
+        settings: SourceSettings,
+        streams: Callable[[], Sequence[StreamAccess]],
+        newest_message: Callable[[ComponentType, str], bytes | None],
+        status_message: Callable[[], bytes],
+        last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
+        recording: RecordingAccess,
+        announce_parameters: Announce,
+        before: "SourceQueries | None" = None,
+    ) -> None:
+        self.settings = settings
+        """A reload can replace them by others that differ only in the frame of poses."""
+        self._streams = streams
+        self._newest_message = newest_message
+        self._status_message = status_message
+        self._last_c3d = last_c3d
+        self._requests = ServerRequests(settings, streams)
+        self._recordings: Recordings = Recordings(
+            *(settings.name, self._requests, recording),
+            None if before is None else before._recordings,  # noqa: SLF001 - the same class
+        )
+        self._newest_json = NewestJson()
+        self._controls = TokenBucket(CONTROLS_PER_S)
+        self.parameters: ParameterCache = ParameterCache(
+            settings, self._requests, announce_parameters, None if before is None else before.parameters
+        )
+
+    @property
+    def server(self) -> str:
+        """HOST:PORT of the server."""
+        return f"{self.settings.host}:{self.settings.port}"
+
+    @property
+    def components(self) -> frozenset[ComponentType]:
+        """The components of all streams."""
+        return frozenset(component for stream in self._streams() for component in stream.components)
+
+    @property
+    def session(self) -> int:
+        """A number that grows with every connection of any stream."""
+        return self._requests.session
+
+    @property
+    def parameters_version(self) -> int:
+        """The version of the server's parameters; 0 before the first."""
+        return self._requests.parameters_version
+
+    @property
+    def frame(self) -> CoordinateFrame:
+        """The coordinate frame of the source's poses."""
+        newest = self.parameters.known.newest
+        return source_frame(self.settings, Parameters() if newest is None else newest.parsed.parameters)
+
+    def check_control(self) -> None:
+        """Raise QueryError unless peers may now start, stop or change something of this source."""
+        name = self.settings.name
+        if not self.settings.remote_control:
+            raise QueryError(
+                f"remote control is off for source {name!r}; to switch it on, set remote_control: true "
+                "for it in the gateway's configuration",
+                code="refused",
+            )
+        if not self._controls.try_take():
+            raise QueryError(
+                f"source {name!r} takes {CONTROLS_PER_S:g} commands a second that start or stop something; "
+                "try again",
+                code="rate",
+            )
+
+    async def answer(self, question: Question, output: str = "") -> Answer:
+        """Return the answer to a query on the output of this name; "" stands for any output.
+
+        Raises QueryError, at the latest after query_timeout_s.
+        """
+        match question.kind:
+            case "parameters":
+                return await self._parameters(question)
+            case "component":
+                return await self._component(question, output)
+            case "status":
+                return self._message_answer(self._status_message(), question, output)
+            case "schema":
+                return schema_answer(question.name)
+            case "c3d":
+                return await self._requests.share("c3d", self._last_c3d)
+            case "recording":
+                return await self._recording(question)
+
+    async def _parameters(self, question: Question) -> Answer:
+        sections = (question.name,) if question.name else ()
+        cached = await self.parameters.get(sections, fresh=question.fresh, stale_ok=question.stale_ok)
+        attachment: dict[str, Any] = {
+            "age_s": round(cached.age_s, 3),
+            "session": cached.session,
+            "parameters_version": cached.version,
+            "frame": self.frame.facts,
+        }
+        if not self._requests.is_connected:
+            attachment["stale"] = True
+        if not question.as_json:
+            return Answer(cached.xml, XML, attachment)
+        if not cached.is_readable:
+            raise QueryError(
+                "the server's XML cannot be read; ask without format=json to see it as received",
+                code="unreadable",
+            )
+        payload = cached.json
+        if payload is None:
+            raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
+        return Answer(payload, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
+
+    async def _component(self, question: Question, output: str) -> Answer:
+        """Return the newest message of the stream; while it does not run, ask for the current frame."""
+        component = COMPONENTS_BY_KEY[question.name]
+        stream = next((stream for stream in self._streams() if component in stream.components), None)
+        if stream is None:  # since the question was checked
+            raise QueryError(f"no stream of source {self.settings.name!r} has {component.key} any more")
+        session = stream.status.session
+        if stream.connection is None:
+            raise self._requests.no_connection_error()
+        if stream.status.state is StreamState.STREAMING:
+            message = self._newest_message(component, output)
+            if message is None or prefix_of(message).session != session:
+                raise QueryError(
+                    f"no {component.key} has arrived from source {self.settings.name!r} in this session",
+                    code="nothing-yet",
+                )
+        else:
+            current = await self._requests.share(
+                ("frame", component), lambda: self._current_frame(component, stream)
+            )
+            utime = now_utime()
+            message = encode_message(
+                current, Stamp(utime, utime, session, self.parameters_version), NOT_PUBLISHED
+            )
+        return self._message_answer(message, question, output)
+
+    def _message_answer(self, message: bytes, question: Question, output: str) -> Answer:
+        payload: JsonPayload | None = None
+        if question.as_json:
+            key = question.name or question.kind
+            message, payload = self._newest_json.of(f"{key} {output}", message)
+        attachment = {}
+        if question.kind == "component":
+            prefix = prefix_of(message)
+            attachment = {"session": prefix.session, "parameters_version": prefix.parameters_version}
+        return message_answer(message, attachment) if payload is None else Answer(payload, JSON, attachment)
+
+    async def _current_frame(self, component: ComponentType, stream: StreamAccess) -> Component:
+        """Request a component of the current frame (§5.3.4).
+
+        If the server does not accept the component's name, request the whole frame (field note 2).
+        """
+        _, packet = await self._requests.send(
+            SendCurrentFrame((component,)), fallback=SendCurrentFrame(), connection=stream.connection
+        )
+        if packet.type == PacketType.NO_DATA:
+            raise QueryError(f"source {self.settings.name!r}: no measurement runs", code="nothing-yet")
+        try:
+            frame = split_frame(packet.body, detect_byte_order(packet.body, self.settings.byte_order))
+        except FrameError as error:
+            raise QueryError(f"the current frame cannot be read: {error}", code="unreadable") from error
+        for found in frame.components:
+            if found.type is component:
+                return found
+        raise QueryError(f"the current frame has no {component.key}", code="nothing-yet")
+
+    async def _recording(self, question: Question) -> Answer:
+        if not question.set:
+            raise QueryError("recording needs an option; accepted: set=start;name=NAME, set=stop")
+        if question.set == "start":
+            content, reply = await self._recordings.start(question.name, question.options)
+        else:
+            content, reply = await self._recordings.stop()
+        return Answer(json_bytes(content), JSON, {"reply": reply} if reply else {})
 
 
 class SourceQueryService:

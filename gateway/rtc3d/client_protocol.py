@@ -1,10 +1,15 @@
-"""The client's side of one RTC3D connection, without I/O: bytes in, frames, events and bytes out."""
+"""The client's side of one RTC3D connection, without I/O: bytes in, frames, events and bytes out.
 
+This is the only table of transitions in the gateway. The state of a stream is derived from these states.
+"""
+
+from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from gateway.errors import ClosedError, FrameError, LinkError, PacketError, ServerError
+from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.commands import (
     Bye,
     Command,
@@ -15,8 +20,7 @@ from gateway.rtc3d.commands import (
     encode_command,
 )
 from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, encode_component
-from gateway.rtc3d.frame_reader import FrameReader
-from gateway.rtc3d.frames import Frame, announced_components, detect_byte_order, encode_frame
+from gateway.rtc3d.frames import Frame, FrameReader, announced_components, detect_byte_order, encode_frame
 from gateway.rtc3d.packets import (
     ALL_PACKETS,
     DEFAULT_MAX_C3D_BYTES,
@@ -28,9 +32,72 @@ from gateway.rtc3d.packets import (
     decode_text,
     encode_packet,
 )
-from gateway.rtc3d.protocol_state import ProtocolInput, ProtocolState, next_state
 from gateway.rtc3d.reply_matcher import Match, ReplyMatcher
-from gateway.safe_text import safe_text
+
+
+class ProtocolState(Enum):
+    """The states: what the client has requested, and what the server sends."""
+
+    IDLE = "idle"  # the server has accepted no request for frames, as far as the client knows
+    REQUESTED = "requested"  # StreamFrames was sent; neither a frame nor No Data has arrived yet
+    STREAMING = "streaming"
+    NO_MEASUREMENT = "no measurement"
+    STOPPED = "stopped"  # the server accepted StreamFrames Stop; a frame that still arrives was under way
+    CLOSING = "closing"  # Bye was sent
+    CLOSED = "closed"
+
+
+class ProtocolInput(Enum):
+    """The inputs that can change the state of a connection."""
+
+    REQUEST_SENT = "StreamFrames sent"
+    REQUEST_REFUSED = "StreamFrames refused"
+    STOP_ACCEPTED = "StreamFrames Stop accepted"
+    STOP_UNANSWERED = "StreamFrames Stop not answered"
+    FRAME_RECEIVED = "a frame received"
+    NO_DATA_RECEIVED = "No Data received"
+    BYE_SENT = "Bye sent"
+    CONNECTION_ENDED = "the connection ended"
+
+
+_TRANSITIONS: Final[dict[tuple[ProtocolState, ProtocolInput], ProtocolState]] = {
+    (ProtocolState.IDLE, ProtocolInput.REQUEST_SENT): ProtocolState.REQUESTED,
+    (ProtocolState.STOPPED, ProtocolInput.REQUEST_SENT): ProtocolState.REQUESTED,
+    (ProtocolState.REQUESTED, ProtocolInput.REQUEST_REFUSED): ProtocolState.IDLE,
+    # A reply does not always say what it answers (field note 20). What the server sends shows the truth: if
+    # frames arrive although the server seems to have refused them, it has not.
+    (ProtocolState.IDLE, ProtocolInput.FRAME_RECEIVED): ProtocolState.STREAMING,
+    (ProtocolState.IDLE, ProtocolInput.NO_DATA_RECEIVED): ProtocolState.NO_MEASUREMENT,
+    (ProtocolState.REQUESTED, ProtocolInput.FRAME_RECEIVED): ProtocolState.STREAMING,
+    (ProtocolState.REQUESTED, ProtocolInput.NO_DATA_RECEIVED): ProtocolState.NO_MEASUREMENT,
+    (ProtocolState.STREAMING, ProtocolInput.NO_DATA_RECEIVED): ProtocolState.NO_MEASUREMENT,
+    (ProtocolState.NO_MEASUREMENT, ProtocolInput.FRAME_RECEIVED): ProtocolState.STREAMING,
+    **{
+        (state, stop): after
+        for state in (
+            ProtocolState.IDLE,
+            ProtocolState.REQUESTED,
+            ProtocolState.STREAMING,
+            ProtocolState.NO_MEASUREMENT,
+        )
+        for stop, after in (
+            (ProtocolInput.STOP_ACCEPTED, ProtocolState.STOPPED),
+            (ProtocolInput.STOP_UNANSWERED, ProtocolState.IDLE),  # the next frame shows if it was ignored
+        )
+    },
+    (ProtocolState.IDLE, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
+    (ProtocolState.REQUESTED, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
+    (ProtocolState.STREAMING, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
+    (ProtocolState.NO_MEASUREMENT, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
+    (ProtocolState.STOPPED, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
+    **{(state, ProtocolInput.CONNECTION_ENDED): ProtocolState.CLOSED for state in ProtocolState},
+}
+
+
+def next_state(state: ProtocolState, protocol_input: ProtocolInput) -> ProtocolState:
+    """Return the state after ``protocol_input``; an input that is not in the table changes nothing."""
+    return _TRANSITIONS.get((state, protocol_input), state)
+
 
 _MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)

@@ -13,8 +13,8 @@ from gateway.rtc3d.packets import Packet, PacketReader, PacketType
 from gateway.rtc3d.parameters import General
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.frame_schedule import SentCounts
 from gateway.rtc3d_server.scene import FrameSource, Scene
-from gateway.rtc3d_server.sent_counts import SentCounts
 from gateway.token_bucket import TokenBucket
 
 MAX_COMMAND_BYTES: Final = 64 * 1024

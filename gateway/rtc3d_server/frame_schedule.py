@@ -1,10 +1,12 @@
 """Which frames a client gets, and when: the rules of §5.3.4 and §5.3.5."""
 
+from collections import Counter
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Final
 
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.scene import FrameSource
 
 _SAME_RATE: Final = Fraction(101, 100)
@@ -84,3 +86,27 @@ def _stride(rate: Rate | None, base_rate: Fraction) -> Fraction:
             return max(Fraction(1), base_rate / Fraction(hz).limit_denominator(1_000_000))
         case _:
             return Fraction(1)
+
+
+class SentCounts:
+    """Counts data frames and the components in them."""
+
+    def __init__(self) -> None:
+        self._frames: Counter[tuple[ComponentType, ...]] = Counter()
+
+    def add(self, components: tuple[ComponentType, ...]) -> None:
+        """Count one frame with these components."""
+        self._frames[components] += 1
+
+    @property
+    def frames(self) -> int:
+        """The number of frames."""
+        return self._frames.total()
+
+    @property
+    def components(self) -> Counter[str]:
+        """How often each component was in a frame, by its key."""
+        counts: Counter[str] = Counter()
+        for components, frames in self._frames.items():
+            counts.update({component.key: frames for component in components})
+        return counts

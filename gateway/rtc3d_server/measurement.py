@@ -1,11 +1,169 @@
-"""The clock of a measurement, and the frames that all clients share."""
+"""The frames of a measurement: its clock, the bytes of its packets, and what all clients share."""
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+from functools import lru_cache
 from typing import Final
 
-from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.scene import FrameSource, Scene
+import numpy as np
+
+from gateway.rtc3d.components import (
+    SHORT_EVENT,
+    WIRE_ORDER,
+    ByteOrder,
+    ComponentType,
+    Items,
+    encode_component,
+)
+from gateway.rtc3d.frames import encode_frame
+from gateway.rtc3d.packets import PacketType, encode_packet
+from gateway.rtc3d.parameters import General, only_sections
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.rtc3d_server.scene import NO_EVENTS, DataPacket, FrameSource, Scene, SceneFunction
+
+_BLOCK_FRAMES: Final = 64
+"""The scene computes this many frames in one call, because a call of numpy costs much more than a value."""
+
+_CACHED_PACKETS: Final = 64  # clients with equal streams share them
+_SECOND_US: Final = 1_000_000
+_FRAME_NUMBERS: Final = 2**31  # the field is a signed 32-bit integer
+
+MAX_LATE_US: Final = 1_000_000
+"""Frames that are later than this are dropped; less late ones are still sent."""
+
+
+def exact_rate(rate_hz: float) -> Fraction:
+    """Return the exact value of a rounded rate, such as 60000/1001 for 59.94006."""
+    return Fraction(rate_hz).limit_denominator(1001)
+
+
+class FrameBuilder:
+    """Builds the frames that have certain components of a scene (see FrameSource).
+
+    There is one frame for each tick of ``rate``, the rate of the slowest measured component in them
+    (§5.3.5); ticks are counted from 0 at the start of the measurement. A frame has the newest sample
+    of each component at its tick, and all components have the tick's time stamp. A FrameNumber is
+    the number of the component's own sample, from 1.
+
+    ``requested`` are the components of a command; an empty sequence means all. Components that the
+    scene lacks are left out. ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16
+    as in §7.7 (field note 6).
+    """
+
+    def __init__(
+        self, scene: SceneFunction, requested: Sequence[ComponentType], event_bytes: int = 24
+    ) -> None:
+        chosen = [component for component in WIRE_ORDER if not requested or component in requested]
+        rates = {c: exact_rate(scene.rates_hz[c]) for c in chosen if c in scene.rates_hz}
+        measurement_rate = exact_rate(scene.measurement_rate_hz)
+        events = scene.parameters.events
+        self._scene = scene
+        self._event_bytes = event_bytes
+        self.measured = tuple(rates)
+        """The components of each frame except events, in wire order."""
+        self.has_events = ComponentType.EVENT in chosen and events is not None and bool(events.events)
+        self.rate = min(rates.values(), default=measurement_rate)
+        """Ticks per second."""
+        self._samples_per_tick = [rates[component] / self.rate for component in self.measured]
+        self._events_per_tick = measurement_rate / self.rate
+        self._packet = lru_cache(_CACHED_PACKETS)(self._build_packet)
+        self._block = lru_cache(4)(self._build_block)
+
+    def time_us(self, tick: int) -> int:
+        """Return the tick's time in µs since the start of the measurement."""
+        return time_us(tick, self.rate)
+
+    def tick_after(self, elapsed_us: int) -> int:
+        """Return the first tick whose time is later than ``elapsed_us``."""
+        return -(-(elapsed_us + 1) * self.rate.numerator // (_SECOND_US * self.rate.denominator))
+
+    def oldest_us(self, elapsed_us: int) -> int:
+        """See FrameSource."""
+        return elapsed_us - MAX_LATE_US
+
+    def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
+        """See FrameSource. The frame has an event component if there are events."""
+        if events_from_us is not None and self.has_events:
+            events = self._scene.events(events_from_us, self.time_us(tick) + 1)
+            if len(events):
+                return self._build_packet(byte_order, tick, events)
+        return self._packet(byte_order, tick)
+
+    def _build_packet(self, byte_order: ByteOrder, tick: int, events: Items = NO_EVENTS) -> DataPacket:
+        timestamp_us = self.time_us(tick)
+        block = self._block(byte_order, tick // _BLOCK_FRAMES)
+        row = tick % _BLOCK_FRAMES
+        components = self.measured
+        parts = [
+            encode_component(component, _frame_number(tick, per_tick), timestamp_us, items[row], byte_order)
+            for component, per_tick, items in zip(components, self._samples_per_tick, block, strict=True)
+        ]
+        if len(events):
+            components = (*components, ComponentType.EVENT)
+            number = _frame_number(tick, self._events_per_tick)
+            parts.append(
+                encode_component(ComponentType.EVENT, number, timestamp_us, self._resized(events), byte_order)
+            )
+        packet = encode_packet(PacketType.DATA, encode_frame(parts, byte_order))
+        return DataPacket(packet, components)
+
+    def _build_block(self, byte_order: ByteOrder, number: int) -> list[Items]:
+        """Return each measured component's items for a block of ticks, shape (_BLOCK_FRAMES, items)."""
+        ticks = np.arange(number * _BLOCK_FRAMES, (number + 1) * _BLOCK_FRAMES, dtype=np.int64)
+        block = []
+        for component, per_tick in zip(self.measured, self._samples_per_tick, strict=True):
+            items = self._scene.items(component, ticks * per_tick.numerator // per_tick.denominator)
+            block.append(items.astype(items.dtype.newbyteorder(byte_order), copy=False))
+        return block
+
+    def _resized(self, events: Items) -> Items:
+        """Return the events in the configured size."""
+        if self._event_bytes == SHORT_EVENT.itemsize:
+            return events[["id", "param1", "param2", "param3"]].astype(SHORT_EVENT)
+        return events
+
+
+def time_us(tick: int, rate: Fraction) -> int:
+    """Return the time of a tick of ``rate`` in µs since the start of the measurement."""
+    return tick * _SECOND_US * rate.denominator // rate.numerator
+
+
+def _frame_number(tick: int, per_tick: Fraction) -> int:
+    return (tick * per_tick.numerator // per_tick.denominator + 1) % _FRAME_NUMBERS
+
+
+class ComputedScene(SceneFunction):
+    """A Scene that is a SceneFunction: subclasses define what the latter contains."""
+
+    num_frames: int | None = None
+
+    @property
+    def length_us(self) -> int | None:
+        """See Scene."""
+        if self.num_frames is None:
+            return None
+        return time_us(self.num_frames, exact_rate(self.measurement_rate_hz))
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
+        """See Scene."""
+        return encode_parameters(only_sections(replace(self.parameters, general=general), sections))
+
+    def start(self) -> None:
+        """See Scene. There is nothing to prepare."""
+
+    def advance(self, elapsed_us: int) -> int | None:  # noqa: ARG002 - there is nothing to prepare
+        """See Scene. There is nothing to prepare."""
+        return None
+
+    def stop(self) -> None:
+        """See Scene. There is nothing to release."""
+
+    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameBuilder:
+        """See Scene."""
+        return FrameBuilder(self, components, event_bytes)
+
 
 LEAD_US: Final = 1_000_000
 """With ``once``, a measurement begins this long after a request for frames. So a client with several

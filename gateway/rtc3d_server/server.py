@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -11,10 +12,20 @@ from gateway.errors import GatewayError, system_reason
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.frame_schedule import SentCounts
 from gateway.rtc3d_server.measurement import Measurement
 from gateway.rtc3d_server.scene import FrameSource, Scene
-from gateway.rtc3d_server.sent_counts import SentCounts
-from gateway.rtc3d_server.timers import call_after_us
+
+
+def call_after_us(delay_us: float, callback: Callable[[], object]) -> asyncio.TimerHandle:
+    """Call ``callback`` after ``delay_us``, rounded up to whole milliseconds; at once if not positive.
+
+    uvloop's timers count whole milliseconds. Without rounding up, a timer could fire just before its
+    time, find nothing due and be set again, many times over.
+    """
+    delay_ms = max(0, math.ceil(delay_us / 1000))
+    return asyncio.get_running_loop().call_later(delay_ms / 1000, callback)
+
 
 _CLOSING_S: Final = 1.0  # how long close() waits for clients to read what was sent
 _log = logging.getLogger(__name__)

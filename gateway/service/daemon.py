@@ -1,24 +1,79 @@
-"""The gateway as a daemon: handles signals, reloads the configuration and notifies systemd."""
+"""The gateway as a daemon: handles signals, reloads the configuration and notifies systemd.
+
+They need cysystemd, which contains libsystemd. It is installed with the optional extra ``systemd``, because
+it has no wheels for platforms without systemd, such as Alpine containers.
+"""
 
 import asyncio
 import logging
 import os
 import signal
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from gateway.config.settings import Settings
 from gateway.errors import ConfigError
-from gateway.gateway import Gateway
-from gateway.log import DefectLog, defect_text
-from gateway.monitoring.process_limits import ProcessLimits, raise_file_limit
-from gateway.monitoring.server import MonitoringServer
-from gateway.monitoring.status_line import status_lines
+from gateway.logs.failures import DefectLog, FailureLog, defect_text
+from gateway.service.gateway import Gateway
+from gateway.service.monitoring.health import status_lines
+from gateway.service.monitoring.process_limits import ProcessLimits, raise_file_limit
+from gateway.service.monitoring.server import MonitoringServer
 from gateway.service.process_end import Signals, named_tasks
-from gateway.service.systemd import SystemdNotifier
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
+
+_DEFAULT_PERIOD_S: Final = 1.0
 
 logger = logging.getLogger(__name__)
+
+
+class SystemdNotifier:
+    """Notifies the systemd that started this process, if one did."""
+
+    def __init__(self) -> None:
+        self._enabled = bool(os.environ.get("NOTIFY_SOCKET"))
+        self._failures = FailureLog(logger, "systemd")
+
+    @property
+    def period_s(self) -> float:
+        """How often to call ``notify_alive``: every second, or twice per WatchdogSec if that is shorter."""
+        # WATCHDOG_PID names another process if the variables were inherited from a supervised parent.
+        if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+            return _DEFAULT_PERIOD_S
+        watchdog_us = int(os.environ.get("WATCHDOG_USEC", "0"))
+        return min(_DEFAULT_PERIOD_S, watchdog_us / 2e6) if watchdog_us else _DEFAULT_PERIOD_S
+
+    def notify_ready(self) -> None:
+        """Report that the start or a reload is complete."""
+        self._notify("READY")
+
+    def notify_reloading(self) -> None:
+        """Report that a reload begins; ``notify_ready`` ends it."""
+        self._notify("RELOADING")
+
+    def notify_stopping(self) -> None:
+        """Report that the service is stopping."""
+        self._notify("STOPPING")
+
+    def notify_alive(self, status: str) -> None:
+        """Reset the watchdog and set the line that ``systemctl status`` shows."""
+        self._notify("WATCHDOG")
+        self._notify("STATUS", " ".join(status.split()))
+
+    def _notify(self, name: str, value: str = "") -> None:
+        if not self._enabled:
+            return
+        try:
+            from cysystemd.daemon import Notification, notify  # noqa: PLC0415 - an optional extra
+
+            notify(Notification[name], value, return_exceptions=False)
+        except ImportError:
+            self._enabled = False
+            logger.warning(
+                "systemd expects notifications, but cysystemd is not installed: "
+                "pip install 'rtc3d-gateway[systemd]', or set Type=exec and no WatchdogSec in the unit"
+            )
+        except (OSError, RuntimeError, ValueError) as error:  # the last two come from cysystemd
+            self._failures.failed(f"cannot send {name}: {error}")
 
 
 async def serve(load: Callable[[], Settings], every_second: Callable[[], None] = lambda: None) -> None:

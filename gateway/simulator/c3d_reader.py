@@ -16,11 +16,11 @@ import threading
 from pathlib import Path
 from typing import Final
 
-from gateway.c3d_files.format_check import PARAMETERS_END_BYTES, problem_of_c3d, problem_of_sizes
-from gateway.child_process import module_environment
+from gateway.c3d_files.receiving import PARAMETERS_END_BYTES, problem_of_c3d, problem_of_sizes
 from gateway.config.files import check_is_file
 from gateway.errors import TakeError
 from gateway.simulator.c3d_recording import C3dRecording, load_recording
+from gateway.workers import module_environment
 
 _MEMORY_BYTES: Final = 512 * 1024**2
 """The address space of the process, 130 MB of which Python and its libraries have."""

@@ -6,8 +6,7 @@ from typing import Final
 import numpy as np
 
 from gateway.rtc3d.components import ComponentType, Items
-from gateway.rtc3d_server.computed_scene import ComputedScene
-from gateway.rtc3d_server.frame_builder import exact_rate, time_us
+from gateway.rtc3d_server.measurement import ComputedScene, exact_rate, time_us
 from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
 from gateway.simulator.c3d_reader import read_c3d
 

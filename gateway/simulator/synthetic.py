@@ -1,16 +1,20 @@
-"""A synthetic scene: moving tools and markers, sine waves, steps on force plates, a button."""
+"""A synthetic scene and its settings: moving tools and markers, sine waves, steps, a button."""
 
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Annotated, Final, Self
 
 import numpy as np
+from pydantic import Field
 
+from gateway.config.section import Section, expects
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, Items
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
     EventParameter,
     ExpectedValue,
+    General,
     Marker,
     Parameters,
     Parameters3D,
@@ -18,12 +22,12 @@ from gateway.rtc3d.parameters import (
     ParametersAnalog,
     ParametersEvents,
     Tool,
+    only_sections,
 )
-from gateway.rtc3d_server.computed_scene import ComputedScene
-from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
-from gateway.simulator.bodies import RigidBodies
-from gateway.simulator.force_plates import ForcePlates
-from gateway.simulator.noise import Noise
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.rtc3d_server.measurement import ComputedScene
+from gateway.rtc3d_server.scene import NO_EVENTS, FrameSource, SampleNumbers, Scene
+from gateway.simulator.bodies import ForcePlates, Noise, RigidBodies
 
 BUTTON_EVENT: Final = 0x123456
 """The id of the only event, as in §6.6. param1 is the button's number, param2 1 (pressed) or 0 (released)."""
@@ -157,3 +161,107 @@ _EVENTS: Final = ParametersEvents(
         ),
     )
 )
+
+
+Size = Annotated[int, Field(strict=True, ge=0, le=10_000), expects("a whole number from 0 to 10000")]
+Rate = Annotated[
+    float,
+    Field(strict=True, ge=0.1, le=100_000, allow_inf_nan=False),
+    expects("a number of samples per second from 0.1 to 100000"),
+]
+Label = Annotated[str, Field(min_length=1, max_length=60), expects("a text of 1 to 60 characters")]
+Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), expects("a whole number, 0 or more")]
+
+
+class SceneSettings(Section):
+    """The arguments of SyntheticScene, and the labels of its markers."""
+
+    markers: Size = 24
+    """The number of markers."""
+
+    tools: Size = 4
+    """The number of 6D tools."""
+
+    analog: Size = 16
+    """The number of analog channels."""
+
+    plates: Size = 2
+    """The number of force plates."""
+
+    rate_hz: Rate = 200.0
+    """Samples per second of markers and tools."""
+
+    analog_rate_hz: Rate = 2000.0
+    """Samples per second of analog channels and force plates."""
+
+    marker_label: Label = "Marker"
+    """The text before the number in the markers' labels."""
+
+    seed: Seed = 1
+    """Another seed gives another scene of the same size."""
+
+    def with_changes(self, changes: Self) -> Self:
+        """Return these settings with the values that ``changes`` sets."""
+        return self.model_copy(update={name: getattr(changes, name) for name in changes.model_fields_set})
+
+    def build(self) -> SyntheticScene:
+        """Return the scene."""
+        scene = SyntheticScene(**self.model_dump(exclude={"marker_label"}))
+        parameters_3d = scene.parameters.markers
+        if parameters_3d is not None:
+            markers = tuple(
+                replace(marker, label=f"{self.marker_label} {marker.id}") for marker in parameters_3d.markers
+            )
+            scene.parameters = replace(scene.parameters, markers=replace(parameters_3d, markers=markers))
+        return scene
+
+
+class RenamedScene:
+    """``scene`` with ``prefix`` before the label of each marker and tool; everything else is the same."""
+
+    def __init__(self, scene: Scene, prefix: str) -> None:
+        self._scene = scene
+        self._prefix = prefix
+
+    @property
+    def parameters(self) -> Parameters:
+        """See Scene."""
+        return _renamed(self._scene.parameters, self._prefix)
+
+    @property
+    def length_us(self) -> int | None:
+        """See Scene."""
+        return self._scene.length_us
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
+        """See Scene."""
+        parameters = self.parameters
+        return encode_parameters(
+            only_sections(replace(parameters, general=parameters.general or general), sections)
+        )
+
+    def start(self) -> None:
+        """See Scene."""
+        self._scene.start()
+
+    def advance(self, elapsed_us: int) -> int | None:
+        """See Scene."""
+        return self._scene.advance(elapsed_us)
+
+    def stop(self) -> None:
+        """See Scene."""
+        self._scene.stop()
+
+    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameSource:
+        """See Scene."""
+        return self._scene.frames(components, event_bytes)
+
+
+def _renamed(parameters: Parameters, prefix: str) -> Parameters:
+    if parameters.markers is not None:
+        markers = tuple(replace(each, label=prefix + each.label) for each in parameters.markers.markers)
+        parameters = replace(parameters, markers=replace(parameters.markers, markers=markers))
+    if parameters.tools is not None:
+        tools = tuple(replace(each, label=prefix + each.label) for each in parameters.tools.tools)
+        parameters = replace(parameters, tools=replace(parameters.tools, tools=tools))
+    return parameters

@@ -1,11 +1,11 @@
-"""Which components of a server share a connection: those that it sends at the same rate (§5.3.5)."""
+"""What to request from a server: which components share a connection (§5.3.5), and at which rate."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate, StreamFrames
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType, described_rate_hz, num_described_items
 from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.server_description import described_rate_hz, num_described_items
 
 _SAME_RATE: Final = 1.01
 """Rates within this factor are one rate: servers round the rates in their parameters."""
@@ -97,3 +97,103 @@ def keys_text(components: Sequence[ComponentType]) -> str:
 def rate_text(rate_hz: float) -> str:
     """Return a rate with at most one decimal."""
     return f"{rate_hz:.1f}".removesuffix(".0")
+
+
+LATE_S: Final = 1.0
+"""How long frames must be late without interruption before a lower rate is requested."""
+
+FIRST_WAIT_S: Final = 10.0
+MAX_WAIT_S: Final = 300.0
+"""How long frames must be in time before a higher rate is requested: at first, and at most."""
+
+MAX_HALVINGS: Final = 8
+"""The lowest rate is 1/256 of the configured one."""
+
+
+def stream_requests(
+    rate: Rate, components: Sequence[ComponentType], server_rate_hz: float | None
+) -> list[StreamFrames]:
+    """Return the StreamFrames commands to try, in order, beginning with the configured rate and components.
+
+    Some servers know neither ``Frequency:n`` nor ``AllFrames`` nor component names (field note 2). The
+    alternatives are: the same rate without names; the divisor 1 instead of AllFrames, or the divisor of
+    ``server_rate_hz`` (the rate in the parameters, if any) nearest to a frequency; the server's default.
+    """
+    names = () if set(components) == set(WIRE_ORDER) else tuple(components)
+    rates: list[Rate] = [rate]
+    if isinstance(rate, AllFrames):
+        rates.append(FrequencyDivisor(1))
+    elif isinstance(rate, Frequency) and server_rate_hz:
+        rates.append(FrequencyDivisor(max(1, round(server_rate_hz / rate.hz))))
+    wanted = [StreamFrames(rate, names), *(StreamFrames(each) for each in rates), StreamFrames()]
+    return list(dict.fromkeys(wanted))
+
+
+def halved(rate: Rate | None, times: int) -> Rate | None:
+    """Return ``rate`` halved ``times`` times. None, the server's default, is taken for all frames."""
+    if times == 0:
+        return rate
+    match rate:
+        case Frequency(hz):
+            return Frequency(hz / 2**times)
+        case FrequencyDivisor(divisor):
+            return FrequencyDivisor(divisor * 2**times)
+        case _:
+            return FrequencyDivisor(2**times)
+
+
+class LagControl:
+    """Decides how often to halve the configured rate, from how late the frames are.
+
+    After LATE_S of late frames it halves the rate once more (a step down). After ``wait_s`` of frames in
+    time it undoes one halving (a step up), until the rate is as configured. A step up fails if a step down
+    follows within ``wait_s``; then ``wait_s`` doubles, up to MAX_WAIT_S. If a step down follows later,
+    ``wait_s`` returns to FIRST_WAIT_S. This avoids retrying the full rate on a link that carries half of it.
+
+    If the rate must not change (``adapt_rate: false``), let ``max_halvings`` be 1: one halving then means
+    that frames are late, and none that they are in time. It is logged as rarely as a rate would change.
+    """
+
+    def __init__(self, max_lag_s: float, max_halvings: int = MAX_HALVINGS) -> None:
+        self._max_lag_s = max_lag_s
+        self._max_halvings = max_halvings
+        self.halvings = 0
+        self.is_late = False
+        """Whether the newest frame was late."""
+        self.wait_s = FIRST_WAIT_S
+        self._since_s: float | None = None  # since when frames are late, or in time, at the current rate
+        self._stepped_up_s: float | None = None
+
+    def observe(self, now_s: float, lag_s: float) -> bool:
+        """Process the lag of one frame; return whether ``halvings`` changed."""
+        is_late = lag_s > self._max_lag_s
+        if is_late is not self.is_late or self._since_s is None:
+            self.is_late = is_late
+            self._since_s = now_s
+            return False
+        held_s = now_s - self._since_s
+        if is_late:
+            return held_s >= LATE_S and self._step_down(now_s)
+        return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
+
+    def restart(self) -> None:
+        """Forget how late the previous frames were, because the next ones do not continue them."""
+        self.is_late = False
+        self._since_s = None
+
+    def _step_down(self, now_s: float) -> bool:
+        if self.halvings >= self._max_halvings:
+            return False
+        if self._stepped_up_s is not None:
+            failed = now_s - self._stepped_up_s < self.wait_s
+            self.wait_s = min(2 * self.wait_s, MAX_WAIT_S) if failed else FIRST_WAIT_S
+            self._stepped_up_s = None
+        self.halvings += 1
+        self._since_s = now_s
+        return True
+
+    def _step_up(self, now_s: float) -> bool:
+        self.halvings -= 1
+        self._stepped_up_s = now_s
+        self._since_s = now_s
+        return True

@@ -4,10 +4,12 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Awaitable, Callable
-from typing import Final, NoReturn
+from typing import Final, NoReturn, Protocol
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import ClosedError, DefectError, LinkError, SilenceError
+from gateway.logs.failures import defect_text
+from gateway.logs.safe_text import safe_text
 from gateway.messages.host_time import host_clock
 from gateway.rtc3d.client_protocol import (
     Answered,
@@ -16,6 +18,7 @@ from gateway.rtc3d.client_protocol import (
     FrameRejected,
     PossibleReply,
     ProtocolEvent,
+    ProtocolState,
     Refused,
     StreamCorrupted,
     UnexpectedPacket,
@@ -24,18 +27,41 @@ from gateway.rtc3d.commands import Bye, Command, StopStreaming
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import FilePiece, Packet, decode_text
-from gateway.rtc3d.protocol_state import ProtocolState
-from gateway.safe_text import safe_text
-from gateway.stream.backlog import Backlog
-from gateway.stream.defects import defect_error
-from gateway.stream.files import FileReceiver
-from gateway.stream.paced_frames import PacedFrames
+from gateway.stream.backlog import Backlog, PacedFrames
+from gateway.stream.process_clock import running_clock
+from gateway.stream.process_timeout import running_timeout
 from gateway.stream.reading import LONG_READ_BYTES, Reading
 from gateway.stream.replies import Replies
-from gateway.stream.running_clock import running_clock
-from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection, set_socket_options
+
+
+def defect_error(defect: BaseException) -> DefectError:
+    """Return the error for an exception that nobody expected."""
+    error = DefectError(f"{defect_text(defect)}; connecting again; report this with the log")
+    error.__cause__ = defect
+    return error
+
+
+class FileReceiver(Protocol):
+    """Takes the C3D files of one stream. Its methods are called in the event loop and must not block."""
+
+    def receive(self, piece: FilePiece) -> None:
+        """Take the next piece of a file."""
+
+    def interrupt(self, reason: str) -> None:
+        """Give up a file that is not complete, because the connection has ended."""
+
+
+class IgnoredFiles:
+    """A FileReceiver that keeps nothing."""
+
+    def receive(self, piece: FilePiece) -> None:
+        """Ignore a piece."""
+
+    def interrupt(self, reason: str) -> None:
+        """Do nothing."""
+
 
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""

@@ -4,7 +4,7 @@ import logging
 from collections import deque
 from typing import Final
 
-from gateway.log import FailureLog
+from gateway.logs.failures import FailureLog
 
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""

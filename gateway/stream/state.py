@@ -3,7 +3,7 @@
 from enum import Enum
 from typing import Final
 
-from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.rtc3d.client_protocol import ProtocolState
 
 
 class Phase(Enum):

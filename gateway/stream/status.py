@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.errors import DefectError, LinkError
-from gateway.log import HOLD_S, DefectLog, EventLog, FailureLog, defect_text
-from gateway.losses import Losses
+from gateway.logs.failures import HOLD_S, DefectLog, EventLog, FailureLog, defect_text
+from gateway.logs.losses import Losses
+from gateway.logs.safe_text import safe_text
 from gateway.messages.host_time import now_utime
-from gateway.rtc3d.protocol_state import ProtocolState
-from gateway.safe_text import safe_text
+from gateway.rtc3d.client_protocol import ProtocolState
 from gateway.stream.clock import ServerClock
 from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
@@ -75,7 +75,7 @@ class StreamStatus:
     lines. ``on_state`` is called after each change of the state, with the former one. ``parameters_version``
     is that of the server's parameters, 0 before the first; all streams of a source have the same.
     ``last_frame_utime`` is when the newest frame arrived, in µs since the Unix epoch, 0 before the first;
-    ``last_frame_s`` is the same on the running clock (see ``gateway.stream.running_clock``), None before the
+    ``last_frame_s`` is the same on the running clock (see ``gateway.stream.process_clock``), None before the
     first. ``connections`` counts the connections, ``tries`` the attempts to connect since the last completed
     handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the server's time
     or frame numbers started again within a connection. ``losses`` counts by cause what was lost before any

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Any, Final
 
+from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import ComponentType
-from gateway.safe_text import safe_text
-from gateway.stream.running_clock import running_clock
+from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import FRAME_REJECTED, StreamStatus
 

@@ -10,7 +10,7 @@ from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.stream.plan import Components, StreamPlan, announced_rates_hz, plan_streams
-from gateway.stream.rate_watch import AnnouncedRates
+from gateway.stream.rate_check import AnnouncedRates
 from gateway.stream.state import StreamState
 from gateway.stream.supervisor import Listener, Supervisor
 

@@ -7,23 +7,19 @@ from typing import NamedTuple, NoReturn
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError
-from gateway.log import log_fields
+from gateway.logs.failures import log_fields
 from gateway.messages.host_time import host_clock
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.backoff import Backoff
-from gateway.stream.change_tasks import ChangeTasks
-from gateway.stream.defects import defect_error
-from gateway.stream.files import FileReceiver
 from gateway.stream.ingest import Ingest, Publish, Skip
-from gateway.stream.parameters import ReadParameters
-from gateway.stream.rate_watch import AnnouncedRates, RateWatch
-from gateway.stream.session import ReadClocks, Session
+from gateway.stream.rate_check import AnnouncedRates, RateWatch
+from gateway.stream.replies import ReadParameters
+from gateway.stream.session import FileReceiver, ReadClocks, Session, defect_error
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
-from gateway.stream.stream_control import StreamControl
-from gateway.stream.tcp import Connect, open_connection
+from gateway.stream.stream_requests import ChangeTasks, StreamControl
+from gateway.stream.tcp import Backoff, Connect, open_connection
 
 logger = logging.getLogger(__name__)
 

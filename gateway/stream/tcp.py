@@ -1,16 +1,114 @@
-"""Opens TCP connections to RT servers, and explains failures."""
+"""Opens TCP connections to RT servers, and explains failures.
+
+A look-up cannot be cancelled, and without an answer it takes half a minute. So each has a thread, and there
+is at most one at a time for a name. asyncio's and uvloop's own look-ups share a few threads.
+"""
 
 import asyncio
 import contextlib
+import ipaddress
+import random
 import socket
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
 from typing import Any, Final
 
-from gateway.config.settings import SourceSettings
+from gateway.config.settings import ReconnectSettings, SourceSettings
 from gateway.errors import FILES_ADVICE, NO_FILES, ConnectError
-from gateway.stream.names import look_up
-from gateway.stream.running_clock import running_clock
-from gateway.stream.running_time import running_timeout
+from gateway.stream.process_clock import running_clock
+from gateway.stream.process_timeout import running_timeout
+from gateway.workers import WorkerThread, result_of
+
+MAX_ADDRESSES: Final = 8
+"""How many addresses of a name are tried."""
+
+_look_ups: Final[dict[str, Future[list[str]]]] = {}
+"""By name: those that run, and those that ended after all who waited for them had given up."""
+
+
+def is_address(host: str) -> bool:
+    """Return whether ``host`` is a number: an IPv4 address, or an IPv6 address with or without a scope."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+async def look_up(host: str) -> list[str]:
+    """Return the addresses of ``host``, at most MAX_ADDRESSES, in the order in which to try them.
+
+    An address is returned as it is. Callers limit the time: an answer that comes later is kept for the next
+    call. Raises OSError, which is gaierror if the name is not known.
+    """
+    if is_address(host):
+        return [host]
+    found = _look_ups.get(host)
+    if found is None:
+        found = _look_ups[host] = WorkerThread(f"look-up {host}").submit(lambda: _get_addresses(host))
+    try:
+        return await result_of(found)  # others may wait for it, too
+    finally:
+        if found.done() and _look_ups.get(host) is found:
+            del _look_ups[host]
+
+
+def _get_addresses(host: str) -> list[str]:
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    addresses = dict.fromkeys(_text(*address) for *_, address in found)
+    return list(addresses)[:MAX_ADDRESSES]
+
+
+def _text(host: str | int, _port: object = None, _flow: object = 0, scope: object = 0) -> str:
+    """Return an address of getaddrinfo as text, with its scope if it has one, for example fe80::1%2."""
+    return f"{host}%{scope}" if scope and "%" not in str(host) else str(host)
+
+
+STEADY_S: Final = 10.0
+"""A connection with data that lasted this long has succeeded: the delays start again."""
+
+_MAX_DOUBLINGS: Final = 30
+
+
+class Backoff:
+    """The delays between attempts: doubling up to a maximum, each shortened at random by up to half.
+
+    The randomness prevents many gateways from reconnecting to a restarted server at the same moment.
+
+    A connection that brings data and lasts for STEADY_S starts the delays again. One that breaks earlier
+    counts as a failure. So a server that sends a few good frames and breaks, again and again, is tried as
+    rarely as one that is off. There is one exception: the delays that have grown while a server was off start
+    again with the first data. So a server that comes back and is restarted once more is not kept waiting.
+    """
+
+    def __init__(self, reconnect: ReconnectSettings) -> None:
+        self._first_s = reconnect.first_delay_s
+        self._max_s = reconnect.max_delay_s
+        self._num_failures = 0  # attempts in a row without data
+        self._num_breaks = 0  # connections in a row with data, but not for STEADY_S
+
+    @property
+    def shortest_s(self) -> float:
+        """A first delay, shortened at random."""
+        return self._shortened(self._first_s)
+
+    def delay_after(self, lasted_s: float, *, had_data: bool) -> float:
+        """Return the delay after an attempt that lasted so long, and brought data or not."""
+        if not had_data:
+            self._num_failures += 1
+        elif lasted_s < STEADY_S:
+            self._num_failures = 0
+            self._num_breaks += 1
+        else:
+            self._num_failures = 1
+            self._num_breaks = 0
+        doublings = min(self._num_failures + self._num_breaks - 1, _MAX_DOUBLINGS)
+        return self._shortened(min(self._first_s * 2.0**doublings, self._max_s))
+
+    @staticmethod
+    def _shortened(delay_s: float) -> float:
+        return delay_s * random.uniform(0.5, 1.0)  # noqa: S311 - spreads load, hides nothing
+
 
 Connect = Callable[[SourceSettings, Any], Awaitable[asyncio.Transport]]
 """Connects a protocol, an object with the methods of ``asyncio.Protocol``, to a source's server."""

@@ -10,11 +10,11 @@ import rtc3d
 
 from gateway.errors import OutputError, ProtocolError
 from gateway.messages.decode import decode
-from gateway.messages.parameters_text import xml_bytes
+from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.settings import lcm_queries_url
-from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway
+from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
 from gateway.subscriber.reception import MAX_SERIES, Reception
 from gateway.subscriber.series import FINGERPRINTS, POSE, Series, Source
 
@@ -182,7 +182,7 @@ class LcmGatewaySubscriber:
 
     def silence(self) -> str:
         """See GatewaySubscriber."""
-        return no_gateway(" ".join(self._names) or self._prefix, self._url)
+        return no_gateway_on_lcm(" ".join(self._names) or self._prefix, self._url)
 
     def close(self) -> None:
         """See GatewaySubscriber."""

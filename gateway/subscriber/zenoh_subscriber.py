@@ -10,7 +10,7 @@ import zenoh
 
 from gateway.messages.topics import is_json_key, lcm_channel, zenoh_key
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
-from gateway.outputs.zenoh.subscriber import no_gateway, served_sources
+from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.subscriber.reception import MAX_SERIES, MAX_XML_BYTES, Reception
 from gateway.subscriber.series import POSE, Series, Source
@@ -164,7 +164,7 @@ class ZenohGatewaySubscriber:
 
     def silence(self) -> str:
         """See GatewaySubscriber."""
-        return no_gateway(self._prefix, self._sources, served_sources(self._session, self._prefix))
+        return no_gateway_on_zenoh(self._prefix, self._sources, served_sources(self._session, self._prefix))
 
     def close(self) -> None:
         """See GatewaySubscriber."""

@@ -1,13 +1,25 @@
 """Takes: recordings of a gateway's messages as LCM event logs, written and read.
 
 ``from gateway.takes import open_take`` is the beginning of an analysis: see its docstring.
+
+In ``files``:
+
+- Writing: ``recording`` has one thread for all files and a queue with a limit in front of it. ``description``
+  says what stands at the beginning and at the end of a file; ``files`` creates files and checks names. The
+  outputs and the commands that record are built on these.
+- Reading: ``event_log`` reads events one after the other and goes on behind damage. ``reader`` adds what each
+  of them is: the source, the component or kind of message.
+- Arrays: ``take`` and ``series`` decode a take into numpy arrays; ``component_rows`` does so for many
+  messages at once.
+- Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory, and
+  ``gaps`` finds what interrupts it.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gateway.takes.series import ParametersEntry, Series
-    from gateway.takes.take import Take, TakeSource, open_take
+    from gateway.takes.files.series import ParametersEntry, Series
+    from gateway.takes.files.take import Take, TakeSource, open_take
 
 __all__ = ["ParametersEntry", "Series", "Take", "TakeSource", "open_take"]
 
@@ -16,6 +28,6 @@ def __getattr__(name: str) -> Any:
     """Import the library when it is used: a gateway that records does not need it."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from gateway.takes import series, take  # noqa: PLC0415 - see above
+    from gateway.takes.files import series, take  # noqa: PLC0415 - see above
 
     return getattr(take, name, None) or getattr(series, name)

@@ -16,14 +16,14 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import FramePublisher, Output
 from gateway.outputs.registry import OUTPUTS
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
-from gateway.worker_thread import make_call
+from gateway.workers import make_call
 from tests.contract.frame_rigs import (
     ALL,
     LAB,

@@ -16,9 +16,9 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from gateway.errors import QueryError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import Answer, KeyPath, Output, ServerParameters
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.rtc3d.components import (

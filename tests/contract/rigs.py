@@ -19,7 +19,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber
-from gateway.takes.event_log import EventLogReader
+from gateway.takes.files.event_log import EventLogReader
 from tests.lcm_relay import LcmRelay
 from tests.needs import need_programs
 from tests.networks import (

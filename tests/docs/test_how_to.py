@@ -9,12 +9,12 @@ from typing import Final
 import pytest
 import zenoh
 
-from gateway.takes.reader import TakeReader
+from gateway.takes.files.reader import TakeReader
 from tests.documents import ROOT
 from tests.terminals import Terminal, folder, follow, terminals
-from tests.unit.export.exported import read_ezc3d
-from tests.unit.export.read_mcap import read_mcap
-from tests.unit.export.test_trc import read_trc
+from tests.unit.takes.export.exported import read_ezc3d
+from tests.unit.takes.export.read_mcap import read_mcap
+from tests.unit.takes.export.test_trc import read_trc
 
 pytestmark = pytest.mark.netns
 

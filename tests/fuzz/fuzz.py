@@ -17,7 +17,7 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["gateway"]):
-    from gateway.cli.take_json import statistics_json
+    from gateway.cli.take_report import statistics_json
     from gateway.errors import (
         CommandError,
         ConfigError,
@@ -27,18 +27,16 @@ with atheris.instrument_imports(include=["gateway"]):
         TakeError,
     )
     from gateway.messages.decode import decode, to_json
-    from gateway.messages.encode import encode_message
-    from gateway.messages.stamp import Stamp
+    from gateway.messages.encode import Stamp, encode_message
     from gateway.messages.summary import summarise
-    from gateway.rtc3d.client_protocol import ClientProtocol
+    from gateway.rtc3d.client_protocol import ClientProtocol, ProtocolState
     from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
     from gateway.rtc3d.frames import detect_byte_order, split_frame
     from gateway.rtc3d.packets import PacketReader
     from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
-    from gateway.rtc3d.protocol_state import ProtocolState
     from gateway.takes import open_take
-    from gateway.takes.event_log import encode_event
-    from gateway.takes.statistics import take_statistics
+    from gateway.takes.files.event_log import encode_event
+    from gateway.takes.files.statistics import take_statistics
     from tests.configurations import load
 
 from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from gateway.export.formats import export_take
-from gateway.export.job import ExportJob
-from gateway.gateway import Gateway
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes.export.formats import export_take
+from gateway.takes.export.job import ExportJob
 from tests.configurations import local_settings, local_source
 from tests.foxglove_viewer import viewing
 from tests.networks import free_port

@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple
 import pytest
 import zenoh
 
-from gateway.live.live_data import LiveData
+from gateway.display.live.live_data import LiveData
 from gateway.subscriber.subscribe import Transport, subscribe_all
-from gateway.takes.event_log import EventLogReader
+from gateway.takes.files.event_log import EventLogReader
 from tests.command_process import run_command
 from tests.configurations import write_config
 from tests.gateway_process import program, simulator

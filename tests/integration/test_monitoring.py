@@ -22,11 +22,11 @@ from gateway.config.settings import (
     MetricsSettings,
     StreamSettings,
 )
-from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
@@ -262,7 +262,7 @@ async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.
         port = other.getsockname()[1]
         async with simulator() as server, monitored_gateway(lab(server.port, port)) as gateway:
             await until_all(gateway, lambda status: status.state is StreamState.STREAMING)
-    [warning] = [record for record in caplog.records if record.name == "gateway.monitoring.server"]
+    [warning] = [record for record in caplog.records if record.name == "gateway.service.monitoring.server"]
     assert warning.levelno == logging.WARNING
     assert re.search(f"port {port}: .*metrics.port", warning.message)
 

@@ -12,12 +12,12 @@ import rtc3d
 import zenoh
 import zenoh.ext
 
-from gateway.gateway import Gateway
 from gateway.messages.decode import decode, prefix_of
-from gateway.outputs.lcm import parameters as lcm_parameters
+from gateway.outputs.lcm import queries as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.simulator.faults.server_faults import Rename
+from gateway.service.gateway import Gateway
+from gateway.simulator.faults.connection_faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_port, lcm_url, open_zenoh

@@ -22,7 +22,7 @@ async def proxied() -> AsyncIterator[tuple[Simulator, FuzzingProxy, RawClient]]:
         FuzzingProxy(simulator.port) as proxy,
         connected(proxy) as client,
     ):
-        await until(lambda: bool(simulator.connections))
+        await until(lambda: bool(simulator.connections) and proxy.num_connections == 1)
         yield simulator, proxy, client
 
 

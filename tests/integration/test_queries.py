@@ -13,13 +13,13 @@ import rtc3d
 import zenoh
 
 from gateway.config.settings import StreamSettings
-from gateway.gateway import Gateway
 from gateway.messages.decode import decode, to_json
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.service.gateway import Gateway
 from tests.networks import free_endpoint, lcm_url
 from tests.queried_gateway import (
     ParameterServer,

@@ -13,7 +13,6 @@ import pytest
 
 from gateway.config.settings import MetricsSettings, Settings
 from gateway.errors import ConfigError
-from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import LcmSettings
@@ -21,6 +20,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
 from gateway.service.daemon import Daemon
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.configurations import local_settings, local_source

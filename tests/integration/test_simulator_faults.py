@@ -12,13 +12,20 @@ import pytest
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.kinds import KINDS
-from gateway.simulator.faults.momentary_faults import Cut
+from gateway.simulator.faults.connection_faults import (
+    ChangeScene,
+    Cut,
+    Delay,
+    HalfOpen,
+    Merge,
+    NoMeasurement,
+    Restart,
+    Split,
+)
+from gateway.simulator.faults.control import KINDS
 from gateway.simulator.faults.reply_faults import LateAcknowledgements
-from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Restart
-from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Merge, Split
-from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SceneSettings
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (

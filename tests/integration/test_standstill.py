@@ -27,7 +27,7 @@ ROUNDS: Final = 3
 
 WAITER: Final = """
 import asyncio, contextlib, os, uvloop
-from gateway.stream.running_time import running_timeout
+from gateway.stream.process_timeout import running_timeout
 
 async def wait_for_bytes():
     loop = asyncio.get_running_loop()

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from gateway.gateway import Gateway
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
+from gateway.service.gateway import Gateway
 from tests.configurations import local_settings, local_source
 from tests.needs import need
 from tests.networks import free_port

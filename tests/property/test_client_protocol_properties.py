@@ -5,7 +5,14 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.rtc3d.client_protocol import Answered, ClientProtocol, FrameRejected, ProtocolEvent, Refused
+from gateway.rtc3d.client_protocol import (
+    Answered,
+    ClientProtocol,
+    FrameRejected,
+    ProtocolEvent,
+    ProtocolState,
+    Refused,
+)
 from gateway.rtc3d.commands import (
     AllFrames,
     Command,
@@ -18,7 +25,6 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.frames import Frame, split_frame
-from gateway.rtc3d.protocol_state import ProtocolState
 from tests.servers import ok, packet
 from tests.strategies import damaged, pieces_of
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME

@@ -16,8 +16,7 @@ from gateway.rtc3d.components import (
     big_endian_content,
     encode_component,
 )
-from gateway.rtc3d.frame_reader import FrameReader
-from gateway.rtc3d.frames import Frame, detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.frames import Frame, FrameReader, detect_byte_order, encode_frame, split_frame
 from tests.strategies import damaged
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 

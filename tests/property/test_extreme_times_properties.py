@@ -13,15 +13,15 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.doctor.observation import ObservedComponent
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode, to_json
-from gateway.messages.limits import encode_within_limits
 from gateway.messages.summary import summarise
+from gateway.messages.texts import encode_within_limits
 from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.stream.ingest import Ingest
-from gateway.stream.rate_watch import RateWatch
+from gateway.stream.rate_check import RateWatch
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 

@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 from gateway.errors import ProtocolError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode, to_json
-from gateway.messages.encode import encode_message
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp, encode_message, tool_poses
 from gateway.messages.summary import summarise
-from gateway.messages.tool_pose import tool_poses
 from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, zenoh_key
-from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import split_frame

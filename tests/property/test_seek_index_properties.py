@@ -6,10 +6,9 @@ from tempfile import TemporaryDirectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.replay.play_list import Entry, Selection, play_list
-from gateway.replay.seek_index import SeekIndex
-from gateway.replay.timeline import ReplayTimeline
-from gateway.takes.reader import TakeReader
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.replay.play_list import Entry, SeekIndex, Selection, play_list
+from gateway.takes.replay.timeline import ReplayTimeline
 from tests.takes import START_UTIME, description, markers, parameters, write_take
 
 XML = b"<Parameters><The_3D><Markers>1</Markers></The_3D></Parameters>"

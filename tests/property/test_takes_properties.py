@@ -11,16 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from gateway.cli.take_json import statistics_json
-from gateway.cli.take_report import write_report
+from gateway.cli.take_report import statistics_json, write_report
 from gateway.errors import ProtocolError, TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes import open_take
-from gateway.takes.event_log import EventLogReader, encode_event
-from gateway.takes.reader import TakeReader
-from gateway.takes.statistics import take_statistics
+from gateway.takes.files.event_log import EventLogReader, encode_event
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.statistics import take_statistics
 from tests.strategies import damaged
 from tests.takes import START_UTIME, Message, description, parameters
 from tests.vectors import COMPONENTS

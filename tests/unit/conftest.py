@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from tests.settable_clock import Clock
-from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.service.scripted_sources import Servers, SlowThreads, use_scripted_servers
 from tests.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {

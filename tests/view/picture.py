@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import FloatRect, Page
 
-from gateway.takes.component_rows import Array
+from gateway.takes.files.component_rows import Array
 
 Position = tuple[float, float, float]
 

@@ -13,8 +13,8 @@ import numpy as np
 import rtc3d
 import zenoh
 
+from gateway.messages.encode import PREFIX
 from gateway.messages.host_time import now_utime
-from gateway.messages.stamp import PREFIX
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.subscriber.series import FINGERPRINTS
 from tests.networks import free_endpoint, open_zenoh

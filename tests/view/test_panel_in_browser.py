@@ -9,13 +9,13 @@ from typing import Final
 import pytest
 from playwright.sync_api import Page, expect
 
+from gateway.display.view.panel import Panel
+from gateway.display.view.server import ViewServer, open_server
+from gateway.display.view.viewer import PERIOD_S
 from gateway.rtc3d.components import ComponentType
-from gateway.view.panel import Panel
-from gateway.view.server import ViewServer, open_server
-from gateway.view.viewer import PERIOD_S
 from tests.browser import NewPage, chromium, new_page
 from tests.statuses import stream
-from tests.unit.view.live_lab import Lab
+from tests.unit.display.view.live_lab import Lab
 
 pytestmark = pytest.mark.chromium
 

@@ -8,7 +8,7 @@ from typing import Final
 import pytest
 from playwright.sync_api import Browser
 
-from gateway.takes.component_rows import Array
+from gateway.takes.files.component_rows import Array
 from tests.browser import NewPage, chromium, new_page, pages
 from tests.gateway_process import gateway_process, simulator
 from tests.networks import free_port

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.listen_address import from_this_computer, host_in_url, is_loopback, listen_problem
 
@@ -73,7 +73,7 @@ def _advertised_topics(settings: FoxgloveSettings) -> list[str] | None:
     from websockets.sync.client import connect  # noqa: PLC0415
     from websockets.typing import Subprotocol  # noqa: PLC0415
 
-    from gateway.outputs.foxglove.protocol import SUBPROTOCOLS  # noqa: PLC0415
+    from gateway.outputs.foxglove.connections import SUBPROTOCOLS  # noqa: PLC0415
 
     host = host_in_url(from_this_computer(settings.host))
     names = [Subprotocol(name) for name in SUBPROTOCOLS]

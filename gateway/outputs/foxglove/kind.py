@@ -3,10 +3,9 @@
 from typing import Final
 
 from gateway.outputs.contract import Output
-from gateway.outputs.extras import missing_package
 from gateway.outputs.foxglove.checks import CHECKS, check_foxglove, leaves_host
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.kind import OutputKind
+from gateway.outputs.kind import OutputKind, missing_package
 
 
 def _create(settings: FoxgloveSettings) -> Output:

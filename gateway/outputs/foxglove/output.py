@@ -7,19 +7,23 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gateway.errors import system_reason
-from gateway.log import DefectLog, FailureLog, defect_text
-from gateway.losses import Losses
+from gateway.logs.failures import DefectLog, FailureLog, defect_text
+from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
-from gateway.outputs.foxglove.live_source import SLOW
-from gateway.outputs.foxglove.publisher import QUEUE_FULL, FoxglovePublisher, ServedSource
+from gateway.outputs.contract import (
+    FramePublisher,
+    IgnoringPublisher,
+    Output,
+    OutputHealth,
+    Publisher,
+    ServerParameters,
+)
+from gateway.outputs.foxglove.live_source import QUEUE_FULL, SLOW, FoxglovePublisher, ServedSource
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.listen_address import host_in_url
-from gateway.outputs.loop_thread import LoopThread
-from gateway.outputs.no_topics import IgnoringPublisher
-from gateway.outputs.status import OutputHealth
+from gateway.outputs.threads import LoopThread
 
 _RETRY_S: Final = 1.0
 _CLOSE_S: Final = 1.0

@@ -17,8 +17,8 @@ from websockets.typing import Subprotocol
 
 from gateway.errors import QueryError
 from gateway.foxglove_schemas.topics import Topic
-from gateway.log import DefectLog
-from gateway.outputs.foxglove import protocol
+from gateway.logs.failures import DefectLog
+from gateway.outputs.foxglove import connections
 from gateway.outputs.foxglove.connections import (
     HANDSHAKE_TIMEOUT_S,
     MAX_REQUEST_BYTES,
@@ -49,7 +49,7 @@ class Channel:
     def __init__(self, number: int, topic: Topic, on_change: Callable[[Viewer | None], None]) -> None:
         self.number = number
         self.topic = topic
-        self.text = protocol.channel_text(number, topic)
+        self.text = connections.channel_text(number, topic)
         self.subscribers: dict[Viewer, int] = {}
         self.on_change = on_change
 
@@ -64,7 +64,7 @@ class FoxgloveServer:
     def __init__(self, host: str, port: int, session: str, origins: Sequence[str] = ()) -> None:
         self._host = host
         self._port = port
-        self._info = protocol.server_info(SERVER_NAME, session)
+        self._info = connections.server_info(SERVER_NAME, session)
         self._channels: dict[int, Channel] = {}
         self._last_number = 0
         self._viewers: set[Viewer] = set()
@@ -86,7 +86,7 @@ class FoxgloveServer:
             self._serve,
             self._host,
             self._port,
-            subprotocols=[Subprotocol(name) for name in protocol.SUBPROTOCOLS],
+            subprotocols=[Subprotocol(name) for name in connections.SUBPROTOCOLS],
             compression=None,  # it would cost more than a network in a laboratory
             process_request=self._admission.refuse,
             open_timeout=HANDSHAKE_TIMEOUT_S,
@@ -114,7 +114,7 @@ class FoxgloveServer:
         channel = Channel(self._last_number, topic, on_change)
         self._channels[channel.number] = channel
         for viewer in self._viewers:
-            viewer.send_control(protocol.advertise([channel.text]))
+            viewer.send_control(connections.advertise([channel.text]))
         return channel
 
     def close_channels(self, channels: list[Channel]) -> None:
@@ -125,7 +125,7 @@ class FoxgloveServer:
                 del viewer.subscriptions[number]
             channel.subscribers.clear()
         if channels:
-            message = protocol.unadvertise([channel.number for channel in channels])
+            message = connections.unadvertise([channel.number for channel in channels])
             for viewer in self._viewers:
                 viewer.send_control(message)
 
@@ -140,7 +140,7 @@ class FoxgloveServer:
         self._viewers.add(viewer)
         try:
             viewer.send_control(self._info)
-            viewer.send_control(protocol.advertise(channel.text for channel in self._channels.values()))
+            viewer.send_control(connections.advertise(channel.text for channel in self._channels.values()))
             async for message in connection:
                 self._handle(viewer, message)
         except ConnectionClosed:
@@ -156,15 +156,15 @@ class FoxgloveServer:
 
     def _handle(self, viewer: Viewer, message: str | bytes) -> None:
         try:
-            request = protocol.parse_request(message)
+            request = connections.parse_request(message)
         except QueryError as error:
-            viewer.send_control(protocol.error(str(error)))
+            viewer.send_control(connections.error(str(error)))
             return
         problems = [self._subscribe(viewer, *subscription) for subscription in request.subscriptions]
         for number in request.ended:
             self._unsubscribe(viewer, number)
         if problem := next(filter(None, problems), ""):  # one of them is enough for the user
-            viewer.send_control(protocol.error(problem))
+            viewer.send_control(connections.error(problem))
 
     def _subscribe(self, viewer: Viewer, number: int, channel_number: int) -> str:
         """Subscribe a viewer to a channel. Return why the subscription is ignored; "" if it is not."""

@@ -6,7 +6,7 @@ from typing import Final
 from urllib.parse import parse_qs
 
 from gateway.errors import OutputError
-from gateway.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.lcm.connection import (
     MULTICAST_SCHEMES,
     multicast_interface,

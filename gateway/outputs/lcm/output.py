@@ -7,14 +7,13 @@ from collections.abc import Mapping
 
 import lcm
 
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.outputs.contract import Output, QueryService, ServerParameters
+from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters
 from gateway.outputs.lcm.queries import LcmQueries
 from gateway.outputs.lcm.sender import LcmPublisher
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import new_sender
-from gateway.outputs.status import OutputHealth
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import lcm
 
 from gateway.errors import OutputError
-from gateway.log import HOLD_S, FailureLog
+from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.outputs.lcm.connection import open_lcm_to_send, send_problem
 
 _NEVER: Final = float("inf")

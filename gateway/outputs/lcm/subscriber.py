@@ -8,7 +8,7 @@ from typing import Final
 
 import lcm
 
-from gateway.log import FailureLog
+from gateway.logs.failures import FailureLog
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.lcm.connection import open_lcm, receiving_url, reconnect
@@ -84,7 +84,7 @@ def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
     return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)
 
 
-def no_gateway(name: str, url: str) -> str:
+def no_gateway_on_lcm(name: str, url: str) -> str:
     """Return why nothing may arrive; ``name`` is the prefix or what the channels of the source begin with."""
     return (
         f"no gateway found on LCM ({name}, {url}); check that it is running with this prefix and URL, and "

@@ -9,10 +9,10 @@ from typing import Final
 import lcm
 
 from gateway.errors import OutputError
-from gateway.log import HOLD_S, FailureLog
+from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmSender
-from gateway.worker_thread import thread_starts
+from gateway.workers import thread_starts
 
 MAX_QUEUED_BYTES: Final = 8 * 1024 * 1024
 MAX_QUEUED_MESSAGES: Final = 10_000

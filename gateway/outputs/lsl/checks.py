@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from gateway.errors import ConfigError, OutputError
-from gateway.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.logs.safe_text import safe_text
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerParameters
+from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import lsl_environment
 from gateway.rtc3d.parameters import Parameters, ParametersEvents
-from gateway.safe_text import safe_text
 
 CHECKS: Final = ("opens", "found", "gateway")
 

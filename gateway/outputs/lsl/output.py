@@ -12,20 +12,23 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gateway.errors import ConfigError
-from gateway.log import DefectLog
-from gateway.losses import Losses
+from gateway.logs.failures import DefectLog
+from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
-from gateway.outputs.event_loop import in_this_loop
-from gateway.outputs.extras import missing_package
-from gateway.outputs.lsl.capture_time import SuspendedTime
-from gateway.outputs.lsl.publisher import LslFramePublisher
+from gateway.outputs.contract import (
+    FramePublisher,
+    IgnoringPublisher,
+    Output,
+    OutputHealth,
+    Publisher,
+    ServerParameters,
+)
+from gateway.outputs.kind import missing_package
+from gateway.outputs.lsl.publisher import LslFramePublisher, SuspendedTime
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.source_streams import SourceStreams
 from gateway.outputs.lsl.supervisor import LslProcesses
-from gateway.outputs.no_topics import IgnoringPublisher
-from gateway.outputs.send_thread import SendThread
-from gateway.outputs.status import OutputHealth
+from gateway.outputs.threads import SendThread, in_this_loop
 
 MIN_PAUSE_S: Final = 0.005
 """The thread that sends pauses at least so long, so that frames at a high rate are sent several at a time."""

@@ -20,8 +20,8 @@ import threading
 import time
 from typing import Any, Final
 
+from gateway.logs.safe_text import safe_text
 from gateway.outputs.lsl.wire import REPORT_INTERVAL_S, Kind, Message, MessageReader, Report, decode_samples
-from gateway.safe_text import safe_text
 
 MAX_MEMORY_BYTES: Final = 768 * 1024 * 1024
 MAX_FILES: Final = 4096

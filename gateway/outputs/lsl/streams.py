@@ -9,8 +9,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
-from gateway.descriptions.fitting_labels import fitting_labels, printable
-from gateway.descriptions.labels import Description, describe
+from gateway.descriptions.labels import Description, describe, fitting_labels, printable
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS, Parameters

@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from gateway.child_process import module_environment
-from gateway.log import FailureLog
+from gateway.logs.failures import FailureLog
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.wire import Message, Report
-from gateway.worker_thread import thread_starts
+from gateway.workers import module_environment, thread_starts
 
 SILENCE_S: Final = 10.0
 """If the process reports nothing for so long, or takes nothing, it is killed and another one started."""

@@ -6,13 +6,12 @@ from typing import Final
 
 import zenoh
 
-from gateway.descriptions.fitting_labels import printable
-from gateway.findings import Finding, MessageLoad, Subject, as_sentence
-from gateway.outputs.ros2.message_types import NO_HASH, ROS_TYPES
-from gateway.outputs.ros2.router import REMEDY, client_config
+from gateway.descriptions.labels import printable
+from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.ros2.messages import NO_HASH, ROS_TYPES
+from gateway.outputs.ros2.output import REMEDY, client_config
 from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.ros2.topic import NODE_NAME
-from gateway.outputs.ros2.wire import SeenEntity, full_name, seen_entity, tokens_of
+from gateway.outputs.ros2.topic import NODE_NAME, SeenEntity, full_name, seen_entity, tokens_of
 from gateway.outputs.zenoh.checks import is_local
 from gateway.outputs.zenoh.config import zenoh_reason
 

@@ -8,9 +8,9 @@ from typing import Any, Final
 import zenoh
 
 from gateway.errors import OutputError
-from gateway.log import DefectLog
+from gateway.logs.failures import DefectLog
 from gateway.messages.decode import decode
-from gateway.outputs.ros2 import cdr
+from gateway.outputs.ros2 import messages
 from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
 from gateway.outputs.ros2.source import Sender
 from gateway.outputs.ros2.topic import RosTopic
@@ -74,7 +74,7 @@ class DiagnosticsPublisher:
         try:
             previous, self._previous = self._previous, decode(message)
             statuses = diagnostics_of(self._previous, previous, self._names())
-            self._topic.put(diagnostic_array(cdr.stamp(self._previous.utime), statuses), time.time_ns())
+            self._topic.put(diagnostic_array(messages.stamp(self._previous.utime), statuses), time.time_ns())
         except zenoh.ZError as error:
             logger.debug("ros2: publishing diagnostics: %s", zenoh_reason(error))
         except Exception as defect:  # noqa: BLE001 - the sending thread continues

@@ -1,21 +1,156 @@
 """The messages of ROS 2 in CDR. What is the same in all messages of a topic is encoded once.
 
+Four bytes say so (ENCAPSULATION). Each value is aligned to its own size, counted from the end of these four
+bytes. A string is its length with the final NUL (uint32), its UTF-8 bytes, and the NUL. A sequence is its
+length (uint32) and its items.
+
+A test compares the hashes with those that rosbags computes from the definitions (REP 2011). They are the same
+in all distributions since Iron.
+
 The stamps are the results of ``cdr.stamp``. All positions are in metres.
 """
 
 import struct
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from gateway.outputs.ros2.cdr import ENCAPSULATION, CdrWriter
+ENCAPSULATION: Final = b"\x00\x01\x00\x00"
+"""The first bytes of every message: CDR version 1, little-endian, no options."""
+
+MAX_STAMP_S: Final = (1 << 31) - 1
+"""The seconds of builtin_interfaces/Time are an int32."""
+
+_UINT32_STRUCT: Final = struct.Struct("<I")
+_STAMP: Final = struct.Struct("<iI")
+
+
+def padding(offset: int, alignment: int) -> bytes:
+    """Return the zeros that align a value which would be at ``offset``."""
+    return bytes(-offset % alignment)
+
+
+def stamp(utime: int) -> bytes:
+    """Return a builtin_interfaces/Time for a time in µs since the Unix epoch, moved into its range."""
+    seconds, microseconds = divmod(utime, 1_000_000)
+    return _STAMP.pack(max(-MAX_STAMP_S - 1, min(seconds, MAX_STAMP_S)), 1000 * microseconds)
+
+
+class CdrWriter:
+    """Appends values, with the padding that each of them needs.
+
+    ``offset`` is where the first value will be in the message, not counting ENCAPSULATION, if only a part of
+    a message is written. ``content`` is what has been written, from there on.
+    """
+
+    def __init__(self, offset: int = 0) -> None:
+        self._first = offset
+        self._parts: list[bytes] = []
+        self._offset = offset
+
+    @property
+    def content(self) -> bytes:
+        """The bytes written so far."""
+        return b"".join(self._parts)
+
+    def raw(self, content: bytes) -> Self:
+        """Append bytes as they are; the caller knows their alignment."""
+        self._parts.append(content)
+        self._offset += len(content)
+        return self
+
+    def align(self, alignment: int) -> Self:
+        """Append zeros until the next value is aligned."""
+        return self.raw(padding(self._offset, alignment))
+
+    def uint8(self, *values: int) -> Self:
+        """Append numbers of one byte; a bool is one of them."""
+        return self.raw(bytes(values))
+
+    def uint32(self, *values: int) -> Self:
+        """Append numbers of four bytes."""
+        self.align(4)
+        for value in values:
+            self.raw(_UINT32_STRUCT.pack(value))
+        return self
+
+    def string(self, text: str) -> Self:
+        """Append a text. A NUL would end it early, so it becomes a replacement character."""
+        encoded = text.replace("\0", "\ufffd").encode(errors="replace")
+        return self.uint32(len(encoded) + 1).raw(encoded).uint8(0)
+
+    def strings(self, texts: Iterable[str]) -> Self:
+        """Append texts one after the other, without their number."""
+        for text in texts:
+            self.string(text)
+        return self
+
+
+HUMBLE: Final = "humble"
+"""The distribution that knows no hashes."""
+
+NO_HASH: Final = "TypeHashNotSupported"
+"""What Humble has in place of a hash."""
+
+
+class RosType(NamedTuple):
+    """A message type, such as geometry_msgs/msg/Pose, and the hash of its definition (RIHS01)."""
+
+    name: str
+    type_hash: str
+
+    @property
+    def dds_name(self) -> str:
+        """The name on the wire: geometry_msgs::msg::dds_::Pose_."""
+        package, kind, name = self.name.split("/")
+        return f"{package}::{kind}::dds_::{name}_"
+
+    def hash_in(self, distribution: str) -> str:
+        """Return what a distribution puts in place of the hash."""
+        return NO_HASH if distribution == HUMBLE else self.type_hash
+
+
+POSE_STAMPED: Final = RosType(
+    "geometry_msgs/msg/PoseStamped",
+    "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+)
+WRENCH_STAMPED: Final = RosType(
+    "geometry_msgs/msg/WrenchStamped",
+    "RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
+)
+TF_MESSAGE: Final = RosType(
+    "tf2_msgs/msg/TFMessage",
+    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+)
+POINT_CLOUD: Final = RosType(
+    "sensor_msgs/msg/PointCloud2",
+    "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+)
+FLOAT_ARRAY: Final = RosType(
+    "std_msgs/msg/Float32MultiArray",
+    "RIHS01_0599f6f85b4bfca379873a0b4375a0aca022156bd2d7021275d116ed1fa8bfe0",
+)
+DIAGNOSTIC_ARRAY: Final = RosType(
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+)
+
+ROS_TYPES: Final = (
+    POSE_STAMPED,
+    WRENCH_STAMPED,
+    TF_MESSAGE,
+    POINT_CLOUD,
+    FLOAT_ARRAY,
+    DIAGNOSTIC_ARRAY,
+)
+"""All of them."""
+
 
 Array = npt.NDArray[Any]
 
 _STAMP_BYTES: Final = 8
-_COUNT: Final = struct.Struct("<I")
 _COUNT_BYTES: Final = 4
 
 pack_pose: Final = struct.Struct("<7d").pack
@@ -67,7 +202,7 @@ class TransformNames:
 
 def tf_message(stamp: bytes, transforms: Sequence[tuple[TransformNames, bytes]]) -> bytes:
     """Return a tf2_msgs/TFMessage with the names and the ``pack_pose`` of each transform."""
-    parts = [ENCAPSULATION, _COUNT.pack(len(transforms))]
+    parts = [ENCAPSULATION, _UINT32_STRUCT.pack(len(transforms))]
     for names, pose in transforms:
         parts += (stamp, names.later if len(parts) > 2 else names.first, pose)
     return b"".join(parts)

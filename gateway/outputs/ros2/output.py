@@ -12,20 +12,65 @@ from typing import Final
 
 import zenoh
 
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic, unique_name
-from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
-from gateway.outputs.event_loop import in_this_loop
-from gateway.outputs.no_topics import IgnoringPublisher
+from gateway.outputs.contract import (
+    FramePublisher,
+    IgnoringPublisher,
+    Output,
+    OutputHealth,
+    Publisher,
+    ServerParameters,
+)
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
-from gateway.outputs.ros2.message_types import DIAGNOSTIC_ARRAY, TF_MESSAGE
-from gateway.outputs.ros2.names import MAX_PART_CHARS, ros_name
-from gateway.outputs.ros2.router import router_session
-from gateway.outputs.ros2.settings import Ros2Settings
+from gateway.outputs.ros2.messages import DIAGNOSTIC_ARRAY, TF_MESSAGE
+from gateway.outputs.ros2.settings import MAX_PART_CHARS, Ros2Settings, ros_name
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosNode, RosTopic
-from gateway.outputs.send_thread import SendThread
-from gateway.outputs.status import OutputHealth
+from gateway.outputs.threads import SendThread, in_this_loop
+from gateway.outputs.zenoh.config import zenoh_config
+from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
+
+REMEDY: Final = "start it with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or correct ros2.connect"
+
+_WAIT_BEFORE_DROP_US: Final = 70_000_000
+"""How long Zenoh waits for a router that does not read, before it drops messages, which it does not count.
+
+Until then, only the sending thread waits, and what finds no place in its queue is counted. This is longer
+than the 60 s without a sign of life after which Zenoh gives a connection to rmw_zenohd up.
+"""
+
+
+def client_config(endpoint: str) -> zenoh.Config:
+    """Return the configuration of a client of one router, which it does not search by multicast."""
+    return zenoh_config(
+        {
+            "mode": "client",
+            "connect": {"endpoints": [endpoint]},
+            "scouting": {"multicast": {"enabled": False}},
+            "transport": {
+                "link": {
+                    "tx": {
+                        "queue": {"congestion_control": {"drop": {"wait_before_drop": _WAIT_BEFORE_DROP_US}}}
+                    }
+                }
+            },
+        }
+    )
+
+
+def router_session(endpoint: str, declare: Callable[[zenoh.Session], None]) -> SessionHolder:
+    """Return the holder of a session with the router at ``endpoint``."""
+    texts = SessionTexts(
+        "ros2",
+        not_open=f"the Zenoh session to {endpoint} is not open yet; if there is no router, {REMEDY}",
+        cannot_open=f"no Zenoh router at {endpoint}",
+        remedy=REMEDY,
+        no_router=f"the Zenoh router at {endpoint} is not connected any more; {REMEDY}",
+        opened=f"connected to the router at {endpoint}",
+    )
+    return SessionHolder(texts, client_config(endpoint), declare)
+
 
 _STATUS: Final = ("status",)
 _UNDECLARE_S: Final = 0.5

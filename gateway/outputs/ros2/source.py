@@ -9,9 +9,9 @@ from typing import Protocol
 import zenoh
 
 from gateway.errors import OutputError
-from gateway.log import DefectLog
-from gateway.losses import Losses
-from gateway.messages.stamp import Stamp
+from gateway.logs.failures import DefectLog
+from gateway.logs.losses import Losses
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2.source_topics import NOT_YET, SourceTopics
 from gateway.outputs.ros2.topic import RosNode, RosTopic

@@ -8,30 +8,28 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from gateway.descriptions.force_plates import units_of
 from gateway.descriptions.labels import describe
-from gateway.descriptions.plate_forces import units_of
 from gateway.descriptions.source_frame import unknown_unit_text
-from gateway.losses import Losses
-from gateway.messages.stamp import Stamp
+from gateway.logs.losses import Losses
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.ros2 import cdr
-from gateway.outputs.ros2.message_types import (
+from gateway.outputs.ros2 import messages
+from gateway.outputs.ros2.messages import (
     FLOAT_ARRAY,
     POINT_CLOUD,
     POSE_STAMPED,
     WRENCH_STAMPED,
-    RosType,
-)
-from gateway.outputs.ros2.messages import (
     AnalogEncoder,
     CloudEncoder,
+    RosType,
     StampedEncoder,
     TransformNames,
     pack_pose,
     pack_wrench,
     tf_message,
 )
-from gateway.outputs.ros2.names import unique_ros_names
+from gateway.outputs.ros2.settings import unique_ros_names
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
@@ -200,7 +198,7 @@ class SourceTopics:
     ) -> None:
         """Publish the ``components`` of a frame on the topics that have subscribers."""
         self.use(parameters)
-        ros_stamp = cdr.stamp(stamp.capture_utime)
+        ros_stamp = messages.stamp(stamp.capture_utime)
         now_ns = time.time_ns()
         for index, layout in enumerate(frame.layout.components):
             kind = layout.type

@@ -4,7 +4,7 @@ import socket
 from collections.abc import Sequence
 from typing import Final
 
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.listen_address import from_this_computer, listen_problem
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.commands import Version, encode_command

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, Protocol
 
 from gateway.errors import CommandError, FrameError, QueryError
-from gateway.log import DefectLog
+from gateway.logs.failures import DefectLog
 from gateway.rtc3d import commands
 from gateway.rtc3d.packets import (
     PACKET_HEADER,
@@ -22,7 +22,7 @@ from gateway.rtc3d.packets import (
 )
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS, error_packet, recording_switch
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
 
 FIRST_COMMAND_S: Final = 10.0
 """A client that has sent no command of the protocol within this time is disconnected."""

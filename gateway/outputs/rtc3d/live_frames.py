@@ -7,11 +7,20 @@ from fractions import Fraction
 from operator import attrgetter
 from typing import Final, NamedTuple
 
-from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept, StreamRate
-from gateway.outputs.rtc3d.frame_bytes import Events, encode_events, encode_joined, events_of, unchanged_body
+from gateway.outputs.rtc3d.arrivals import (
+    Arrival,
+    Arrivals,
+    Events,
+    Kept,
+    StreamRate,
+    encode_events,
+    encode_joined,
+    events_of,
+    unchanged_body,
+)
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.packets import PacketType, encode_packet
-from gateway.rtc3d_server.frame_builder import exact_rate
+from gateway.rtc3d_server.measurement import exact_rate
 from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket
 
 WAIT_US: Final = 250_000

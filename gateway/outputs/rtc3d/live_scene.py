@@ -9,11 +9,10 @@ from weakref import WeakValueDictionary
 from gateway.errors import CommandError
 from gateway.outputs.rtc3d.arrivals import Arrivals
 from gateway.outputs.rtc3d.live_frames import LiveFrames
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType, described_rate_hz, num_described_items
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import SECTIONS, General, Parameters, only_sections
 from gateway.rtc3d.parameters_xml import encode_parameters, extract_sections
-from gateway.rtc3d.server_description import described_rate_hz, num_described_items
 
 _KEPT_CHOICES: Final = 2
 _CACHED_SECTIONS: Final = 16  # clients can ask for 63 different choices

@@ -9,8 +9,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.log import EventLog
-from gateway.losses import Losses
+from gateway.logs.failures import EventLog
+from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, ClientFilter, ControlRecording
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
@@ -22,7 +22,7 @@ from gateway.rtc3d_server.client_session import error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.scene import FrameSource
 from gateway.rtc3d_server.server import RtServer
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
 
 SLOW_CLIENT: Final = "slow client"
 """The cause of frames that a client did not get because it does not read fast enough."""

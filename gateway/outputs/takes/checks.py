@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.folder import check_directory
 from gateway.outputs.takes.settings import TakesSettings

@@ -18,13 +18,12 @@ import rtc3d
 
 from gateway.errors import ProtocolError, QueryError, TakeError
 from gateway.messages.decode import decode
+from gateway.outputs.takes.control import MAX_PIECE_BYTES, StoredTake, TakePiece
 from gateway.outputs.takes.disk import disk_problem
-from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake, TakePiece
-from gateway.takes.description import NO_DETAILS, TakeDetails, decoded_details, has_end
-from gateway.takes.event_log import EventLogReader
-from gateway.takes.names import by_number, check_name, default_name, numbered
-from gateway.takes.new_file import NewFiles
-from gateway.takes.reader import SUFFIX
+from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.new_file import NewFiles, by_number, check_name, default_name, numbered
+from gateway.takes.files.reader import SUFFIX
 
 ROLLING: Final = ".rolling"
 """The folder of the rolling segments, in that of the takes."""

@@ -5,8 +5,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Final
 
-from gateway.outputs.takes.disk import disk_problem
-from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.disk import Host, disk_problem
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.settings import TakesSettings
 

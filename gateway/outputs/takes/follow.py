@@ -8,11 +8,11 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Final, Protocol
 
 from gateway.errors import QueryError
-from gateway.log import HOLD_S, FailureLog
+from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.messages.encode import COUNT_OFFSET, ITEMS_OFFSET
 from gateway.outputs.contract import Publisher
+from gateway.outputs.takes.control import StoredTake
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.outputs.takes.stored import StoredTake
 from gateway.outputs.takes.take_file import TakeFile
 
 END_S: Final = 2.0

@@ -4,24 +4,24 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import (
     Command,
     Output,
+    OutputHealth,
     Publisher,
     QueryService,
     ServerFile,
     ServerParameters,
 )
-from gateway.outputs.status import OutputHealth
 from gateway.outputs.takes.control import TakeCommand
-from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.follow import EventPublisher, TakeFollower
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import ComponentType
-from gateway.takes.recording import MAX_QUEUED_BYTES
+from gateway.takes.files.recording import MAX_QUEUED_BYTES
 
 
 class TakesOutput(Output):

@@ -5,7 +5,7 @@ from typing import Any
 
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
-from gateway.takes.recording import Recorder
+from gateway.takes.files.recording import Recorder
 
 
 class TakesPublisher:

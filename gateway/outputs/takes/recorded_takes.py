@@ -11,19 +11,17 @@ from typing import Any, Final
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
-from gateway.outputs.takes.disk import Disk, disk_problem
-from gateway.outputs.takes.disk_calls import DiskReader, Host, disk_result
+from gateway.outputs.takes.control import SourceTakes, StoredTake, TakePiece
+from gateway.outputs.takes.disk import Disk, DiskReader, Host, disk_problem, disk_result
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
-from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
-from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
-from gateway.outputs.takes.take_file import TakeFile
-from gateway.takes.description import NO_DETAILS, TakeDetails
-from gateway.takes.names import check_name, default_name
-from gateway.takes.recording import Recorder
+from gateway.outputs.takes.take_file import FileHeader, SourceDescription, TakeFile
+from gateway.takes.files.description import NO_DETAILS, TakeDetails
+from gateway.takes.files.new_file import check_name, default_name
+from gateway.takes.files.recording import Recorder
 
 MAX_AFTER_S: Final = 3600.0
 """How long a take that is saved may go on."""

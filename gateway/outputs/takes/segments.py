@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import QueryError, TakeError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.outputs.takes.disk import Disk, is_full
-from gateway.outputs.takes.header import FileHeader, SourceDescription
-from gateway.outputs.takes.log_sink import LogSink
-from gateway.takes.description import NO_DETAILS, TakeDetails
-from gateway.takes.event_log import EventLogReader
-from gateway.takes.names import default_name, numbered
-from gateway.takes.reader import SUFFIX
-from gateway.takes.recording import LogFile
+from gateway.outputs.takes.take_file import FileHeader, LogSink, SourceDescription
+from gateway.takes.files.description import NO_DETAILS, TakeDetails
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.new_file import default_name, numbered
+from gateway.takes.files.reader import SUFFIX
+from gateway.takes.files.recording import LogFile
 
 SEGMENT_S: Final = 10.0
 """How long a segment is, unless that would be more than MAX_SEGMENTS."""

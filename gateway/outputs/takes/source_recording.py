@@ -9,18 +9,17 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters, published_again
-from gateway.outputs.takes.disk_calls import Host
-from gateway.outputs.takes.log_sink import LogSink
+from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.take_file import TakeFile
+from gateway.outputs.takes.take_file import LogSink, TakeFile
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
-from gateway.takes.recording import Recorder
+from gateway.takes.files.recording import Recorder
 
 C3D_WAIT_S: Final = 60.0
 """A C3D file that the server sends within this time after a take belongs to the take."""

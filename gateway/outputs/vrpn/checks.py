@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from gateway.errors import system_reason
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
+from gateway.outputs.vrpn.server import bind
 from gateway.outputs.vrpn.settings import VrpnSettings
-from gateway.outputs.vrpn.sockets import bind
 
 CHECKS: Final = ("port", "access")
 

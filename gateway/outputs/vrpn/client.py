@@ -7,7 +7,12 @@ from typing import Final, Protocol, cast
 
 from gateway.errors import PeerError
 from gateway.messages.host_time import now_utime
-from gateway.outputs.vrpn.protocol import COOKIE, TYPE_DESCRIPTIONS, ClientReader, encode_pong
+from gateway.outputs.vrpn.protocol import (
+    COOKIE,
+    TYPE_DESCRIPTIONS,
+    ClientReader,
+    encode_pong,
+)
 from gateway.outputs.vrpn.trackers import Trackers
 from gateway.token_bucket import TokenBucket
 

@@ -1,20 +1,154 @@
 """The output that serves tools as VRPN trackers."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import Final
 
-from gateway.losses import Losses
+from gateway.descriptions.labels import describe
+from gateway.descriptions.source_frame import unknown_unit_text
+from gateway.errors import OutputError
+from gateway.logs.losses import Losses
+from gateway.messages.encode import Stamp
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
-from gateway.outputs.event_loop import in_this_loop
-from gateway.outputs.loop_thread import LoopThread
-from gateway.outputs.no_topics import IgnoringPublisher
-from gateway.outputs.status import OutputHealth
-from gateway.outputs.vrpn.publisher import VrpnPublisher
+from gateway.outputs.contract import (
+    FramePublisher,
+    IgnoringPublisher,
+    Output,
+    OutputHealth,
+    Publisher,
+    ServerParameters,
+)
+from gateway.outputs.threads import LoopThread, in_this_loop
+from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import VrpnServer
 from gateway.outputs.vrpn.settings import VrpnSettings
+from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame, FrameLayout
+
+MAX_TOOLS: Final = 256
+"""How many tools of a source can be trackers, and how many poses of a frame are sent, at most."""
+
+Offer = Callable[[Callable[[], None], int], bool]
+"""LoopThread.offer of the server's thread."""
+
+_NO_PARAMETERS: Final = ServerParameters(b"", 0, 0)
+
+
+class VrpnPublisher:
+    """Takes whole frames of one source and sends the poses of its tools.
+
+    Methods without an underscore are for the gateway's event loop, the others run in the server's thread.
+    """
+
+    def __init__(self, source: str, server: VrpnServer, offer: Offer) -> None:
+        self.losses: Losses | None = None
+        """Counts the poses that are lost."""
+        self._source = source
+        self._server = server
+        self._offer = offer
+        self._parameters = _NO_PARAMETERS
+        self._shown: ServerParameters | None = None  # those that the trackers are named by
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a client is connected."""
+        return self._server.has_clients
+
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Use other parameters for the frames after this call."""
+        self._parameters = parameters
+        self.name_trackers()
+
+    def name_trackers(self) -> None:
+        """Name the trackers by the newest parameters. If too many calls wait, the next frame does so."""
+        self._offer(partial(self._show, self._parameters, 0), len(self._parameters.xml))
+
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        """Return whether a client is connected and the tools are among these components."""
+        return self.wanted and ComponentType.TOOLS in components
+
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        """Return whether a client is connected and frames of ``layout`` have tools."""
+        return self.wants(components) and bool(_tool_indices(layout))
+
+    def publish(
+        self,
+        frame: Frame,
+        stamp: Stamp,
+        sequence: int,  # noqa: ARG002 - VRPN has no sequence numbers
+        components: frozenset[ComponentType],  # noqa: ARG002 - see ``prepare``
+    ) -> None:
+        """Hand over a frame with tools. Raises OutputError if too many wait, or if the unit is unknown."""
+        if not self.wanted:
+            return
+        parameters = self._parameters
+        if parameters.frame.metres_per_unit is None:
+            raise OutputError(unknown_unit_text(parameters.parsed), cause="unknown unit")
+        call = partial(self._send, parameters, frame, stamp)
+        if not self._offer(call, len(frame.body)):
+            raise OutputError("frames arrive faster than they can be sent", cause="queue full")
+
+    def close(self) -> None:
+        """Remove the source's trackers."""
+        self._offer(partial(self._server.trackers.remove, self._source), 0)
+
+    def _show(self, parameters: ServerParameters, num_tools: int) -> None:
+        """Name the trackers of ``num_tools`` tools, or of more if the parameters have more."""
+        tools = parameters.parsed.tools
+        num_labels = 0 if tools is None else len(tools.tools)
+        num_trackers = min(max(num_labels, num_tools), MAX_TOOLS)
+        labels = describe(ComponentType.TOOLS, parameters.parsed, num_trackers).labels
+        self._server.trackers.set_tools(self._source, labels)
+        self._server.describe_trackers()
+        self._shown = parameters
+
+    def _send(self, parameters: ServerParameters, frame: Frame, stamp: Stamp) -> None:
+        num_items = num_with_tracker = num_poses = 0
+        messages: list[bytes] = []
+        for index in _tool_indices(frame.layout):  # usually one
+            items = frame.component(index).items()
+            num_items += len(items)
+            if self._shown is not parameters or min(len(items), MAX_TOOLS) > len(self._trackers):
+                self._show(parameters, len(items))
+            poses = parameters.frame.poses(items[: MAX_TOOLS - num_poses])
+            num_poses += len(poses)
+            for tracker, pose in zip(self._trackers, poses, strict=False):
+                num_with_tracker += tracker is not None
+                if tracker is not None and pose is not None:
+                    messages.append(encode_pose(tracker.number, stamp.capture_utime, pose))
+        if num_with_tracker < num_items:
+            num_lost = num_items - num_with_tracker
+            self._count_loss(
+                "too many tools",
+                f"{num_lost} tools have no tracker: there can be {MAX_TOOLS} of a source and {MAX_TRACKERS} "
+                "of all; remove tools that are not used from the server",
+                num_lost,
+            )
+        slow = self._server.send(b"".join(messages)) if messages else []
+        if slow:
+            self._count_loss(
+                "slow client",
+                f"poses for {slow[0]} are lost, because it does not read them fast enough; look at that "
+                "program",
+                len(messages) * len(slow),
+            )
+
+    @property
+    def _trackers(self) -> Collection[Tracker | None]:
+        return self._server.trackers.of_source(self._source).values()
+
+    def _count_loss(self, cause: str, text: str, num_poses: int) -> None:
+        if self.losses is not None:
+            self.losses.lost(cause, text, messages=num_poses)
+
+
+def _tool_indices(layout: FrameLayout) -> list[int]:
+    """Return which components of a frame have tools."""
+    components = enumerate(layout.components)
+    return [index for index, each in components if each.type is ComponentType.TOOLS and each.num_items]
+
 
 _CLOSING_S: Final = 1.0
 

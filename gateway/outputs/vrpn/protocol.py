@@ -12,7 +12,7 @@ import struct
 from typing import Final
 
 from gateway.errors import PeerError
-from gateway.safe_text import quoted
+from gateway.logs.safe_text import quoted
 
 COOKIE_BYTES: Final = 24
 COOKIE: Final = b"vrpn: ver. 07.35  0".ljust(COOKIE_BYTES, b"\0")

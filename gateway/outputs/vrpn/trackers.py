@@ -4,7 +4,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
-from gateway.outputs.vrpn.protocol import MAX_NAME_BYTES, describe_tracker
+from gateway.outputs.vrpn.protocol import (
+    MAX_NAME_BYTES,
+    describe_tracker,
+)
 
 TrackerNames = Literal["auto", "tool", "source/tool"]
 """How trackers are named: by tool, by source and tool, or (auto) by tool if there is only one source."""

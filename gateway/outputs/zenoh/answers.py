@@ -24,15 +24,14 @@ from typing import Final
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.log import log_fields
-from gateway.losses import Losses
+from gateway.logs.failures import log_fields
+from gateway.logs.losses import Losses
+from gateway.logs.safe_text import safe_text
+from gateway.messages.decode import TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.admission import NO_REPLY, Admission, Refusal
+from gateway.outputs.admission import NO_REPLY, Admission, QueryDefects, Refusal
 from gateway.outputs.contract import Answer, KeyPath, QueryService
-from gateway.outputs.encodings import TEXT, json_bytes
-from gateway.outputs.query_defects import QueryDefects
-from gateway.outputs.send_thread import SendThread
-from gateway.safe_text import safe_text
+from gateway.outputs.threads import SendThread
 
 MAX_PENDING: Final = 4096
 """The maximum number of queries in progress. Further ones get the error busy."""

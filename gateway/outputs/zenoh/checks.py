@@ -15,10 +15,9 @@ import zenoh
 
 from gateway.config.secrets import mask_secrets_in_text
 from gateway.errors import ConfigError
-from gateway.findings import Finding, MessageLoad, Subject
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.zenoh.command_session import command_config, endpoints, mode_of
-from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+from gateway.outputs.findings import Finding, MessageLoad, Subject
+from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
 CHECKS: Final = ("link", "gateway")

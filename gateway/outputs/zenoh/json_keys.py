@@ -16,14 +16,12 @@ from typing import Any, Final
 import zenoh
 
 from gateway.descriptions.labels import describe, event_labels
-from gateway.losses import Losses
-from gateway.messages.decode import decode
-from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES, json_text
+from gateway.logs.losses import Losses
+from gateway.messages.decode import JSON, MAX_JSON_SOURCE_BYTES, decode, json_text
 from gateway.messages.topics import JSON_NAME, Topic
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.encodings import JSON
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.send_thread import SendThread
+from gateway.outputs.threads import SendThread
 from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters

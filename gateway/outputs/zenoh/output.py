@@ -8,18 +8,17 @@ from typing import Final
 
 import zenoh
 
-from gateway.log import DefectLog
-from gateway.losses import Losses
+from gateway.logs.failures import DefectLog
+from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
-from gateway.outputs.contract import Output, QueryService, ServerFile, ServerParameters
-from gateway.outputs.status import OutputHealth
+from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerFile, ServerParameters
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.json_keys import JsonKeys
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.worker_thread import WorkerThread
+from gateway.workers import WorkerThread
 
 _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
 _TEXTS: Final = SessionTexts(

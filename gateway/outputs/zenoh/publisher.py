@@ -8,7 +8,7 @@ from typing import Any, Final
 import zenoh
 
 from gateway.errors import OutputError
-from gateway.outputs.encodings import LCM
+from gateway.messages.decode import LCM
 from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.outputs.zenoh.json_keys import JsonPublisher
 

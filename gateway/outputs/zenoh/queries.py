@@ -14,12 +14,12 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
+from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.admission import Admission, QueryLimits
 from gateway.outputs.contract import Answer, QueryService, ServerParameters
-from gateway.outputs.encodings import JSON, XML, json_bytes
-from gateway.outputs.send_thread import SendThread
+from gateway.outputs.threads import SendThread
 from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
 from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings

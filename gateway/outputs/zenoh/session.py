@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 import zenoh
 
 from gateway.errors import OutputError
-from gateway.log import DefectLog, FailureLog, defect_text
-from gateway.outputs.status import OutputHealth
+from gateway.logs.failures import DefectLog, FailureLog, defect_text
+from gateway.outputs.contract import OutputHealth
 from gateway.outputs.zenoh.config import in_zenoh_thread, prepare_threads, zenoh_reason
-from gateway.worker_thread import thread_starts
+from gateway.workers import thread_starts
 
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5

@@ -11,8 +11,7 @@ from gateway.errors import OutputError
 from gateway.messages.topics import escape_key_chunk, is_json_key, zenoh_key
 from gateway.outputs.discovery import missing_source
 from gateway.outputs.kind import Receive, SubscriptionRequest
-from gateway.outputs.zenoh.command_session import command_config
-from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.config import command_config, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 
 
@@ -95,7 +94,7 @@ def served_sources(session: zenoh.Session, prefix: str, timeout_s: float = 1.0) 
     return sorted({key.removeprefix(f"{prefix}/").partition("/")[0] for key in keys})
 
 
-def no_gateway(prefix: str, wanted: Collection[str], served: Collection[str]) -> str:
+def no_gateway_on_zenoh(prefix: str, wanted: Collection[str], served: Collection[str]) -> str:
     """Return why nothing arrives of the ``wanted`` sources (of all, if empty) if these are ``served``."""
     if not served:
         return (

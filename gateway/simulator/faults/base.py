@@ -1,19 +1,137 @@
 """The base classes of all faults: when they happen, for how long, and what they can change."""
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
-
 import asyncio
-from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, ClassVar, Final, NamedTuple, Protocol, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
-from gateway.config.section import Section, validation_error
-from gateway.rtc3d.packets import Packet
-from gateway.simulator.faults.faulty_server import FaultyConnection, FaultyServer
-from gateway.simulator.faults.outgoing import PendingWrite, Reply
-from gateway.simulator.faults.parameters import Count, Interval, Seconds, parameter_text
+from gateway.config.section import Section, expects, validation_error
+from gateway.rtc3d.packets import Packet, PacketType
+from gateway.simulator.synthetic import SceneSettings
+
+
+class FaultyConnection(Protocol):
+    """What a momentary fault may do to a connection."""
+
+    @property
+    def number(self) -> int:
+        """The connection's number since the server's start, from 1."""
+        ...
+
+    def send_unchanged(self, data: bytes) -> None:
+        """Send bytes that no fault changes, after all bytes that are waiting."""
+        ...
+
+    def disconnect(self, last_data: bytes, *, reset: bool) -> None:
+        """Write ``last_data`` before all bytes that are waiting, and end the connection with FIN or RST."""
+        ...
+
+
+class FaultyServer(Protocol):
+    """What a fault may do to the server."""
+
+    @property
+    def connections(self) -> Sequence[FaultyConnection]:
+        """The clients' connections."""
+        ...
+
+    def stop_measurement(self) -> None:
+        """Stop the measurement, if one is running."""
+        ...
+
+    def start_measurement(self) -> None:
+        """Start a measurement, unless another fault prevents it."""
+        ...
+
+    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
+        """Serve the scenario's scene with changes; return a function that restores the previous scene."""
+        ...
+
+    def rename_items(self, prefix: str) -> Callable[[], None]:
+        """Put ``prefix`` before the names of markers and tools; return a function that restores the scene."""
+        ...
+
+    def crash(self) -> None:
+        """End as if the process died."""
+        ...
+
+    def restart(self) -> None:
+        """Listen again after a crash, unless another fault prevents it."""
+        ...
+
+
+MAX_SECONDS: Final = 86400
+
+Seconds = Annotated[
+    float,
+    Field(strict=True, ge=0, le=MAX_SECONDS, allow_inf_nan=False),
+    expects(f"a number of seconds from 0 to {MAX_SECONDS}"),
+]
+Interval = Annotated[
+    float,
+    Field(strict=True, ge=0.01, le=MAX_SECONDS, allow_inf_nan=False),
+    expects(f"a number of seconds from 0.01 to {MAX_SECONDS}"),
+]
+Milliseconds = Annotated[
+    float,
+    Field(strict=True, gt=0, le=600_000, allow_inf_nan=False),
+    expects("a number of milliseconds above 0, up to 600000"),
+]
+Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
+
+
+def parameter_text(value: object) -> str:
+    """Return a parameter's value in the form of the command line."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case float():
+            return f"{value:.12g}"
+        case tuple() | list():
+            return f"[{','.join(map(parameter_text, value))}]"
+    return str(value)
+
+
+class PendingWrite(NamedTuple):
+    """Bytes to write to a client's socket: one packet, until a fault changes it."""
+
+    due_s: float
+    """When to write them, in s on the monotonic clock; never before earlier writes."""
+
+    data: bytes
+
+    joins_previous: bool = False
+    """Whether to write these bytes and the previous ones with one send, if both are due."""
+
+
+class Reply(NamedTuple):
+    """A reply to a command, one packet; it is sent at once unless it is delayed."""
+
+    packet: bytes
+
+    delay_s: float = 0.0
+    """How much later it is sent; other packets do not wait for it."""
+
+    after_frames: int = 0
+    """The number of data frames to send before it; a No Data packet ends the wait."""
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the reply is delayed."""
+        return bool(self.delay_s or self.after_frames)
+
+
+def packet_type_of(packet: bytes) -> int:
+    """Return a packet's type (§4.2); -1 for bytes that are not a packet."""
+    return int.from_bytes(packet[4:8], "big") if len(packet) >= 8 else -1
+
+
+def is_acknowledgement(packet: bytes) -> bool:
+    """Return whether a reply reports success: type 1, whatever its text (field note 1)."""
+    return packet_type_of(packet) == PacketType.COMMAND
 
 
 class ActiveFault:

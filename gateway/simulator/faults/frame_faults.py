@@ -23,8 +23,7 @@ from gateway.rtc3d.components import (
 )
 from gateway.rtc3d.frames import detect_byte_order, encode_frame, split_frame
 from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
-from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault
-from gateway.simulator.faults.outgoing import PendingWrite, packet_type_of
+from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault, PendingWrite, packet_type_of
 
 Fraction = Annotated[
     float, Field(strict=True, ge=0, le=1, allow_inf_nan=False), expects("a number from 0 to 1")

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from gateway.cli.commands import COMMANDS
+from gateway.cli.main import COMMANDS
 from tests.gateway_process import PROGRAM
 
 ROOT: Final = Path(__file__).parents[3]

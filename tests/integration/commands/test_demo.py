@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from gateway import demo
+from gateway.cli import demo_lab
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.outputs.kind import DemoSide, Receive, Subscription
 from gateway.outputs.lcm.kind import LCM
@@ -41,7 +41,7 @@ class StallingScene(SyntheticScene):
 async def report(scene: SyntheticScene, seconds: float) -> tuple[bool, str]:
     """Run the demo; return its verdict and what it prints."""
     out = io.StringIO()
-    verdict = await demo.run_demo(scene, asyncio.Event(), Console(file=out, width=200), seconds=seconds)
+    verdict = await demo_lab.run_demo(scene, asyncio.Event(), Console(file=out, width=200), seconds=seconds)
     return verdict, out.getvalue()
 
 
@@ -75,7 +75,7 @@ async def test_the_demo_loses_nothing_on_a_busy_machine_and_says_what_is_late() 
 
 async def test_what_the_gateway_skips_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     streams = (StreamSettings.model_validate({"backlog": "latest"}),)
-    monkeypatch.setattr(demo, "SourceSettings", partial(SourceSettings, streams=streams))
+    monkeypatch.setattr(demo_lab, "SourceSettings", partial(SourceSettings, streams=streams))
     is_complete, text = await report(StallingScene(), 3.0)
     assert is_complete, text
     assert "Nothing was lost." in text

@@ -10,7 +10,7 @@ from typing import Any, Final
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.findings import Result
+from gateway.outputs.findings import Result
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator

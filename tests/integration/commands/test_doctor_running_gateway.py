@@ -10,10 +10,10 @@ import pytest
 
 from gateway.config.settings import MetricsSettings
 from gateway.doctor.all_checks import run_checks
-from gateway.findings import Finding, Result
-from gateway.gateway import Gateway
+from gateway.outputs.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.service.gateway import Gateway
 from gateway.stream.state import StreamState
 from tests import servers
 from tests.command_process import run

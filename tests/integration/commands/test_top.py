@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from gateway.top.pages import TWO_GATEWAYS
+from gateway.display.top.pages import TWO_GATEWAYS
 from tests.command_process import Completed, run_command
 from tests.configurations import write_config
 from tests.gateway_process import program, simulator

@@ -19,7 +19,7 @@ from tests.gateway_process import PROGRAM
 from tests.networks import free_endpoint, free_port, zenoh_keys
 from tests.recorded_scenes import record_scene
 from tests.takes import frame, parameters, write_take
-from tests.unit.export.exported import read_ezc3d
+from tests.unit.takes.export.exported import read_ezc3d
 from tests.waiting import wait_until
 
 SCENE = SyntheticScene(markers=20, tools=0, analog=8, plates=1, rate_hz=100, analog_rate_hz=1000)

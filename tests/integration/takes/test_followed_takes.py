@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.takes import follow
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.takes.reader import TakeReader
+from gateway.service.gateway import Gateway
+from gateway.takes.files.reader import TakeReader
 from tests.networks import free_endpoint
 from tests.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
 from tests.servers import ScriptedServer, c3d_file, markers_frame, packet

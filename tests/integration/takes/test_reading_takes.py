@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from gateway.config.settings import SourceSettings
-from gateway.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.rtc3d_server.scene import Scene
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
-from gateway.takes.reader import TakeReader
-from gateway.takes.statistics import take_statistics
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.statistics import take_statistics
 from tests.configurations import make_settings
 from tests.waiting import wait_until_async
 

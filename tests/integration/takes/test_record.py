@@ -20,13 +20,13 @@ import yaml
 import zenoh
 
 from gateway.messages.decode import decode, prefix_of
-from gateway.messages.stamp import PREFIX
+from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.subscriber.series import FINGERPRINTS
-from gateway.takes.event_log import EventLogReader
-from gateway.takes.statistics import take_statistics
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.statistics import take_statistics
 from tests.gateway_process import PROGRAM, program, simulator
 from tests.networks import free_endpoint, lcm_url, open_zenoh, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
@@ -383,8 +383,8 @@ def test_without_a_gateway_there_is_no_file(
 HANGING: Final = """
 import sys, threading
 from gateway.cli.main import main
-from gateway.recorder.take_recording import TakeRecording
-from gateway.takes.recording import LogFile
+from gateway.takes.recorder.take_recording import TakeRecording
+from gateway.takes.files.recording import LogFile
 
 def hang(*_):
     print("the disk hangs", file=sys.stderr, flush=True)

@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 from gateway.config.settings import MetricsSettings, ReconnectSettings, Settings, SourceSettings
-from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.folder import TakesFolder
@@ -21,9 +20,10 @@ from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.reader import TakeReader
+from gateway.takes.files.reader import TakeReader
 from tests.configurations import make_settings
 from tests.gateway_process import program, simulator
 from tests.networks import free_endpoint, zenoh_keys

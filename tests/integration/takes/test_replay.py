@@ -20,7 +20,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.takes.event_log import encode_event
+from gateway.takes.files.event_log import encode_event
 from tests.command_in_process import run_in_process
 from tests.gateway_process import PROGRAM
 from tests.integration.commands.test_command_line import Ended, end_of, run

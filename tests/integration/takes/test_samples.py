@@ -13,10 +13,10 @@ import pytest
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.takes import open_take
-from gateway.takes.reader import TakeReader
+from gateway.takes.files.reader import TakeReader
 from tests.command_in_process import run_in_process
 from tests.documents import ROOT
-from tests.unit.export.exported import read_ezc3d
+from tests.unit.takes.export.exported import read_ezc3d
 
 TAKE: Final = ROOT / "examples/walk.lcmlog"
 C3D: Final = ROOT / "examples/walk.c3d"

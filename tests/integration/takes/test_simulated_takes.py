@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import MetricsSettings, SourceSettings
-from gateway.gateway import Gateway
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
@@ -25,18 +24,18 @@ from gateway.rtc3d.parameters import (
     ParametersAnalog,
 )
 from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
-from gateway.rtc3d_server.computed_scene import ComputedScene
+from gateway.rtc3d_server.measurement import ComputedScene
 from gateway.rtc3d_server.scene import Scene
+from gateway.service.gateway import Gateway
 from gateway.simulator.c3d_scene import C3dScene
+from gateway.simulator.faults.connection_faults import ChangeScene, Rename
 from gateway.simulator.faults.frame_faults import FrozenTimestamps
-from gateway.simulator.faults.server_faults import ChangeScene, Rename
-from gateway.simulator.recorded.take_scene import TakeScene
-from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
-from gateway.simulator.synthetic import SyntheticScene
+from gateway.simulator.synthetic import SceneSettings, SyntheticScene
+from gateway.simulator.take_scene import TakeScene
 from gateway.stream.state import StreamState
-from gateway.takes.event_log import EventLogReader
-from gateway.takes.reader import TakeReader
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.reader import TakeReader
 from tests.command_in_process import run_in_process
 from tests.configurations import make_settings
 from tests.integration.raw_client import RawClient, connected

@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from gateway.gateway import Gateway
-from gateway.live.live_data import LiveData
+from gateway.display.live.live_data import LiveData
+from gateway.display.view.server import RunningTakes
+from gateway.outputs.takes.control import MAX_PIECE_BYTES
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.outputs.takes.stored import MAX_PIECE_BYTES
+from gateway.service.gateway import Gateway
 from gateway.subscriber.subscribe import Transport, subscribe_all
-from gateway.takes.event_log import EventLogReader
-from gateway.takes.reader import TakeReader
-from gateway.view.running_takes import RunningTakes
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.reader import TakeReader
 from tests.networks import free_endpoint, lcm_url
 from tests.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
 from tests.servers import ScriptedServer, markers_frame

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from gateway.c3d_files import receiving
-from gateway.c3d_files.queue_memory import QueueMemory
 from gateway.c3d_files.receiving import FileReceiver, SourceFiles
-from gateway.c3d_files.spool import Spool, StoredFile
+from gateway.c3d_files.spool import QueueMemory, Spool, StoredFile
 from gateway.rtc3d.packets import FilePiece
 from tests.servers import c3d_file
 from tests.waiting import wait_until_async

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.c3d_files.format_check import problem_of_c3d
+from gateway.c3d_files.receiving import problem_of_c3d
 from gateway.c3d_files.spool import Spool, StoredFile, UnfinishedFile
 
 

@@ -8,8 +8,7 @@ import pytest
 import rtc3d
 
 from gateway.cli.echo_messages import MAX_WAITING, Limits, print_messages
-from gateway.cli.echo_units import Units
-from gateway.cli.silence import Silence
+from gateway.cli.echo_sources import Silence, Units
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from tests.spec_parameters import in_root, spec_xml
 

@@ -8,7 +8,7 @@ import pytest
 from gateway.cli import echo_rates
 from gateway.cli.echo_messages import Limits
 from gateway.cli.echo_rates import MAX_KEYS, MIN_WINDOW, Rate, Rates, print_rates
-from gateway.cli.silence import Silence
+from gateway.cli.echo_sources import Silence
 from tests.settable_clock import Clock
 from tests.unit.cli.test_echo import REQUEST, Published
 

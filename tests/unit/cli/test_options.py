@@ -13,7 +13,7 @@ from gateway.cli import configuration
 from gateway.cli.configuration import configuration_from_options
 from gateway.cli.main import app
 from gateway.config.loading import Configuration
-from gateway.config.schema import schema_text
+from gateway.config.show import schema_text
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.command_in_process import run_in_process

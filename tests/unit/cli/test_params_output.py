@@ -7,7 +7,7 @@ import re
 import pytest
 
 from gateway.cli.params_output import OutputFormat, write_replies
-from gateway.cli.params_query import ParametersReply, Sections
+from gateway.cli.params_queries import ParametersReply, Sections
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS
 from tests.spec_parameters import ALL, in_root, spec_body, spec_xml

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from gateway.cli.main import app
 from gateway.cli.take_gateway import GatewayAddress, TakeReplies
-from gateway.cli.take_list import ListedTake, size_text, write_list
+from gateway.cli.take_report import ListedTake, size_text, write_list
 from gateway.errors import QueryError, TakeError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from tests.takes import description, markers, parameters, write_take

@@ -12,7 +12,6 @@ from hypothesis import settings as hypothesis_settings
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
-from gateway.config.schema import schema_text
 from gateway.config.section import Section
 from gateway.config.settings import (
     MetricsSettings,
@@ -22,6 +21,7 @@ from gateway.config.settings import (
     SpoolSettings,
     StreamSettings,
 )
+from gateway.config.show import schema_text
 from gateway.config.transform import RollPitchYaw, TransformSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings

@@ -8,7 +8,7 @@ from gateway.config.settings import SourceSettings
 from gateway.config.transform import TransformSettings, Unit
 from gateway.descriptions.source_frame import source_frame
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.tool_pose import metres_per_unit
+from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import Parameters, Parameters3D
 from tests.settings import mistakes
 

@@ -4,7 +4,7 @@ import json
 from rich.console import Console
 
 from gateway.doctor.report import Report
-from gateway.findings import NO_CONFIGURATION, Finding, Result, Subject
+from gateway.outputs.findings import NO_CONFIGURATION, Finding, Result, Subject
 
 LAB = Subject("lab")
 

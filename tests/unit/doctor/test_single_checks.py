@@ -8,12 +8,11 @@ from typing import Any, cast
 
 import pytest
 
-from gateway.doctor import clock_check, gateway_checks, rate_check, source_checks
-from gateway.doctor.gateway_checks import check_gateway
+from gateway.doctor import computer_checks, frame_checks, gateway_checks, source_checks
+from gateway.doctor.computer_checks import check_receive_buffer
+from gateway.doctor.gateway_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.observation import ObservedStream
-from gateway.doctor.receive_buffer_check import check_receive_buffer
-from gateway.doctor.running_gateway import HealthReport, RunningLoss, RunningStream
-from gateway.findings import Finding, Result, Subject
+from gateway.outputs.findings import Finding, Result, Subject
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
@@ -22,7 +21,7 @@ from gateway.rtc3d.parameters import Parameters
 
 def test_the_clock_is_read() -> None:
     """The structure that the kernel fills has the right size and order."""
-    is_synchronised, max_error_us = clock_check.read_clock()
+    is_synchronised, max_error_us = computer_checks.read_clock()
     assert isinstance(is_synchronised, bool)
     assert max_error_us >= 0
 
@@ -39,8 +38,8 @@ def test_a_clock_matters_to_messages_that_leave(
     monkeypatch: pytest.MonkeyPatch, clock: tuple[bool, int], leaving: list[str], result: Result, found: str
 ) -> None:
     """Programs on this computer use the same clock; others compare utime with theirs."""
-    monkeypatch.setattr(clock_check, "read_clock", lambda: clock)
-    finding = clock_check.check_clock(leaving)
+    monkeypatch.setattr(computer_checks, "read_clock", lambda: clock)
+    finding = computer_checks.check_clock(leaving)
     assert finding.result is result
     assert finding.found.endswith(found)
     assert ("chrony" in finding.remedy) is (result is not Result.PASSING)
@@ -52,8 +51,8 @@ def test_a_clock_whose_state_is_not_reported_is_not_tested(monkeypatch: pytest.M
     def refuse() -> tuple[bool, int]:
         raise OSError(1, "adjtimex is not allowed")
 
-    monkeypatch.setattr(clock_check, "read_clock", refuse)
-    finding = clock_check.check_clock(["zenoh"])
+    monkeypatch.setattr(computer_checks, "read_clock", refuse)
+    finding = computer_checks.check_clock(["zenoh"])
     assert finding.result is Result.NOT_TESTED
     assert finding.found == "the kernel does not report it: adjtimex is not allowed"
 
@@ -111,11 +110,13 @@ Rates = Mapping[ComponentType, float]
 def rate_finding(
     monkeypatch: pytest.MonkeyPatch, announced_hz: Rates, measured_hz: Rates, rate: Rate
 ) -> Finding:
-    monkeypatch.setattr(rate_check, "described_rate_hz", lambda _, component: announced_hz.get(component))
+    monkeypatch.setattr(frame_checks, "described_rate_hz", lambda _, component: announced_hz.get(component))
     observed = {component: SimpleNamespace(rate_hz=hz) for component, hz in measured_hz.items()}
     settings = SimpleNamespace(rate=rate)
     stream: Any = SimpleNamespace(observed=observed, settings=settings, shares_connection=False)
-    return rate_check.check_rate(Subject("lab"), cast("ObservedStream", stream), cast("Parameters", object()))
+    return frame_checks.check_rate(
+        Subject("lab"), cast("ObservedStream", stream), cast("Parameters", object())
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.foxglove_schemas.float_topics import FloatTopics, field_names
 from gateway.foxglove_schemas.messages import FoxgloveSource
+from gateway.foxglove_schemas.topics import FloatTopics, field_names
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from tests.spec_parameters import ALL

@@ -5,10 +5,8 @@ from typing import Any
 import rtc3d
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.encode import encode_message
-from gateway.messages.stamp import Stamp
-from gateway.messages.tool_pose import tool_poses
-from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.messages.encode import Stamp, encode_message, tool_poses
+from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame

@@ -6,8 +6,7 @@ import math
 import pytest
 
 from gateway.errors import ProtocolError
-from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, to_json
-from gateway.messages.json_text import json_text
+from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, json_text, to_json
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 from tests.message_vectors import VECTORS
 from tests.unit.messages.samples import component_message, tool_pose_messages

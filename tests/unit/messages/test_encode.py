@@ -11,14 +11,14 @@ from gateway.messages.encode import (
     CONTENT_OFFSET,
     ITEMS_OFFSET,
     MESSAGE_TYPES,
+    Stamp,
     encode_message,
     lcm_type_name,
     message_timestamp_us,
+    tool_poses,
     with_sequence,
 )
-from gateway.messages.limits import encode_within_limits
-from gateway.messages.stamp import Stamp
-from gateway.messages.tool_pose import tool_poses
+from gateway.messages.texts import encode_within_limits
 from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, zenoh_key
 from gateway.rtc3d.components import ComponentType
 from tests.message_vectors import FOLDER, VECTORS, MessageVector, difference, to_vector_values

@@ -5,11 +5,11 @@ import logging
 import pytest
 import rtc3d
 
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
-from gateway.messages.parameters_text import xml_bytes, xml_text
 from gateway.messages.summary import summarise
-from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.messages.texts import xml_bytes, xml_text
+from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.unit.messages.samples import (

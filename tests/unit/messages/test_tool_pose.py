@@ -10,8 +10,7 @@ import pytest
 import rtc3d
 
 from gateway.messages.coordinate_frame import CoordinateFrame, Quaternion
-from gateway.messages.stamp import Stamp
-from gateway.messages.tool_pose import metres_per_unit, tool_poses
+from gateway.messages.encode import Stamp, metres_per_unit, tool_poses
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame
 from tests.vectors import ALL_ONES

@@ -8,9 +8,8 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from gateway.outputs import loop_thread
-from gateway.outputs.event_loop import in_this_loop
-from gateway.outputs.loop_thread import LoopThread
+from gateway.outputs import threads
+from gateway.outputs.threads import LoopThread, in_this_loop
 
 
 async def nothing() -> None: ...
@@ -27,8 +26,8 @@ def test_calls_are_made_in_order_in_the_thread() -> None:
 
 
 def test_the_queue_is_bounded_by_calls_and_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop_thread, "MAX_CALLS", 3)
-    monkeypatch.setattr(loop_thread, "MAX_BYTES", 100)
+    monkeypatch.setattr(threads, "MAX_CALLS", 3)
+    monkeypatch.setattr(threads, "MAX_BYTES", 100)
     thread = LoopThread("test")
     entered, go_on = threading.Event(), threading.Event()
 

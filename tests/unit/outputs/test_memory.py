@@ -3,10 +3,10 @@
 import pytest
 
 from gateway.errors import OutputError
+from gateway.messages.decode import json_bytes
 from gateway.messages.topics import Topic
-from gateway.outputs.encodings import json_bytes
+from gateway.outputs.contract import OutputHealth
 from gateway.outputs.memory import MemoryOutput
-from gateway.outputs.status import OutputHealth
 
 TOPIC = Topic("lab", ("3d",), "rtc3d.markers_t")
 

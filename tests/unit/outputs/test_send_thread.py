@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 
-from gateway.outputs import send_thread
-from gateway.outputs.send_thread import SendThread
+from gateway.outputs import threads
+from gateway.outputs.threads import SendThread
 from tests.waiting import wait_until
 
 
@@ -89,7 +89,7 @@ def test_after_close_no_call_is_begun(blocked: tuple[SendThread, threading.Event
 
 def test_the_end_of_the_program_does_not_wait_for_a_call() -> None:
     code = (
-        "import threading; from gateway.outputs.send_thread import SendThread;"
+        "import threading; from gateway.outputs.threads import SendThread;"
         "began = threading.Event();"
         "SendThread('s').submit(lambda: (began.set(), threading.Event().wait())); began.wait()"
     )
@@ -114,8 +114,8 @@ def test_offered_calls_are_made_after_those_that_must_be_made(
 def test_offered_calls_beyond_the_number_or_the_bytes_are_refused(
     blocked: tuple[SendThread, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(send_thread, "MAX_CALLS", 3)
-    monkeypatch.setattr(send_thread, "MAX_BYTES", 100)
+    monkeypatch.setattr(threads, "MAX_CALLS", 3)
+    monkeypatch.setattr(threads, "MAX_BYTES", 100)
     sender, go = blocked
     made: list[int] = []
     last = threading.Event()
@@ -134,7 +134,7 @@ def test_offered_calls_beyond_the_number_or_the_bytes_are_refused(
 def test_the_number_of_offered_calls_is_limited(
     blocked: tuple[SendThread, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(send_thread, "MAX_CALLS", 3)
+    monkeypatch.setattr(threads, "MAX_CALLS", 3)
     sender, go = blocked
     assert [sender.offer(lambda: None) for _ in range(5)] == [True] * 3 + [False] * 2
     go.set()

@@ -5,9 +5,9 @@ from collections.abc import Callable, Collection
 import numpy as np
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, WIRE_ORDER, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, FrameLayout, encode_frame, split_frame

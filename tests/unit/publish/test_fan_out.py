@@ -8,12 +8,10 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.decode import decode
-from gateway.messages.encode import encode_message
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp, encode_message
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
-from gateway.publish.fan_out import FanOut
-from gateway.publish.item_counts import ItemCounts
+from gateway.publish.fan_out import FanOut, ItemCounts
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool

@@ -7,10 +7,10 @@ import pytest
 import rtc3d
 
 from gateway import __version__
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
-from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, clock_model, status_message
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import StreamState

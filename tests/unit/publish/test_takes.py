@@ -3,7 +3,7 @@
 import asyncio
 from pathlib import Path
 
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.takes.output import TakesOutput
 from gateway.publish.fan_out import FanOut

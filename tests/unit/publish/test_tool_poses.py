@@ -5,7 +5,7 @@ from itertools import chain
 
 import pytest
 
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.frames import Frame, split_frame

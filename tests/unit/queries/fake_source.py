@@ -12,9 +12,8 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import Answer
 from gateway.queries.known_parameters import ServerAnswer
 from gateway.queries.questions import Question
-from gateway.queries.recordings import RecordingAccess
-from gateway.queries.server_requests import StreamAccess
-from gateway.queries.source_queries import SourceQueries
+from gateway.queries.server_requests import RecordingAccess, StreamAccess
+from gateway.queries.service import SourceQueries
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketType

@@ -1,21 +1,30 @@
 import json
+import threading
+from pathlib import Path
 
 import pytest
 import rtc3d
 
 from gateway.errors import QueryError
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.encode import encode_message
-from gateway.messages.stamp import Stamp
-from gateway.outputs.encodings import TEXT
-from gateway.queries.answers import message_answer, parameters_json, schema_answer
-from gateway.queries.frame_answer import frame_answer
-from gateway.queries.payloads import NewestJson
+from gateway.messages.decode import MAX_JSON_SOURCE_BYTES, TEXT
+from gateway.messages.encode import Stamp, encode_message
+from gateway.queries import answers
+from gateway.queries.answers import (
+    FilePayload,
+    JsonPayload,
+    NewestJson,
+    frame_answer,
+    message_answer,
+    parameters_json,
+    schema_answer,
+)
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import General, Parameters, ParametersForce
-from tests.vectors import FULL_FRAME
+from tests.unit.messages.samples import component_message
+from tests.vectors import FULL_FRAME, MARKERS
 
 
 def encoded_message(component_type: ComponentType) -> bytes:
@@ -72,3 +81,62 @@ def test_the_frame_is_answered_with_the_names_that_outputs_have_given() -> None:
     assert json.loads(answer.payload) == json.loads(json.dumps({**frame.facts, "names": names}))
     with pytest.raises(QueryError, match="frame takes no options"):
         frame_answer(frame, names, {"format": "json"})
+
+
+FIRST = component_message(MARKERS)
+SECOND = FIRST[:8] + bytes(8) + FIRST[16:]  # another utime
+
+
+def test_a_payload_is_made_once_for_all_threads() -> None:
+    made: list[int] = []
+
+    def make() -> bytes:
+        made.append(1)
+        return b"{}"
+
+    payload = JsonPayload(make, 2)
+    assert not payload.is_made
+    threads = [threading.Thread(target=payload.make) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (made, payload.is_made, payload.make()) == ([1], True, b"{}")
+
+
+def test_the_json_of_a_message_is_made_once() -> None:
+    newest = NewestJson()
+    _, first = newest.of("3d", FIRST)
+    assert json.loads(first.make())["num_markers"] > 0
+    assert newest.of("3d", bytes(FIRST))[1] is first
+    message, second = newest.of("3d", SECOND)
+    assert message == SECOND
+    assert json.loads(second.make())["utime"] == 0
+
+
+def test_while_the_json_of_a_message_waits_to_be_made_later_peers_share_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    newest = NewestJson()
+    _, first = newest.of("3d", FIRST)
+    assert newest.of("3d", SECOND) == (FIRST, first)
+    assert newest.of("6d", SECOND)[0] == SECOND
+    monkeypatch.setattr(answers, "_UNMADE_S", 0.0)  # nobody makes it
+    assert newest.of("3d", SECOND)[0] == SECOND
+
+
+def test_a_message_that_is_too_long_is_not_converted() -> None:
+    with pytest.raises(QueryError, match="too long for JSON; ask without format=json") as caught:
+        NewestJson().of("3d", bytes(MAX_JSON_SOURCE_BYTES + 1))
+    assert caught.value.code == "refused"
+
+
+def test_a_file_is_read_when_it_is_sent(tmp_path: Path) -> None:
+    path = tmp_path / "a.c3d"
+    path.write_bytes(b"content")
+    payload = FilePayload(path)
+    assert (payload.num_bytes, payload.make()) == (7, b"content")
+    path.unlink()
+    with pytest.raises(QueryError, match=r"C3D file a\.c3d cannot be read: No such file") as caught:
+        payload.make()
+    assert caught.value.code == "nothing-yet"

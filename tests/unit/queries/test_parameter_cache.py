@@ -11,7 +11,7 @@ from gateway.queries.known_parameters import MAX_PARTS
 from gateway.queries.parameter_cache import ParameterCache
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.parameters import LONG_XML_BYTES, XmlThread
+from gateway.stream.replies import LONG_XML_BYTES, XmlThread
 from tests.spec_parameters import in_root
 from tests.unit.queries.fake_source import CM, MM, FakeSource, parameters_xml
 

@@ -1,17 +1,177 @@
 import asyncio
+import json
 from collections.abc import Mapping
+from typing import Any
 
 import pytest
 
-from gateway.config.settings import OutputSettings
+from gateway.config.settings import OutputSettings, SourceSettings
 from gateway.errors import QueryError, ServerError
+from gateway.messages.decode import JSON, XML
+from gateway.messages.encode import Stamp, encode_message, with_sequence
 from gateway.outputs.contract import Answer
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.registry import OUTPUTS
+from gateway.queries.parameter_cache import ParameterRefresh
+from gateway.queries.questions import Question
 from gateway.queries.service import SourceQueryService
+from gateway.rtc3d.commands import SendCurrentFrame
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.stream.state import StreamState
+from tests.servers import markers_frame
 from tests.toy_output import ToyOutput
 from tests.unit.queries.fake_source import CM, MM, FakeSource
+from tests.virtual_time import run_in_virtual_time
+
+FRAME = markers_frame(7, (1.0, 2.0, 3.0))[8:]
+
+
+async def test_parameters_are_answered_with_their_xml_age_session_and_version(source: FakeSource) -> None:
+    answer = await source.answer("parameters")
+    assert (answer.payload, answer.encoding) == (MM, XML)
+    assert answer.attachment.keys() == {"age_s", "session", "parameters_version", "frame"}
+    assert (answer.attachment["session"], answer.attachment["parameters_version"]) == (1, 1)
+
+
+async def test_stale_parameters_are_marked_as_stale(source: FakeSource) -> None:
+    source.server.is_connected = False
+    answer = await source.answer("parameters", stale_ok=True)
+    assert answer.attachment["stale"] is True
+
+
+async def test_parameters_are_converted_to_json_once(source: FakeSource) -> None:
+    first = await source.answer("parameters", as_json=True)
+    second = await source.answer("parameters", as_json=True)
+    assert first.payload is second.payload
+    assert first.encoding == JSON
+    assert json.loads(first.payload)["3d"]["unit"] == "mm"
+    assert first.attachment["recovered"] == []
+
+
+@pytest.mark.parametrize(
+    ("xml", "code", "text"),
+    [
+        (b"It is 3 o'clock.", "unreadable", "the server's XML cannot be read; ask without format=json"),
+        (MM, "nothing-yet", "the server's answer has no section 6d"),
+    ],
+)
+async def test_parameters_that_cannot_be_converted_to_json_are_an_error(
+    source: FakeSource, xml: bytes, code: str, text: str
+) -> None:
+    source.server.replies["SendParameters 6D"] = xml
+    assert (await source.answer("parameters", "6d")).payload == xml
+    with pytest.raises(QueryError, match=text) as caught:
+        await source.answer("parameters", "6d", as_json=True)
+    assert caught.value.code == code
+
+
+async def test_a_file_is_read_once_for_simultaneous_queries() -> None:
+    source = FakeSource()
+    answers = await asyncio.gather(*(source.answer("c3d") for _ in range(10)))
+    assert [answer.payload for answer in answers] == [b"file"] * 10
+    assert source.num_file_reads == 1
+
+
+def markers_message(session: int) -> bytes:
+    [component] = split_frame(FRAME, "big").components
+    return encode_message(component, Stamp(1, 1, session, 1), 5)
+
+
+async def test_while_streaming_a_component_is_answered_with_its_newest_message() -> None:
+    source = FakeSource()
+    source.status.state = StreamState.STREAMING
+    source.newest_messages[ComponentType.MARKERS] = markers_message(session=1)
+    answer = await source.answer("component", "3d")
+    assert answer.payload == markers_message(session=1)
+    assert answer.attachment == {"session": 1, "parameters_version": 1}
+    assert source.server.commands == []
+
+
+async def test_a_message_of_an_earlier_session_is_not_an_answer() -> None:
+    source = FakeSource()
+    source.status.state = StreamState.STREAMING
+    source.status.session = 2
+    source.newest_messages[ComponentType.MARKERS] = markers_message(session=1)
+    with pytest.raises(QueryError, match="no 3d has arrived from source 'lab' in this session"):
+        await source.answer("component", "3d")
+    assert source.server.commands == []
+
+
+async def test_simultaneous_queries_for_the_current_frame_share_one_request() -> None:
+    source = FakeSource()
+    source.server.replies["SendCurrentFrame 3D"] = Packet(PacketType.DATA, FRAME)
+    answers = await asyncio.gather(*(source.answer("component", "3d", as_json=True) for _ in range(5)))
+    assert {json.loads(answer.payload)["frame_number"] for answer in answers} == {7}
+    assert source.server.commands == ["SendCurrentFrame 3D"]
+
+
+async def test_a_server_that_does_not_know_a_component_is_asked_for_the_whole_frame() -> None:
+    source = FakeSource()
+    source.server.replies["SendCurrentFrame 3D"] = ServerError("err-what?")
+    source.server.replies[str(SendCurrentFrame())] = Packet(PacketType.DATA, FRAME)
+    assert (await source.answer("component", "3d")).encoding == "application/x-lcm;rtc3d.markers_t"
+
+
+async def test_the_json_of_a_message_has_the_number_on_the_output_of_the_query() -> None:
+    source = FakeSource()
+    source.status.state = StreamState.STREAMING
+    answers = {}
+    for output in ("lcm", "zenoh"):
+        source.newest_messages[ComponentType.MARKERS] = with_sequence(markers_message(1), len(output))
+        answers[output] = await source.queries.answer(Question("component", "3d", as_json=True), output)
+    assert [json.loads(answers[output].payload)["sequence"] for output in answers] == [3, 5]
+
+
+@pytest.mark.parametrize(
+    ("packet", "code", "text"),
+    [
+        (Packet(PacketType.NO_DATA, b""), "nothing-yet", "no measurement runs"),
+        (Packet(PacketType.DATA, b"\0\0\0\0"), "nothing-yet", "the current frame has no 3d"),
+        (Packet(PacketType.DATA, FRAME[:-1]), "unreadable", "the current frame cannot be read: "),
+    ],
+)
+async def test_a_current_frame_without_the_component_is_an_error(
+    packet: Packet, code: str, text: str
+) -> None:
+    source = FakeSource()
+    source.server.replies["SendCurrentFrame 3D"] = packet
+    with pytest.raises(QueryError, match=text) as caught:
+        await source.answer("component", "3d")
+    assert caught.value.code == code
+
+
+# When the parameters are read again, in virtual time ----------------------------------------
+
+
+async def readings_s(request_s: float, **settings: Any) -> list[int]:
+    """Return the times of all readings, with a request at one time, and another reading after 4 s."""
+    loop = asyncio.get_running_loop()
+    started_s, readings_s = loop.time(), list[int]()
+
+    async def read() -> None:
+        readings_s.append(round(loop.time() - started_s))
+        if len(readings_s) > 9:
+            task.cancel()  # time would stand still
+
+    source_settings = SourceSettings(name="lab", host="192.0.2.1", **settings)
+    refresh = ParameterRefresh(source_settings, read, lambda: started_s + 4.0)
+    task = asyncio.create_task(refresh.run())
+    loop.call_later(request_s, refresh.request)
+    await asyncio.sleep(30.0)
+    task.cancel()
+    return readings_s
+
+
+def test_an_answer_for_another_reason_delays_the_next_reading() -> None:
+    """So the server is not asked for what it has just sent."""
+    assert run_in_virtual_time(readings_s(99.0, parameters_interval_s=10.0)) == [14, 24]
+
+
+def test_without_an_interval_the_parameters_are_read_on_request_only() -> None:
+    assert run_in_virtual_time(readings_s(5.0, parameters_interval_s=0.0)) == [6]
 
 
 async def trim(source: str, options: Mapping[str, str]) -> Answer:

@@ -11,6 +11,7 @@ from gateway.rtc3d.client_protocol import (
     ByteOrderMismatch,
     ClientProtocol,
     FrameRejected,
+    ProtocolState,
     Refused,
     StreamCorrupted,
     UnexpectedPacket,
@@ -29,7 +30,6 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.rtc3d.packets import Packet
-from gateway.rtc3d.protocol_state import ProtocolState
 from tests.servers import error, ok, packet
 from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING, ByteOrder
 

@@ -20,8 +20,13 @@ from gateway.rtc3d.components import (
     big_endian_content,
     encode_component,
 )
-from gateway.rtc3d.frame_reader import FrameReader
-from gateway.rtc3d.frames import announced_components, detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.frames import (
+    FrameReader,
+    announced_components,
+    detect_byte_order,
+    encode_frame,
+    split_frame,
+)
 from tests.vectors import (
     ANALOG,
     COMPONENTS,

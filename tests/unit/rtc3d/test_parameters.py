@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from gateway.rtc3d.component_types import ComponentType
+from gateway.rtc3d.components import described_labels, described_rate_hz, num_described_items, only_components
 from gateway.rtc3d.parameters import (
     SECTIONS,
     AnalogChannel,
@@ -17,22 +18,14 @@ from gateway.rtc3d.parameters import (
     ParametersForce,
     Plate,
     Tool,
-    sections_of,
-    without_statistics,
-)
-from gateway.rtc3d.parameters_changes import (
     changed_sections,
     describe_renames,
     differ_in_statistics_only,
+    sections_of,
     statistics_xml,
+    without_statistics,
 )
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.rtc3d.server_description import (
-    described_labels,
-    described_rate_hz,
-    num_described_items,
-    only_components,
-)
 from tests.spec_parameters import ALL, ANALOG, BY_SECTION, GENERAL, spec_xml
 
 

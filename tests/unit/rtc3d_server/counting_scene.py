@@ -4,7 +4,7 @@ import numpy as np
 
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, Items
 from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
-from gateway.rtc3d_server.computed_scene import ComputedScene
+from gateway.rtc3d_server.measurement import ComputedScene
 from gateway.rtc3d_server.scene import SampleNumbers
 
 EVENT_EVERY_US = 70_000

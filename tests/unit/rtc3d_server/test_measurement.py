@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.frame_builder import FrameBuilder, exact_rate
-from gateway.rtc3d_server.measurement import LEAD_US, MAX_LEAD_US, Measurement
-from gateway.rtc3d_server.timers import call_after_us
+from gateway.rtc3d_server.measurement import LEAD_US, MAX_LEAD_US, FrameBuilder, Measurement, exact_rate
+from gateway.rtc3d_server.server import call_after_us
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,

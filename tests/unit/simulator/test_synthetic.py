@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items
-from gateway.rtc3d.server_description import described_labels, num_described_items
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items, described_labels, num_described_items
 from gateway.simulator.synthetic import BUTTON_EVENT, SyntheticScene
 
 Floats = npt.NDArray[np.floating[Any]]

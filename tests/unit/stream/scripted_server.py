@@ -10,7 +10,7 @@ from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.parameters import Connection as ClientConnection
+from gateway.stream.replies import Connection as ClientConnection
 from gateway.stream.session import Session
 from tests.servers import markers_frame, ok, packet
 

@@ -10,11 +10,10 @@ from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import FilePiece
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.stream.change_tasks import ChangeTasks
-from gateway.stream.parameters import Connection as ClientConnection
+from gateway.stream.replies import Connection as ClientConnection
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
-from gateway.stream.stream_control import StreamControl
+from gateway.stream.stream_requests import ChangeTasks, StreamControl
 from tests.servers import packet
 from tests.unit.stream.scripted_server import Answer, Connection, ScriptedServer, obliging, read_parameters
 from tests.virtual_time import EPOCH_UTIME, read_clocks

@@ -10,8 +10,8 @@ import pytest
 
 from gateway.errors import DefectError, RequestError
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.change_tasks import DEMAND_POLL_S, MAX_RESUMES
 from gateway.stream.state import StreamState
+from gateway.stream.stream_requests import DEMAND_POLL_S, MAX_RESUMES
 from tests.unit.stream.scripted_server import obliging, refusing, silent_to
 from tests.unit.stream.session_lab import Lab
 from tests.virtual_time import settle
@@ -158,7 +158,7 @@ async def test_a_request_for_the_default_rate_is_logged_as_such(caplog: pytest.L
 
 
 async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
+    caplog.set_level(logging.DEBUG, "gateway.stream.stream_requests")
     lab = await started(adapt_rate=True)
     lab.server.answer = silent_to("StreamFrames")
     await change(lab, 1)

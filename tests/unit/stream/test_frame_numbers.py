@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from gateway.stream.frame_numbers import FrameNumbers
+from gateway.stream.ingest import FrameNumbers
 
 PERIOD_US = 2500
 

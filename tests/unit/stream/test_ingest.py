@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.stream.ingest import Ingest

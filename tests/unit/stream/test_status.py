@@ -12,10 +12,10 @@ from gateway.errors import ClosedError, LinkError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
-from gateway.monitoring.status_line import source_line
 from gateway.publish.status_messages import status_message
-from gateway.rtc3d.protocol_state import ProtocolState
-from gateway.stream.running_clock import running_clock
+from gateway.rtc3d.client_protocol import ProtocolState
+from gateway.service.monitoring.health import source_line
+from gateway.stream.process_clock import running_clock
 from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, FrameRate, StreamStatus

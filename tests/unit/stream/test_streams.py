@@ -11,12 +11,12 @@ from gateway.c3d_files.spool import Spool
 from gateway.stream.state import StreamState
 from tests.servers import error, ok, packet
 from tests.spec_parameters import in_root
-from tests.unit.scripted_sources import Servers
+from tests.unit.service.scripted_sources import Servers
+from tests.unit.service.test_source import Lab
 from tests.unit.stream.scripted_server import Connection
-from tests.unit.test_source import Lab
 from tests.virtual_time import settle, until
 
-pytestmark = pytest.mark.interpreted  # gateway.source gets another Supervisor
+pytestmark = pytest.mark.interpreted  # gateway.service.source gets another Supervisor
 
 EVERYTHING = "3d 6d analog force event"
 TWO = ["3d 6d force event", "analog"]

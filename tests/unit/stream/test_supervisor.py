@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
-from gateway.log import HOLD_S, current_log_fields
-from gateway.messages.stamp import Stamp
+from gateway.logs.failures import HOLD_S, current_log_fields
+from gateway.messages.encode import Stamp
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.stream.backoff import STEADY_S, Backoff
-from gateway.stream.parameters import Connection
+from gateway.stream.replies import Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor
+from gateway.stream.tcp import STEADY_S, Backoff
 from tests.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
 from tests.unit.stream.session_lab import CollectedFiles
@@ -169,7 +169,7 @@ async def test_recovery_is_logged_once_with_its_duration_when_it_has_held(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = 0.0
-    monkeypatch.setattr("gateway.log.monotonic", lambda: now_s)
+    monkeypatch.setattr("gateway.logs.failures.monotonic", lambda: now_s)
     caplog.set_level(logging.INFO, "gateway.stream")
     lab = Lab()
     lab.server.refuses = True

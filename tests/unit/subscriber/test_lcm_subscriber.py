@@ -6,15 +6,14 @@ from pathlib import Path
 import pytest
 import rtc3d
 
-from gateway.messages.stamp import PREFIX
+from gateway.messages.encode import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.recorder.file_sink import FileSink
-from gateway.recorder.take_recording import TakeRecording
-from gateway.recorder.target import Target
 from gateway.subscriber.lcm_subscriber import LcmGatewaySubscriber
 from gateway.subscriber.reception import MAX_SOURCES
 from gateway.subscriber.series import FINGERPRINTS
-from gateway.takes.event_log import EventLogReader
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.recorder.take_recording import TakeRecording
+from gateway.takes.recorder.target import FileSink, Target
 from tests.networks import lcm_url
 from tests.waiting import wait_until
 

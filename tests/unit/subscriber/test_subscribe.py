@@ -4,7 +4,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from gateway.live.live_data import LiveData
+from gateway.display.live.live_data import LiveData
 from gateway.subscriber.series import Source
 from gateway.subscriber.subscribe import silence_text
 

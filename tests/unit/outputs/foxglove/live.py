@@ -8,7 +8,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.settings import FoxgloveSettings

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from gateway.errors import ConfigError
-from gateway.findings import Finding, Result
+from gateway.outputs.findings import Finding, Result
 from gateway.outputs.foxglove import checks
 from gateway.outputs.foxglove.checks import check_foxglove, leaves_host
 from gateway.outputs.foxglove.kind import FOXGLOVE

@@ -76,7 +76,8 @@ async def test_a_slow_viewer_loses_messages_which_are_counted_and_another_loses_
             messages, frames = lab.losses["slow client"]
             assert messages == frames >= 100
             assert viewer.warnings == []
-    [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    # On a busy computer, the loss may seem to end in between, and is logged again when it goes on.
+    [warning] = {record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING}
     assert warning.startswith("lab to foxglove: the viewer at 127.0.0.1:")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.foxglove_schemas import float_topics, forces, messages
+from gateway.foxglove_schemas import forces, messages, topics
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.foxglove import output as output_module
 from gateway.outputs.foxglove.output import FoxgloveOutput
@@ -21,7 +21,6 @@ from gateway.rtc3d.components import MISSING, WIRE_ORDER, ByteOrder, ComponentTy
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, ParametersForce, Tool
 from tests.foxglove_viewer import HandshakeRefusedError, Viewer, viewing
 from tests.networks import free_port
-from tests.unit.export.read_mcap import floats_of, points_of
 from tests.unit.outputs.foxglove.live import (
     ANALOG,
     EVENT,
@@ -37,6 +36,7 @@ from tests.unit.outputs.foxglove.live import (
     serving,
     watching,
 )
+from tests.unit.takes.export.read_mcap import floats_of, points_of
 from tests.waiting import wait_until_async
 
 ALWAYS = {
@@ -199,8 +199,8 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
     for owner, name in (
         (messages.FoxgloveSource, "_cloud"),
         (messages.FoxgloveSource, "_transforms"),
-        (float_topics.ProtobufRecord, "encode"),
-        (float_topics.CdrRecord, "encode"),
+        (topics.ProtobufRecord, "encode"),
+        (topics.CdrRecord, "encode"),
         (messages.FoxgloveSource, "_log"),
         (forces.ForceScene, "arrows"),
     ):

@@ -6,9 +6,8 @@ from typing import Any
 
 import foxglove
 
-from gateway.foxglove_schemas.float_topics import FloatTopics
 from gateway.foxglove_schemas.messages import FoxgloveSource
-from gateway.foxglove_schemas.topics import FoxgloveMessage
+from gateway.foxglove_schemas.topics import FloatTopics, FoxgloveMessage
 from gateway.outputs.foxglove.server import FoxgloveServer, send
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters

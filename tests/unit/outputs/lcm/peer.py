@@ -9,11 +9,10 @@ import lcm
 import pytest
 import rtc3d
 
-from gateway.log import current_log_fields
-from gateway.losses import Losses
-from gateway.messages.decode import decode
+from gateway.logs.failures import current_log_fields
+from gateway.logs.losses import Losses
+from gateway.messages.decode import JSON, decode, json_bytes
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
-from gateway.outputs.encodings import JSON, json_bytes
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.queries import LcmQueries
 from gateway.outputs.lcm.settings import LcmSettings

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from gateway.findings import Finding, MessageLoad, Result
+from gateway.outputs.findings import Finding, MessageLoad, Result
 from gateway.outputs.lcm import checks
 from gateway.outputs.lcm.checks import charged_bytes, check_lcm
 from gateway.outputs.lcm.settings import LcmSettings

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.encode import Stamp
 from gateway.messages.host_time import HostClock, now_steady_us
-from gateway.messages.stamp import Stamp
-from gateway.outputs.lsl.capture_time import CaptureTimes, SuspendedTime
-from gateway.outputs.lsl.samples import samples
+from gateway.outputs.lsl.publisher import CaptureTimes, SuspendedTime
+from gateway.outputs.lsl.source_streams import samples
 from gateway.outputs.lsl.wire import (
     Kind,
     Message,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lsl.publisher import MAX_WAITING, LslFramePublisher
 from gateway.outputs.lsl.settings import LslSettings

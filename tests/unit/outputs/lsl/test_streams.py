@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from gateway.findings import Result
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.findings import Result
 from gateway.outputs.lsl import checks
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.streams import (

@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.ros2.message_types import TF_MESSAGE
+from gateway.logs.losses import Losses
+from gateway.outputs.contract import OutputHealth, ServerParameters
+from gateway.outputs.ros2.messages import TF_MESSAGE
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosTopic
-from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from tests.losses import amounts

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from gateway.findings import Result
+from gateway.outputs.findings import Result
 from gateway.outputs.ros2.checks import CHECKS, check_ros2, leaves_host
-from gateway.outputs.ros2.message_types import NO_HASH, POSE_STAMPED
+from gateway.outputs.ros2.messages import NO_HASH, POSE_STAMPED
 from gateway.outputs.ros2.settings import Ros2Settings
 from tests.networks import free_endpoint
 from tests.ros_lab import RosLab, ros_lab

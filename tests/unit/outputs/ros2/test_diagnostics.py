@@ -6,7 +6,7 @@ import pytest
 import rtc3d
 
 from gateway.messages.topics import Topic
-from gateway.outputs.no_topics import IgnoringPublisher
+from gateway.outputs.contract import IgnoringPublisher
 from gateway.outputs.ros2 import diagnostics as diagnostics_module
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher, diagnostics_of
 from gateway.outputs.ros2.messages import DiagnosticStatus

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.outputs.ros2 import cdr
+from gateway.outputs.ros2 import messages
 from gateway.outputs.ros2.messages import (
     AnalogEncoder,
     CloudEncoder,
@@ -41,8 +41,8 @@ poses = st.tuples(*7 * [doubles])
     ],
 )
 def test_a_stamp_is_moved_into_its_range(utime: int, stamp: str) -> None:
-    assert cdr.stamp(utime)[:4] == bytes.fromhex(stamp)[:4]
-    assert int.from_bytes(cdr.stamp(utime)[4:], "little") < 1_000_000_000
+    assert messages.stamp(utime)[:4] == bytes.fromhex(stamp)[:4]
+    assert int.from_bytes(messages.stamp(utime)[4:], "little") < 1_000_000_000
 
 
 def test_a_text_with_nul_or_half_a_character_is_still_one_text() -> None:
@@ -63,7 +63,7 @@ def test_a_cloud_has_its_numbers_in_the_order_of_its_fields() -> None:
     assert not message.is_dense
 
 
-REAL_STAMP = cdr.stamp(1_700_000_000_000_001)
+REAL_STAMP = messages.stamp(1_700_000_000_000_001)
 REAL_POSE = pack_pose(0.1, -2, 3, 0, 0.6, 0, 0.8)
 
 
@@ -90,7 +90,12 @@ REAL_POSE = pack_pose(0.1, -2, 3, 0, 0.6, 0, 0.8)
         ),
         pytest.param(
             b"%b%b%b%b"
-            % (cdr.ENCAPSULATION, REAL_STAMP, TransformNames("hall-2", "hall-2/Left_Foot").later, REAL_POSE),
+            % (
+                messages.ENCAPSULATION,
+                REAL_STAMP,
+                TransformNames("hall-2", "hall-2/Left_Foot").later,
+                REAL_POSE,
+            ),
             "0001000000f15365e80300000700000068616c6c2d3200001100000068616c6c2d322f4c6566745f466f6f7400000000"
             "000000009a9999999999b93f00000000000000c000000000000008400000000000000000333333333333e33f00000000"
             "000000009a9999999999e93f",
@@ -140,7 +145,7 @@ def test_messages_equal_those_of_real_ros(ours: bytes, theirs: str) -> None:
 
 @given(utimes, texts, st.tuples(*6 * [doubles]))
 def test_wrenches_equal_those_of_rosbags(utime: int, frame_id: str, wrench: tuple[float, ...]) -> None:
-    ours = StampedEncoder(frame_id).encode(cdr.stamp(utime), pack_wrench(*wrench))
+    ours = StampedEncoder(frame_id).encode(messages.stamp(utime), pack_wrench(*wrench))
     assert ours == ros.encoded(ros.wrench_stamped(utime, frame_id, wrench))
 
 
@@ -149,7 +154,8 @@ def test_transforms_equal_those_of_rosbags(
     utime: int, frame_id: str, children: list[tuple[str, tuple[float, ...]]]
 ) -> None:
     ours = tf_message(
-        cdr.stamp(utime), [(TransformNames(frame_id, child), pack_pose(*pose)) for child, pose in children]
+        messages.stamp(utime),
+        [(TransformNames(frame_id, child), pack_pose(*pose)) for child, pose in children],
     )
     assert ours == ros.encoded(ros.tf_message(utime, frame_id, children))
 
@@ -158,7 +164,7 @@ def test_transforms_equal_those_of_rosbags(
 def test_clouds_equal_those_of_rosbags(utime: int, frame_id: str, markers: list[tuple[float, ...]]) -> None:
     values = np.array(markers, dtype=np.float64).reshape(-1, 4)
     ours = CloudEncoder(frame_id, len(markers)).encode(
-        cdr.stamp(utime), values[:, :3].copy(), values[:, 3].astype(np.float32)
+        messages.stamp(utime), values[:, :3].copy(), values[:, 3].astype(np.float32)
     )
     cloud = ros.decoded(ours, "sensor_msgs/msg/PointCloud2")
     assert ros.encoded(cloud) == ours
@@ -207,7 +213,7 @@ statuses = st.lists(
 
 @given(utimes, statuses)
 def test_diagnostics_equal_those_of_rosbags(utime: int, statuses: list[DiagnosticStatus]) -> None:
-    ours = diagnostic_array(cdr.stamp(utime), statuses)
+    ours = diagnostic_array(messages.stamp(utime), statuses)
     theirs: Any = ros.message(
         "diagnostic_msgs/msg/DiagnosticArray",
         header=ros.header(utime, ""),

@@ -13,7 +13,7 @@ from gateway.outputs.ros2 import output as output_module
 from gateway.outputs.ros2.output import Ros2Output
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.source import RosSource
-from gateway.outputs.ros2.wire import gid_of
+from gateway.outputs.ros2.topic import gid_of
 from gateway.rtc3d.components import ComponentType
 from tests.ros_lab import ALL, parameters, ros_lab, stamp, tools_frame
 from tests.unit.outputs.ros2.scripted_ros import Node, Router, Sender

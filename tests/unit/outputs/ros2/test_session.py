@@ -7,11 +7,10 @@ from unittest.mock import Mock
 import pytest
 import zenoh
 
-from gateway.outputs.ros2.message_types import POINT_CLOUD
-from gateway.outputs.ros2.router import client_config
+from gateway.outputs.ros2.messages import POINT_CLOUD
+from gateway.outputs.ros2.output import client_config
 from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.ros2.topic import RosNode, RosTopic
-from gateway.outputs.ros2.wire import gid_of
+from gateway.outputs.ros2.topic import RosNode, RosTopic, gid_of
 from tests.settings import mistakes
 
 ENDPOINT = "tcp/192.0.2.9:7447"

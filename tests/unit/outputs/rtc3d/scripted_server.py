@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.rtc3d.live_server import LiveServer, SourceState
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder

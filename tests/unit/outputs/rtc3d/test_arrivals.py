@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept, StreamRate
-from gateway.outputs.rtc3d.frame_bytes import encode_joined
+from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept, StreamRate, encode_joined
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, LiveFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame

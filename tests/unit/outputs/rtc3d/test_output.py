@@ -10,14 +10,13 @@ from typing import Any, ClassVar
 import pytest
 
 from gateway.errors import GatewayError, OutputError
-from gateway.losses import Losses
-from gateway.messages.stamp import Stamp
+from gateway.logs.losses import Losses
+from gateway.messages.decode import JSON
+from gateway.messages.encode import Stamp
 from gateway.outputs.contract import CONTROL_OPTION, Answer, ServerFile, ServerParameters
-from gateway.outputs.encodings import JSON
 from gateway.outputs.rtc3d import output as output_module
 from gateway.outputs.rtc3d.live_server import SourceState
-from gateway.outputs.rtc3d.output import Rtc3dOutput
-from gateway.outputs.rtc3d.publisher import QUEUE_FULL
+from gateway.outputs.rtc3d.output import QUEUE_FULL, Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateway.findings import Finding, Result
+from gateway.outputs.findings import Finding, Result
 from gateway.outputs.rtc3d.checks import CHECKS, check_rtc3d
 from gateway.outputs.rtc3d.kind import RTC3D
 from gateway.outputs.rtc3d.settings import Rtc3dSettings

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from gateway.findings import MessageLoad
+from gateway.outputs.findings import MessageLoad
 from gateway.outputs.takes.checks import check_takes
 from tests.recording_output import settings_in
 from tests.unit.outputs.takes.test_segments import no_links

@@ -7,9 +7,15 @@ from typing import Any, cast
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, TakeCommand
-from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
-from gateway.takes.description import NO_DETAILS, TakeDetails
+from gateway.outputs.takes.control import (
+    MAX_LISTED,
+    MAX_SAVED_S,
+    SourceTakes,
+    StoredTake,
+    TakeCommand,
+    TakePiece,
+)
+from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from tests.settable_clock import Clock
 
 ABOUT = TakeDetails("S01", note="left knee")

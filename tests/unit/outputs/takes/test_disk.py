@@ -14,18 +14,17 @@ from typing import Any, cast
 import pytest
 
 from gateway.errors import OutputError, QueryError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters
+from gateway.outputs.takes import disk as disk_calls
 from gateway.outputs.takes import disk as disk_module
-from gateway.outputs.takes import disk_calls
 from gateway.outputs.takes.disk import RETRY_S, Disk
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
-from gateway.outputs.takes.header import FileHeader, SourceDescription
-from gateway.outputs.takes.log_sink import LogSink
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.takes.recording import LogFile
+from gateway.outputs.takes.take_file import FileHeader, LogSink, SourceDescription
+from gateway.takes.files.recording import LogFile
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
 from tests.waiting import wait_until_async

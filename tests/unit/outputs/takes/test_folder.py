@@ -10,11 +10,11 @@ import pytest
 
 from gateway.errors import QueryError
 from gateway.outputs.takes import folder as folder_module
-from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.control import MAX_PIECE_BYTES, StoredTake
+from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
-from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
-from gateway.takes.event_log import encode_event
+from gateway.takes.files.event_log import encode_event
 from tests.recording_output import NoThread, settings_in
 from tests.settable_clock import Clock
 from tests.unit.outputs.takes.test_segments import no_links

@@ -12,7 +12,7 @@ import pytest
 import rtc3d
 
 from gateway.outputs.takes.follow import END_S, LOST_S, event_ids
-from gateway.takes.reader import TakeReader
+from gateway.takes.files.reader import TakeReader
 from tests.recording_output import RecordingLab, still_lab
 from tests.settable_clock import Clock
 from tests.unit.messages.samples import component_message

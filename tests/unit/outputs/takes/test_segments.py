@@ -10,16 +10,16 @@ from typing import NoReturn
 import pytest
 
 from gateway.errors import QueryError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import TakesFolder
-from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.takes.description import TakeDetails
-from gateway.takes.event_log import EventLogReader
-from gateway.takes.reader import TakeReader
-from gateway.takes.recording import LogFile
+from gateway.outputs.takes.take_file import FileHeader, SourceDescription
+from gateway.takes.files.description import TakeDetails
+from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.recording import LogFile
 from tests.recording_output import frames, still_lab
 from tests.settable_clock import Clock
 

@@ -16,13 +16,13 @@ from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.takes import recorded_takes
+from gateway.outputs.takes.control import StoredTake
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.stored import StoredTake
 from gateway.takes import open_take
-from gateway.takes.description import NO_DETAILS, TakeDetails
-from gateway.takes.statistics import take_statistics
+from gateway.takes.files.description import NO_DETAILS, TakeDetails
+from gateway.takes.files.statistics import take_statistics
 from tests.recording_output import events, frames, still_lab
 from tests.settable_clock import Clock
 from tests.virtual_time import run_in_virtual_time

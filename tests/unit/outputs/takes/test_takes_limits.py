@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.output import TakesOutput
-from gateway.takes.reader import log_paths
+from gateway.takes.files.reader import log_paths
 from tests.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
 from tests.settable_clock import Clock
 from tests.takes import markers, write_take

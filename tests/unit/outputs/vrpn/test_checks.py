@@ -3,7 +3,7 @@
 import socket
 import threading
 
-from gateway.findings import Result
+from gateway.outputs.findings import Result
 from gateway.outputs.vrpn.checks import CHECKS, check_vrpn, leaves_host
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.stamp import Stamp
+from gateway.messages.encode import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.vrpn.output import VrpnOutput
+from gateway.outputs.vrpn.output import MAX_TOOLS, VrpnOutput, VrpnPublisher
 from gateway.outputs.vrpn.protocol import encode_pose
-from gateway.outputs.vrpn.publisher import MAX_TOOLS, VrpnPublisher
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.vrpn.trackers import Trackers
 from gateway.rtc3d.components import ITEM_DTYPES, ByteOrder, ComponentType, encode_component

@@ -11,10 +11,16 @@ import pytest_asyncio
 
 from gateway.outputs.vrpn import client as client_module
 from gateway.outputs.vrpn import server as server_module
-from gateway.outputs.vrpn.knocks import MAX_CALLS, MAX_CALLS_PER_HOST, Knocks
 from gateway.outputs.vrpn.protocol import encode_pose
-from gateway.outputs.vrpn.server import MAX_CLIENTS, MAX_HANDSHAKES, VrpnServer
-from gateway.outputs.vrpn.sockets import bind
+from gateway.outputs.vrpn.server import (
+    MAX_CALLS,
+    MAX_CALLS_PER_HOST,
+    MAX_CLIENTS,
+    MAX_HANDSHAKES,
+    Knocks,
+    VrpnServer,
+    bind,
+)
 from gateway.token_bucket import TokenBucket
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE, Pose, VrpnClient, send_datagram
@@ -125,7 +131,7 @@ async def test_refused_calls_are_logged_few_times(running: Running, caplog: pyte
 
 async def test_flood_of_udp_calls_is_read_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
-    monkeypatch.setattr("gateway.outputs.vrpn.knocks.knock_port", read.append)
+    monkeypatch.setattr("gateway.outputs.vrpn.server.knock_port", read.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         for _ in range(3000):
             udp.sendto(b"127.0.0.1 5000\0", ("127.0.0.1", running[1]))

@@ -11,8 +11,8 @@ import pytest
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.log import current_log_fields
-from gateway.losses import Losses
+from gateway.logs.failures import current_log_fields
+from gateway.logs.losses import Losses
 from gateway.outputs.contract import Answer, KeyPath
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.queries import ZenohQueries

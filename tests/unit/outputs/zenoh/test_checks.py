@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.findings import Finding, Result
+from gateway.outputs.findings import Finding, Result
 from gateway.outputs.zenoh.checks import check_zenoh, leaves_host
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 import rtc3d
 
-from gateway.messages.decode import decode, to_json
+from gateway.messages.decode import MAX_JSON_SOURCE_BYTES, decode, to_json
 from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
-from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer

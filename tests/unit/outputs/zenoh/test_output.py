@@ -9,9 +9,8 @@ import zenoh
 
 from gateway.errors import ConfigError, OutputError
 from gateway.messages.topics import Topic
-from gateway.outputs.status import OutputHealth
-from gateway.outputs.zenoh.command_session import command_config
-from gateway.outputs.zenoh.config import zenoh_config
+from gateway.outputs.contract import OutputHealth
+from gateway.outputs.zenoh.config import command_config, zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.networks import free_endpoint, zenoh_keys

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.zenoh import queries as queries_module
 from gateway.outputs.zenoh.json_keys import JsonKeys

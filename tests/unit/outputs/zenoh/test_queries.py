@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.losses import Losses
+from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module

@@ -11,7 +11,18 @@ from hypothesis import strategies as st
 from gateway.errors import ConfigError, FrameError
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
-from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault
+from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault, PendingWrite, Reply
+from gateway.simulator.faults.connection_faults import (
+    Cut,
+    Delay,
+    Jitter,
+    Merge,
+    Oversize,
+    Restart,
+    Split,
+    Undersize,
+)
+from gateway.simulator.faults.control import KINDS, describe_kinds, parse_fault, summary_of
 from gateway.simulator.faults.frame_faults import (
     FrozenTimestamps,
     JumpingTimestamps,
@@ -21,15 +32,9 @@ from gateway.simulator.faults.frame_faults import (
     WrongByteOrder,
     WrongCounts,
 )
-from gateway.simulator.faults.held_replies import HeldReplies
-from gateway.simulator.faults.kinds import KINDS, describe_kinds, parse_fault, summary_of
-from gateway.simulator.faults.momentary_faults import Cut, Oversize, Undersize
-from gateway.simulator.faults.outgoing import PendingWrite, Reply
-from gateway.simulator.faults.reply_faults import MinimalServer, RefusedCommands
-from gateway.simulator.faults.server_faults import Restart
-from gateway.simulator.faults.stream_faults import Delay, Jitter, Merge, Split
-from gateway.simulator.scene_settings import SceneSettings
+from gateway.simulator.faults.reply_faults import HeldReplies, MinimalServer, RefusedCommands
 from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SceneSettings
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     COMMAND,

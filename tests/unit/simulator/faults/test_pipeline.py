@@ -8,8 +8,19 @@ from itertools import pairwise
 import pytest
 
 from gateway.simulator.faults.base import Fault
+from gateway.simulator.faults.connection_faults import (
+    Delay,
+    Garbage,
+    HalfOpen,
+    Jitter,
+    Merge,
+    NoMeasurement,
+    SlowReader,
+    Split,
+    Undersize,
+)
 from gateway.simulator.faults.frame_faults import ConstantFrameNumbers, ShortEvents
-from gateway.simulator.faults.momentary_faults import Garbage, Undersize
+from gateway.simulator.faults.pipeline import MAX_WAITING_BYTES
 from gateway.simulator.faults.reply_faults import (
     DoubledAcknowledgements,
     FramesFirst,
@@ -19,9 +30,6 @@ from gateway.simulator.faults.reply_faults import (
     RefusedCommands,
     ReplyText,
 )
-from gateway.simulator.faults.server_faults import NoMeasurement
-from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Jitter, Merge, SlowReader, Split
-from gateway.simulator.faults.write_queue import MAX_WAITING_BYTES
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, NO_DATA, XML, components_in, packet
 from tests.unit.simulator.faults.faulty_client import VERSION, FaultyClient
 

@@ -1,0 +1,299 @@
+"""The demo: simulator, gateway, a subscriber of each output, and the 3D view in a process of its own.
+
+No data leaves the machine: Zenoh uses loopback TCP without scouting, LCM stays in memory (or uses
+multicast with ``udpm``). The measurement starts after all subscribers have received the gateway's status,
+and stops before they close, so every component that was sent must arrive. Messages that the gateway skipped
+on purpose and messages that arrived late are counted apart from lost ones.
+"""
+
+import asyncio
+import contextlib
+import importlib.util
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Final, TypeAlias
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings
+from gateway.errors import OutputError, ViewError
+from gateway.messages.decode import decode, prefix_of
+from gateway.messages.host_time import now_utime
+from gateway.messages.summary import summarise
+from gateway.outputs.kind import DemoSide
+from gateway.outputs.registry import OUTPUTS, settings_type
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER
+from gateway.rtc3d_server.scene import Scene
+from gateway.service.gateway import Gateway
+from gateway.simulator.simulator import Simulator
+from gateway.stream.state import StreamState
+from gateway.stream.status import SKIPPED
+from gateway.workers import module_environment
+
+ViewProcess: TypeAlias = Callable[[str], AbstractAsyncContextManager[None]]
+"""Runs the view on a Zenoh endpoint, while the context is open."""
+
+_HOST: Final = "127.0.0.1"
+_PORT: Final = 8080
+_READY_S: Final = 15.0
+_STOP_S: Final = 5.0
+
+
+def view_is_installed() -> bool:
+    """Whether the extra ``view`` is installed."""
+    return importlib.util.find_spec("viser") is not None
+
+
+@asynccontextmanager
+async def view_process(endpoint: str, *, is_required: bool, opens_browser: bool) -> AsyncIterator[None]:
+    """Run ``rtc3d-gateway view`` on a Zenoh endpoint, and print its address when it serves the page.
+
+    If it ``is_required``, raise ViewError if it does not start, and open a browser if ``opens_browser``.
+    """
+    port = _free_port()
+    command = [sys.executable, "-m", "gateway", "view", "--connect", endpoint, "--port", str(port)]
+    if not (is_required and opens_browser):
+        command.append("--no-browser")
+    # A session of its own: Ctrl-C in the terminal must not end it before the demo does.
+    process = await asyncio.create_subprocess_exec(
+        *command, stdout=asyncio.subprocess.PIPE, start_new_session=True, env=module_environment()
+    )
+    assert process.stdout is not None  # noqa: S101 - it is a pipe
+    try:
+        line = b""
+        with contextlib.suppress(TimeoutError):
+            line = await asyncio.wait_for(process.stdout.readline(), _READY_S)
+        if line:
+            print(f"Watch it in a browser: http://{_HOST}:{port}", flush=True)
+        elif is_required:
+            raise ViewError("the 3D view did not start; see above, or try rtc3d-gateway view")
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), _STOP_S)
+        except TimeoutError:
+            process.kill()
+
+
+def _free_port() -> int:
+    """Return the usual port of the view, or another one if that is taken."""
+    for port in (_PORT, 0):
+        with contextlib.suppress(OSError), socket.create_server((_HOST, port)) as test:
+            return int(test.getsockname()[1])
+    return _PORT
+
+
+SOURCE: Final = "demo"
+_START_TIMEOUT_S: Final = 10.0
+_QUIET_S: Final = 3.0
+"""If nothing arrives for this long after the end, what is missing then is lost."""
+
+_REFRESH_S: Final = 0.5
+_MESSAGE_WIDTH: Final = 60
+
+
+@dataclass
+class _Received:
+    """What one subscriber received, by component. Its thread writes, the event loop reads."""
+
+    max_lag_s: float
+    """Messages that arrive later than this after their capture are late."""
+    count: Counter[str] = field(default_factory=Counter)
+    late: Counter[str] = field(default_factory=Counter)
+    newest: dict[str, bytes] = field(default_factory=dict)
+
+    def add(self, name: str, message: bytes) -> None:
+        """Count a message. ``name`` is a key or channel, such as mocap/demo/3d or MOCAP_DEMO_3D."""
+        component = name.replace("_", "/").rsplit("/", 1)[-1].lower()
+        self.count[component] += 1
+        self.newest[component] = message
+        if component in COMPONENTS_BY_KEY:
+            self.late[component] += now_utime() - prefix_of(message).capture_utime > 1e6 * self.max_lag_s
+
+
+async def run_demo(
+    scene: Scene,
+    stop: asyncio.Event,
+    console: Console,
+    *,
+    seconds: float | None = None,
+    udpm: bool = False,
+    view: Callable[[str], AbstractAsyncContextManager[None]] | None = None,
+) -> bool:
+    """Show rates and values for ``seconds``, or until ``stop``; return whether every message was received.
+
+    ``view`` starts a viewer that subscribes at a Zenoh endpoint, until the end of the demo. Raises
+    OutputError if Zenoh or LCM does not open on this machine.
+    """
+    sides = {name: kind.demo(udpm) for name, kind in OUTPUTS.items() if kind.demo is not None}
+    async with contextlib.AsyncExitStack() as stack:
+        simulator = await stack.enter_async_context(Simulator(scene))
+        simulator.stop_measurement()
+        settings = _settings(simulator.port, sides)
+        received = {name: _Received(settings.sources[0].max_lag_ms / 1000) for name in sides}
+        gateway = Gateway(settings, [side.output for side in sides.values()])
+        await stack.enter_async_context(_running(gateway))
+        for name, side in sides.items():
+            await _until_open(name, side)
+            stack.callback(side.subscribe(SOURCE, received[name].add).close)
+            if view is not None and side.endpoint is not None:
+                await stack.enter_async_context(view(side.endpoint))
+        await _until(
+            lambda: all(each.count["status"] for each in received.values()),
+            _START_TIMEOUT_S,
+            "the gateway's status did not arrive on every output",
+        )
+        [source] = gateway.sources
+        await _until(
+            lambda: all(status.state is StreamState.NO_MEASUREMENT for status in source.statuses),
+            _START_TIMEOUT_S,
+            "the gateway did not request every component",
+        )
+        simulator.start_measurement()
+        await _show(received, stop, seconds, console)
+        simulator.stop_measurement()
+        await _wait_for_missing(simulator, received)
+        skipped = _num_skipped(gateway)
+    console.print(_report(simulator.components_sent, received))
+    lost = sum(max(0, _num_missing(simulator.components_sent, each) - skipped) for each in received.values())
+    late = sum(each.late.total() for each in received.values())
+    console.print(
+        f"{skipped} messages were skipped, and {late} arrived late "
+        f"(more than {settings.sources[0].max_lag_ms:g} ms after their capture)."
+    )
+    if simulator.frames_dropped:
+        console.print(
+            f"The simulator left out {simulator.frames_dropped} frames that were more than 1 s late."
+        )
+    console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
+    return not lost
+
+
+@contextlib.asynccontextmanager
+async def _running(gateway: Gateway) -> AsyncIterator[None]:
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    try:
+        yield
+    finally:
+        stop.set()
+        await task
+
+
+def _settings(port: int, sides: dict[str, DemoSide]) -> Settings:
+    sections = {name: side.settings for name, side in sides.items()}
+    source = SourceSettings(name=SOURCE, host="127.0.0.1", port=port)
+    return settings_type().model_validate(
+        {"sources": (source,), "metrics": MetricsSettings(enabled=False), **sections}
+    )
+
+
+async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
+    try:
+        async with asyncio.timeout(timeout_s):
+            while not condition():  # noqa: ASYNC110 - other threads change the conditions
+                await asyncio.sleep(0.02)
+    except TimeoutError:
+        raise OutputError(f"{failure} within {timeout_s:g} s", cause="demo") from None
+
+
+async def _until_open(name: str, side: DemoSide) -> None:
+    await _until(lambda: side.output.health().connected, _START_TIMEOUT_S, f"{name} did not open")
+
+
+async def _show(
+    received: dict[str, _Received], stop: asyncio.Event, seconds: float | None, console: Console
+) -> None:
+    """Wait for ``seconds``, or until ``stop``, and show the live table if the output is a terminal."""
+    end = "s; Ctrl-C ends it" if seconds is None else f"of {seconds:.0f} s"
+    start_s = time.monotonic()
+    previous: dict[str, Counter[str]] = {output: Counter() for output in received}
+    elapsed_s = 0.0
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        while not stop.is_set() and (seconds is None or elapsed_s < seconds):
+            wait_s = _REFRESH_S if seconds is None else min(_REFRESH_S, seconds - elapsed_s)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), wait_s)
+            now_s = time.monotonic() - start_s
+            rates = {
+                output: {
+                    component: (each.count[component] - previous[output][component]) / (now_s - elapsed_s)
+                    for component in each.count
+                }
+                for output, each in received.items()
+            }
+            previous = {output: Counter(each.count) for output, each in received.items()}
+            elapsed_s = now_s
+            if console.is_terminal:
+                title = f"RTC3D simulator → gateway → subscribers, {now_s:.0f} {end}"
+                live.update(_table(received, rates, title), refresh=True)
+
+
+async def _wait_for_missing(simulator: Simulator, received: dict[str, _Received]) -> None:
+    """Wait until every message that was sent has arrived, or none arrives for _QUIET_S."""
+    while missing := sum(_num_missing(simulator.components_sent, each) for each in received.values()):
+        try:
+            await _until(
+                lambda: (
+                    sum(_num_missing(simulator.components_sent, each) for each in received.values()) < missing
+                ),
+                _QUIET_S,
+                "messages are missing",
+            )
+        except OutputError:
+            return
+
+
+def _num_missing(sent: Counter[str], received: _Received) -> int:
+    return sum(max(0, count - received.count[component]) for component, count in sent.items())
+
+
+def _num_skipped(gateway: Gateway) -> int:
+    """Return how many messages the gateway skipped before any output."""
+    statuses = [status for source in gateway.sources for status in source.statuses]
+    return sum(
+        loss.messages for status in statuses for loss in status.losses.report() if loss.cause == SKIPPED
+    )
+
+
+def _table(received: dict[str, _Received], rates: dict[str, dict[str, float]], title: str) -> Table:
+    table = Table(title=title)
+    table.add_column("component")
+    for output in received:
+        table.add_column(f"{output} Hz", justify="right")
+    table.add_column("newest message", width=_MESSAGE_WIDTH, no_wrap=True, overflow="ellipsis")
+    for component in WIRE_ORDER:
+        newest = next(iter(received.values())).newest.get(component.key)
+        text = "" if newest is None else summarise(decode(newest))
+        table.add_row(
+            component.key,
+            *(f"{rates[output].get(component.key, 0.0):.1f}" for output in received),
+            text,
+        )
+    return table
+
+
+def _report(sent: Counter[str], received: dict[str, _Received]) -> Table:
+    table = Table(title="Messages sent, received, late and missing")
+    for heading in (
+        "component",
+        "sent",
+        *(f"{output}\n{what}" for output in received for what in ("received", "late", "missing")),
+    ):
+        table.add_column(heading, justify="left" if heading == "component" else "right")
+    for component in WIRE_ORDER:
+        cells = []
+        for each in received.values():
+            count = each.count[component.key]
+            cells += [str(count), str(each.late[component.key]), str(sent[component.key] - count)]
+        table.add_row(component.key, str(sent[component.key]), *cells)
+    return table

@@ -1,0 +1,363 @@
+"""What ``record`` prints: its progress, what goes wrong, and the table at the end."""
+
+import contextlib
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple, TextIO
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from gateway.logs.safe_text import safe_text
+from gateway.subscriber.reception import MAX_SERIES, MAX_SOURCES
+from gateway.subscriber.series import POSE
+from gateway.subscriber.subscribe import GatewaySubscriber
+from gateway.takes.recorder.take_recording import RecordedSeries, RecordedSource, TakeRecording
+from gateway.takes.recorder.target import FileSink
+
+SILENCE_S: Final = 2.0
+_NO_DATA_S: Final = 3.0
+_TERMINAL_S: Final = 0.5
+_LINE_S: Final = 5.0
+_CHECK_S: Final = 1.0
+_SLOW_BYTES: Final = 8 * 1024 * 1024
+"""If more than this waits for the disk, it is too slow."""
+
+_MAX_LOSS_LINES: Final = 20
+
+
+class RecordProgress:
+    """Writes to stderr: on a terminal, a line that changes; otherwise, one line every few seconds.
+
+    If it is ``quiet``, it writes only what goes wrong.
+    """
+
+    def __init__(
+        self, recording: TakeRecording, subscriber: GatewaySubscriber, wanted: list[str], *, quiet: bool
+    ) -> None:
+        self._recording = recording
+        self._subscriber = subscriber
+        self._wanted = wanted
+        self._quiet = quiet
+        self._start_s = self._rate_s = time.monotonic()
+        self._checked_s = self._start_s
+        self._shown_s = self._start_s
+        self._former = (0, 0)  # messages and bytes, when the line was shown last
+        self._disk_problem = ""
+        self._is_slow = False
+        self._num_lost = 0
+        self._num_refused = 0
+        self._num_loss_lines = 0
+        self._reported: set[str] = set()  # what was reported and still holds
+        console = Console(stderr=True)
+        self._live: Live | None = None
+        if console.is_terminal and not quiet:
+            self._live = Live(Text(""), console=console, auto_refresh=False, transient=True)
+            self._live.start()
+
+    def tick(self) -> None:
+        """Report what is new. Call it often."""
+        now_s = time.monotonic()
+        self._check_disk()
+        if now_s - self._checked_s >= _CHECK_S:
+            self._checked_s = now_s
+            self._check_losses()
+            self._check_silence(now_s)
+        if not self._quiet and now_s - self._shown_s >= (_LINE_S if self._live is None else _TERMINAL_S):
+            self._shown_s = now_s
+            self._show(now_s)
+
+    def close(self) -> None:
+        """Remove the line."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _print(self, text: str) -> None:
+        if self._live is not None:
+            self._live.console.print(Text(safe_text(text)))
+            return
+        with contextlib.suppress(OSError, ValueError):  # nobody reads it: the recording goes on
+            print(safe_text(text), file=sys.stderr, flush=True)
+
+    # The disk, and losses.
+
+    def _check_disk(self) -> None:
+        sink = self._recording.sink
+        problem = "" if sink is None else sink.problem
+        if problem != self._disk_problem:
+            self._disk_problem = problem
+            if problem:
+                self._print(f"{problem}; up to 64 MB wait in memory until the disk has room again")
+            else:
+                self._print("the disk accepts what is written again")
+        queued_bytes = self._recording.queued_bytes
+        if self._is_slow:
+            self._is_slow = queued_bytes > _SLOW_BYTES // 2
+        elif queued_bytes > _SLOW_BYTES and not problem:
+            self._is_slow = True
+            self._print(f"the disk is too slow: {size_text(queued_bytes)} wait to be written")
+
+    def _check_losses(self) -> None:
+        all_series = self._recording.all_series
+        num_lost = sum(series.check.num_lost for series in all_series)
+        num_refused = sum(series.num_refused for series in all_series)
+        if num_lost > self._num_lost:
+            self._print_loss(f"{num_lost - self._num_lost} messages were lost on the way; {num_lost} so far")
+        if num_refused > self._num_refused:
+            text = "messages were not written, because too many wait for the disk"
+            self._print_loss(f"{num_refused - self._num_refused} {text}; {num_refused} so far")
+        self._num_lost, self._num_refused = num_lost, num_refused
+        for source in self._recording.sources_now:
+            if any(series.check.has_two_publishers for series in source.series):
+                self._report(
+                    f"two gateways publish the source {source.name}: give one of them another name, "
+                    "or record through one only; both are recorded"
+                )
+
+    def _print_loss(self, text: str) -> None:
+        self._num_loss_lines += 1
+        if self._num_loss_lines < _MAX_LOSS_LINES:
+            self._print(text)
+        elif self._num_loss_lines == _MAX_LOSS_LINES:
+            self._print(f"{text}; further losses are in the table at the end")
+
+    # Silence.
+
+    def _check_silence(self, now_s: float) -> None:
+        sources = [source for source in self._recording.sources_now if source.heard_s is not None]
+        missing = set(self._wanted) - {source.name for source in sources}
+        if now_s - self._start_s >= SILENCE_S and (missing or not sources):
+            self._report_missing()
+        for source in sources:
+            assert source.heard_s is not None  # noqa: S101 - see above
+            text = f"{source.name}: nothing has arrived for 2 s; is its gateway running?"
+            if now_s - source.heard_s >= SILENCE_S:
+                self._report(text)
+            else:
+                self._reported.discard(text)
+                self._check_streams(source, now_s)
+
+    def _report_missing(self) -> None:
+        if "missing" not in self._reported:
+            problem = self._subscriber.silence()
+            if problem:
+                self._reported.add("missing")
+                self._print(problem)
+
+    def _check_streams(self, source: RecordedSource, now_s: float) -> None:
+        """Report why there are no frames, if the gateway itself gets none."""
+        if source.num_data or now_s - self._start_s < _NO_DATA_S or source.name in self._reported:
+            return
+        status = source.decoded_status()
+        if status is None or any(stream.state == "streaming" for stream in status.streams):
+            return
+        self._reported.add(source.name)
+        for stream in status.streams:
+            error = f": {stream.last_error}" if stream.last_error else ""
+            self._print(
+                f"{source.name}: the gateway gets no frames from {status.server}: {stream.state}{error}"
+            )
+
+    def _report(self, text: str) -> None:
+        """Print a text, unless that was done already."""
+        if text not in self._reported:
+            self._reported.add(text)
+            self._print(text)
+
+    # The line.
+
+    def _show(self, now_s: float) -> None:
+        line = self._line(now_s)
+        if self._live is None:
+            self._print(line)
+        else:
+            self._live.update(Text(safe_text(line), no_wrap=True, overflow="ellipsis"), refresh=True)
+
+    def _line(self, now_s: float) -> str:
+        recording = self._recording
+        counts = (recording.num_messages, recording.num_bytes)
+        elapsed_s = max(now_s - self._rate_s, 1e-3)
+        message_rate, byte_rate = (
+            (new - old) / elapsed_s for new, old in zip(counts, self._former, strict=True)
+        )
+        self._former, self._rate_s = counts, now_s
+        minutes, seconds = divmod(int(now_s - self._start_s), 60)
+        sink = recording.sink
+        parts = [
+            f"{minutes}:{seconds:02}",
+            "waiting for messages" if sink is None else size_text(sink.num_bytes),
+            f"{message_rate:.0f} messages/s",
+            f"{size_text(byte_rate)}/s",
+            f"{self._num_lost} lost" if self._num_lost else "no gaps",
+            f"{size_text(recording.queued_bytes)} to be written",
+        ]
+        return "  ".join(parts)
+
+
+def size_text(num_bytes: float) -> str:
+    """Return a size in decimal units: "12.3 MB"."""
+    if num_bytes < 1e6:
+        return f"{num_bytes / 1e3:.0f} kB"
+    return f"{num_bytes / 1e6:.1f} MB" if num_bytes < 1e9 else f"{num_bytes / 1e9:.2f} GB"
+
+
+_ORDER: Final = ("3d", "6d", f"{POSE}*", "analog", "force", "event", "status", "clock", "parameters")
+_MAX_NOTES: Final = 10
+_COLUMNS: Final = ("messages", "size", "rate", "gaps", "lost", "not written")
+
+
+class SeriesCounts(NamedTuple):
+    """What was recorded of one component of a source. ``num_unwritten`` messages are not in the file."""
+
+    num_messages: int
+    num_bytes: int
+    rate_hz: float
+    num_gaps: int
+    num_lost: int
+    num_unwritten: int
+
+
+def counts_of(series: Sequence[RecordedSeries], sink: FileSink) -> SeriesCounts:
+    """Return the counts of some series together."""
+    num_unwritten = sum(each.num_refused + sink.lost[each.channel] for each in series)
+    num_messages = sum(each.num_messages for each in series)
+    return SeriesCounts(
+        num_messages - num_unwritten,
+        sum(each.num_bytes - each.num_refused_bytes - sink.lost_bytes[each.channel] for each in series),
+        sum(_rate_hz(each) for each in series),
+        sum(each.check.num_gaps for each in series),
+        sum(each.check.num_lost for each in series),
+        num_unwritten,
+    )
+
+
+def _rate_hz(series: RecordedSeries) -> float:
+    duration_us = series.check.last_utime - series.check.first_utime
+    return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
+
+
+def print_summary(recording: TakeRecording, out: TextIO) -> bool:
+    """Print what was recorded, and return whether the recording is complete.
+
+    It is if it has a message of a frame, and none that was published meanwhile is missing.
+    """
+    console = Console(file=out)
+    sink = recording.sink
+    if sink is None:
+        console.print(Text("nothing was recorded, and there is no file: no message has arrived"))
+        return False
+    table = Table("source", "component", box=None, pad_edge=False)
+    for column in _COLUMNS:
+        table.add_column(column, justify="right")
+    for source in recording.sources_now:
+        for row, series in _rows(source):
+            counts = counts_of(series, sink)
+            table.add_row(
+                Text(safe_text(source.name)),
+                row,
+                str(counts.num_messages),
+                size_text(counts.num_bytes),
+                f"{counts.rate_hz:.1f} Hz",
+                *(str(number) if number else "-" for number in counts[3:]),
+            )
+    console.print(table)
+    problems = [*_problems(recording)]
+    notes = [*_notes(recording)]
+    if len(notes) > _MAX_NOTES:
+        notes[_MAX_NOTES:] = [f"… and {len(notes) - _MAX_NOTES} notes on other sources"]
+    for note in (*notes, *problems):
+        console.print(Text(safe_text(note)), soft_wrap=True)
+    end = "INCOMPLETE" if problems else "complete: no gaps"
+    console.print(Text(f"{sink.path}: {size_text(sink.num_bytes)}, {end}"), soft_wrap=True)
+    return not problems
+
+
+def _rows(source: RecordedSource) -> Iterator[tuple[str, list[RecordedSeries]]]:
+    rows: defaultdict[str, list[RecordedSeries]] = defaultdict(list)
+    for series in source.series:
+        if series.is_recorded and series.num_messages:
+            rows[series.row].append(series)
+    for row in sorted(rows, key=_ORDER.index):
+        yield row, rows[row]
+
+
+def _problems(recording: TakeRecording) -> Iterator[str]:
+    """Yield why the recording is not complete."""
+    if not any(source.num_data for source in recording.sources_now):
+        yield "no frame was recorded"
+    yield from _losses(recording)
+    if recording.sink is not None:
+        yield from _disk_problems(recording.sink)
+    if recording.is_moved:
+        yield "the file was moved or deleted while it was recorded"
+    if recording.defect is not None:
+        yield (
+            f"{recording.num_defects} messages were not recorded because of a defect in rtc3d-gateway: "
+            f"{type(recording.defect).__name__}: {recording.defect}; report this"
+        )
+    if recording.num_beyond:
+        yield (
+            f"{recording.num_beyond} messages were not recorded: there are more than {MAX_SOURCES} sources "
+            f"or {MAX_SERIES} keys; choose some with --source and --component"
+        )
+
+
+def _losses(recording: TakeRecording) -> Iterator[str]:
+    all_series = [series for series in recording.all_series if series.is_recorded]
+    num_lost = sum(series.check.num_lost for series in all_series)
+    if num_lost:
+        yield f"{num_lost} messages were lost between the gateway and this computer, or in the gateway"
+    for source in recording.sources_now:
+        if any(series.check.has_two_publishers for series in source.series):
+            yield (
+                f"two gateways publish the source {source.name}, so losses cannot be counted exactly; "
+                "give one of them another name"
+            )
+    num_refused = sum(series.num_refused for series in all_series)
+    if num_refused:
+        yield f"{num_refused} messages were not written, because too many waited for the disk"
+
+
+def _disk_problems(sink: FileSink) -> Iterator[str]:
+    if sink.lost:
+        yield f"{sink.lost.total()} messages were not written: {sink.problem}"
+    elif sink.problem:
+        yield sink.problem
+    elif sink.is_unsafe:
+        yield "the disk reported errors: the file may be damaged"
+
+
+def _notes(recording: TakeRecording) -> Iterator[str]:
+    """Yield what is worth knowing, although nothing is missing because of it."""
+    if recording.num_foreign:
+        yield (
+            f"{recording.num_foreign} messages on these keys or channels were not recorded: they are none of "
+            "this version's types; does another program, or another version of the gateway, publish there?"
+        )
+    if recording.sink is not None and recording.sink.num_errors and not recording.sink.problem:
+        yield f"the disk did not accept what was written for a while ({_times(recording.sink.num_errors)})"
+    for source in recording.sources_now:
+        checks = [series.check for series in source.series]
+        restarts = max((check.num_restarts for check in checks), default=0)
+        if restarts:
+            yield f"{source.name}: its gateway was started again ({_times(restarts)})"
+        late = sum(check.num_alternations for check in checks if not check.has_two_publishers)
+        if late:
+            yield f"{source.name}: {late} messages came in another order than they were sent"
+        repeated = sum(check.num_repeated for check in checks)
+        if repeated:
+            yield f"{source.name}: {repeated} messages came twice; both are recorded"
+        if source.num_data and source.parameters is None:
+            yield (
+                f"{source.name}: its parameters were not published, so the recording has no labels; "
+                "see `rtc3d-gateway params`"
+            )
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

@@ -1,0 +1,309 @@
+"""``top`` on a terminal: pages that are drawn twice a second, and the keys that change them."""
+
+import contextlib
+import select
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final
+
+from rich.cells import cell_len
+
+from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.terminal.screen import Keyboard, Line, Screen, Style, is_in_front
+from gateway.display.top.pages import PAGES
+from gateway.display.top.table import Order, Table, filtered, laid_out, sorted_by, wrapped
+from gateway.logs.safe_text import safe_text
+from gateway.outputs.discovery import DISCOVERY_S
+from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
+
+_MAX_FILTER: Final = 60
+_MAX_NOTICE_LINES: Final = 3
+_KEYS: Final = (
+    ("q", "quit"),
+    ("1-8 ←→", "page"),
+    ("↑↓", "scroll"),
+    ("s", "sort"),
+    ("r", "reverse"),
+    ("/", "filter"),
+)
+
+_PAGE_STEPS: Final = {"tab": 1, "right": 1, "l": 1, "shift-tab": -1, "left": -1, "h": -1}
+_PAGES_BY_KEY: Final = {str(number): number - 1 for number in range(1, len(PAGES) + 1)}
+
+
+class Display:
+    """The page that is shown, which ``press`` changes and ``lines`` returns as text."""
+
+    def __init__(self, title: str, *, has_keys: bool) -> None:
+        self._title = title
+        self._has_keys = has_keys
+        self._page = 0
+        self._offsets = [0] * len(PAGES)
+        self._orders: list[Order | None] = [None] * len(PAGES)  # None: the usual one of the page
+        self._filter = ""
+        self._is_typing = False
+        self._shown = Table((), (), "")
+        self._num_rows = 1  # that fit on the screen
+        self.is_over = False
+        """Whether q was pressed."""
+
+    def press(self, key: str) -> None:
+        """Do what a key is for."""
+        if self._is_typing:
+            self._type(key)
+            return
+        page = _PAGE_STEPS.get(key)
+        if page is not None:
+            self._page = (self._page + page) % len(PAGES)
+        elif key in _PAGES_BY_KEY:
+            self._page = _PAGES_BY_KEY[key]
+        elif key in {"s", "r"}:
+            self._sort(is_reverse=key == "r")
+        elif key == "/":
+            self._is_typing = True
+        elif key == "escape":
+            self._filter = ""
+        elif key in {"q", "Q"}:
+            self.is_over = True
+        else:
+            self._scroll(key)
+
+    def _type(self, key: str) -> None:
+        match key:
+            case "enter":
+                self._is_typing = False
+            case "escape":
+                self._filter, self._is_typing = "", False
+            case "backspace":
+                self._filter = self._filter[:-1]
+            case "ctrl-u":
+                self._filter = ""
+            case _:
+                text = " " if key == "space" else key
+                if len(text) == 1:
+                    self._filter = (self._filter + text)[:_MAX_FILTER]
+        self._offsets[self._page] = 0
+
+    def _scroll(self, key: str) -> None:
+        page = max(self._num_rows - 1, 1)
+        steps = {"up": -1, "k": -1, "down": 1, "j": 1, "page-up": -page, "page-down": page, "space": page}
+        offset = self._offsets[self._page]
+        match key:
+            case "home" | "g":
+                offset = 0
+            case "end" | "G":
+                offset = 1 << 30
+            case _:
+                offset += steps.get(key, 0)
+        self._offsets[self._page] = max(offset, 0)
+
+    @property
+    def _order(self) -> Order | None:
+        return self._orders[self._page] or self._shown.order
+
+    def _sort(self, *, is_reverse: bool) -> None:
+        """Sort by the next column, or in the other direction."""
+        order = self._order
+        titles = [column.title for column in self._shown.columns]
+        if is_reverse and order is not None:
+            self._orders[self._page] = Order(order.title, not order.is_reversed)
+        elif titles and not is_reverse:
+            index = titles.index(order.title) + 1 if order is not None and order.title in titles else 0
+            self._orders[self._page] = Order(titles[index % len(titles)])
+
+    def lines(
+        self, sources: Sequence[LiveSource], notices: Sequence[str], width: int, height: int
+    ) -> list[Line]:
+        """Return what the screen shows: titles, the page, and at the bottom what the keys do."""
+        self._shown = PAGES[self._page].table(sources)
+        order = self._order
+        table = laid_out(sorted_by(filtered(self._shown, self._filter), order), width, order)
+        above: list[Line] = [self._title_line(len(sources), width), self._tabs(width)]
+        shown_notices = [line for text in notices for line in wrapped(safe_text(text), width)]
+        above += [[(line, Style.BAD)] for line in shown_notices[:_MAX_NOTICE_LINES]]
+        above.append(table.titles)
+        self._num_rows = max(height - len(above) - 1, 1)
+        last = max(len(table.body) - self._num_rows, 0)
+        offset = self._offsets[self._page] = min(self._offsets[self._page], last)
+        body = table.body[offset : offset + self._num_rows]
+        body += [[]] * (self._num_rows - len(body))
+        footer = self._footer(offset, len(table.body), width)
+        return [*[*above, *body][: max(height - 1, 0)], footer]
+
+    def _title_line(self, num_sources: int, width: int) -> Line:
+        count = f"{num_sources} source{'' if num_sources == 1 else 's'}"
+        clock = time.strftime("%H:%M:%S")
+        left = f"rtc3d-gateway top  {self._title}  {count}"
+        if len(left) + len(clock) + 2 > width:
+            left = f"{self._title}  {count}"
+        return [(left.ljust(width - len(clock)), Style.STRONG), (clock, Style.FAINT)]
+
+    def _tabs(self, width: int) -> Line:
+        """Return the names of the pages; if they do not fit, the numbers of those that are not shown."""
+        names = [f" {number} {page.name} " for number, page in enumerate(PAGES, start=1)]
+        if sum(map(len, names)) > width:  # 80 columns are enough without the second space
+            names = [name.rstrip() for name in names]
+        if sum(map(len, names)) > width:
+            names = [name if number == self._page else f" {number + 1} " for number, name in enumerate(names)]
+        return [
+            (name, Style.MARKED if number == self._page else Style.PLAIN) for number, name in enumerate(names)
+        ]
+
+    def _footer(self, offset: int, num_lines: int, width: int) -> Line:
+        if self._is_typing:
+            return [("filter: ", Style.STRONG), (self._filter, Style.PLAIN), (" ", Style.MARKED)]
+        parts: list[tuple[str, Style]] = []
+        if self._filter:
+            parts += [
+                (f"filter: {self._filter}  ", Style.WARNING),
+                ("Esc ", Style.STRONG),
+                ("clear  ", Style.FAINT),
+            ]
+        for key, meaning in _KEYS if self._has_keys else ():
+            parts += [(f"{key} ", Style.STRONG), (f"{meaning}  ", Style.FAINT)]
+        if num_lines <= self._num_rows:
+            return _cut(parts, width)
+        place = f" {offset + 1}–{min(offset + self._num_rows, num_lines)} of {num_lines}"
+        return [*_cut(parts, width - len(place)), (place, Style.PLAIN)]
+
+
+def _cut(parts: Sequence[tuple[str, Style]], width: int) -> list[tuple[str, Style]]:
+    """Return the first parts that fit, filled up with spaces."""
+    shown: list[tuple[str, Style]] = []
+    for text, style in parts:
+        if cell_len(text) > width:
+            break
+        shown.append((text, style))
+        width -= cell_len(text)
+    return [*shown, (" " * max(width, 0), Style.PLAIN)]
+
+
+_UPDATE_S: Final = 0.1
+_DRAW_S: Final = 0.5
+_DRAW_SHARE: Final = 20
+"""Drawing waits this many times as long as it takes, so that huge tables cost 5 % of a core at most."""
+
+_ASK_AGAIN_S: Final = 3.0
+
+
+class App:
+    """The program between the keyboard and the screen."""
+
+    def __init__(
+        self,
+        live: LiveData,
+        subscriber: GatewaySubscriber,
+        screen: Screen,
+        keyboard: Keyboard | None,
+        notices: deque[str],
+        title: str,
+    ) -> None:
+        self._live = live
+        self._subscriber = subscriber
+        self._screen = screen
+        self._keyboard = keyboard
+        self._notices = notices
+        self._display = Display(title, has_keys=keyboard is not None)
+        self._sources: Sequence[LiveSource] = ()
+        self._is_suspending = False
+        self._silence = ""
+        self._next_ask_s = time.monotonic() + DISCOVERY_S
+        self._asking: threading.Thread | None = None
+
+    def run(self) -> None:
+        """Show the pages until q, or until a signal raises an exception; the terminal is restored."""
+        next_draw_s = 0.0
+        size = self._screen.size
+        with _suspending(self._suspend):
+            try:
+                while not self._display.is_over:
+                    has_changed = self._read_keys()
+                    if self._is_suspending:
+                        self._stop_process()
+                        has_changed = True
+                    self._subscriber.tick()
+                    self._sources = self._live.update()
+                    self._check_silence()
+                    has_changed |= size != self._screen.size
+                    start_s = time.monotonic()
+                    if has_changed or start_s >= next_draw_s:
+                        size = self._screen.size
+                        self._draw()
+                        end_s = time.monotonic()
+                        next_draw_s = start_s + max(_DRAW_S, _DRAW_SHARE * (end_s - start_s))
+            finally:
+                self._give_back()
+
+    def _read_keys(self) -> bool:
+        """Wait for a key, but not longer than until the next update; return whether there was one."""
+        self._take()
+        keyboard = self._keyboard
+        if keyboard is None or not keyboard.is_taken:
+            time.sleep(_UPDATE_S)
+            return False
+        if not select.select([keyboard.descriptor], [], [], _UPDATE_S)[0]:
+            return False
+        names = keyboard.read()
+        if names is None:
+            self._display.is_over = True
+        for name in names or ():
+            if name == "ctrl-l":
+                self._screen.redraw()
+            self._display.press(name)
+        return True
+
+    def _take(self) -> None:
+        """Take the terminal, once the program is in front."""
+        if not self._screen.is_open and is_in_front(self._screen.descriptor):
+            if self._keyboard is not None:
+                self._keyboard.take()
+            self._screen.open()
+
+    def _give_back(self) -> None:
+        self._screen.close()
+        if self._keyboard is not None:
+            self._keyboard.give_back()
+
+    def _suspend(self) -> None:
+        self._is_suspending = True
+
+    def _stop_process(self) -> None:
+        """Stop the process, as Ctrl-Z does, with the terminal as it was; return when it continues."""
+        self._is_suspending = False
+        self._give_back()
+        signal.raise_signal(signal.SIGSTOP)
+
+    def _check_silence(self) -> None:
+        """If nothing is heard, find out why, in another thread: it may take a second."""
+        if self._live.first_heard_s is not None:
+            self._silence = ""
+        elif time.monotonic() >= self._next_ask_s and not (self._asking and self._asking.is_alive()):
+            self._next_ask_s = time.monotonic() + _ASK_AGAIN_S
+            self._asking = threading.Thread(target=self._ask, name="top-silence", daemon=True)
+            self._asking.start()
+
+    def _ask(self) -> None:
+        self._silence = silence_text(self._subscriber, self._live)
+
+    def _draw(self) -> None:
+        if not self._screen.is_open:
+            return
+        notices = [self._silence] if self._silence else []
+        if self._live.defect is not None:
+            notices.append(f"a defect in this program: {self._live.defect!r}")
+        notices += [*self._notices][-1:]
+        size = self._screen.size
+        self._screen.draw(self._display.lines(self._sources, notices, size.columns, size.lines))
+
+
+@contextlib.contextmanager
+def _suspending(suspend: Callable[[], None]) -> Iterator[None]:
+    """Call ``suspend`` at Ctrl-Z, during the block."""
+    former: Any = signal.signal(signal.SIGTSTP, lambda *_: suspend())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, former)

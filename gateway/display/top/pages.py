@@ -1,0 +1,339 @@
+"""The pages of ``top``: a table each, made from the facts about all sources."""
+
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Final, NamedTuple
+
+from gateway.display.live.component import SLOW_SHARE, visible_percent
+from gateway.display.live.live_data import LiveSource
+from gateway.display.terminal.screen import Style
+from gateway.display.top import facts
+from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
+from gateway.logs.safe_text import safe_text
+
+TWO_GATEWAYS: Final = (
+    "two gateways publish a source of this name, so lost messages are not counted exactly: give one of them "
+    "another name"
+)
+_LEVEL_STYLES: Final = {"ok": Style.GOOD, "warning": Style.WARNING, "error": Style.BAD}
+_MAX_NAME: Final = 40
+_SELDOM_SHARE: Final = 0.9
+"""A marker or tool that is visible in a smaller share of the frames is worth a look."""
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class Page(NamedTuple):
+    """A page: its name, and what it shows of all sources."""
+
+    name: str
+    table: Callable[[Sequence[LiveSource]], Table]
+
+
+def overview(sources: Sequence[LiveSource]) -> Table:
+    """Each source with its state, and a line for each of its components."""
+    columns = (
+        Column("component"),
+        Column("Hz", is_number=True, width=6),
+        Column("announced", is_number=True, rank=1),
+        Column("lost", is_number=True),
+        Column("gaps", is_number=True, rank=6),
+        Column("restarts", is_number=True, rank=7),
+        Column("→gateway ms", is_number=True, rank=2),
+        Column("→here ms", is_number=True, rank=2),
+        Column("items", is_number=True, rank=5),
+        Column("visible", is_number=True, rank=3),
+        Column("age s", is_number=True, rank=4),
+        Column("note"),
+    )
+    return Table(columns, [_overview_of(source) for source in sources], "no source so far")
+
+
+def _overview_of(source: LiveSource) -> Section:
+    state = facts.state(source)
+    heading = [(f"{_name(source)}: {state.text}", _LEVEL_STYLES[state.level])]
+    if facts.has_two_gateways(source):
+        heading.append((TWO_GATEWAYS, Style.BAD))
+    heading += [(text, Style.BAD) for text in _output_problems(source)]
+    return Section([_component_row(each) for each in facts.components(source)], heading)
+
+
+def _component_row(component: facts.ComponentFacts) -> Row:
+    note, style = _component_note(component)
+    is_slow = (
+        component.rate_hz is not None
+        and component.announced_rate_hz is not None
+        and component.num_messages > 0
+        and component.rate_hz < SLOW_SHARE * component.announced_rate_hz
+    )
+    is_missing = component.num_visible is not None and component.num_visible < (component.num_items or 0)
+    lost_style = Style.BAD if component.num_lost else Style.PLAIN
+    return (
+        text_cell(component.component),
+        number_cell(component.rate_hz, 1, style if style is Style.BAD else _warning_if(is_slow)),
+        number_cell(component.announced_rate_hz, 1),
+        number_cell(component.num_lost, 0, lost_style),
+        number_cell(component.num_gaps, 0, lost_style),
+        number_cell(component.num_restarts, 0, _warning_if(component.num_restarts > 0)),
+        _latency_cell(component.capture_to_gateway_p50_ms, component.capture_to_gateway_p99_ms),
+        _latency_cell(component.gateway_to_here_p50_ms, component.gateway_to_here_p99_ms),
+        number_cell(component.num_items),
+        number_cell(component.num_visible, 0, _warning_if(is_missing)),
+        number_cell(component.age_s, 1, style if style is Style.BAD else Style.PLAIN),
+        text_cell(note, style),
+    )
+
+
+def _component_note(component: facts.ComponentFacts) -> tuple[str, Style]:
+    if component.is_stopped:
+        return "stopped", Style.BAD
+    if component.has_two_gateways:
+        return "two gateways", Style.BAD
+    if component.num_malformed:
+        return f"{component.num_malformed} malformed", Style.WARNING
+    if component.num_skipped:
+        return f"{component.num_skipped} not decoded here", Style.WARNING
+    if not component.num_messages:
+        return "none so far", Style.FAINT
+    return "", Style.PLAIN
+
+
+def _latency_cell(p50_ms: float | None, p99_ms: float | None) -> Cell:
+    if p50_ms is None or p99_ms is None:
+        return Cell("")
+    return Cell(f"{number_cell(p50_ms, 1).text}/{number_cell(p99_ms, 1).text}", Style.PLAIN, p99_ms)
+
+
+def markers(sources: Sequence[LiveSource]) -> Table:
+    """How often each marker was visible, and where it is."""
+    columns = (
+        Column("marker"),
+        Column("visible in 10 s", is_number=True),
+        Column("now"),
+        *_position_columns(),
+        Column("source", rank=1),
+    )
+    rows = [
+        (*_item_cells(item), text_cell(_name(source))) for source in sources for item in facts.markers(source)
+    ]
+    return Table(columns, [Section(rows)] if rows else [], "no markers so far", Order("visible in 10 s"))
+
+
+def tools(sources: Sequence[LiveSource]) -> Table:
+    """How often each tool was visible, its error, and where it is."""
+    columns = (
+        Column("tool"),
+        Column("visible in 10 s", is_number=True),
+        Column("now"),
+        Column("error", is_number=True),
+        *_position_columns(),
+        Column("source", rank=1),
+    )
+    rows = []
+    for source in sources:
+        for item in facts.tools(source):
+            name, share, now, *position = _item_cells(item)
+            error = number_cell(item.error, 3)
+            rows.append((name, share, now, error, *position, text_cell(_name(source))))
+    return Table(columns, [Section(rows)] if rows else [], "no tools so far", Order("visible in 10 s"))
+
+
+def _position_columns() -> list[Column]:
+    return [*(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"), Column("unit", rank=3)]
+
+
+def _item_cells(item: facts.ItemFacts) -> list[Cell]:
+    share = item.visible_share
+    style = Style.FAINT if share is None else _share_style(share)
+    return [
+        text_cell(item.label, Style.PLAIN if item.is_visible else Style.BAD),
+        Cell("") if share is None else Cell(f"{visible_percent(share):.1f} %", style, share),
+        text_cell("visible") if item.is_visible else text_cell("missing", Style.BAD),
+        *(number_cell(value, 1) for value in (item.x, item.y, item.z)),
+        text_cell(item.unit, Style.FAINT),
+    ]
+
+
+def _share_style(share: float) -> Style:
+    if share < _SELDOM_SHARE:
+        return Style.BAD
+    return Style.WARNING if share < 1 else Style.PLAIN
+
+
+def server(sources: Sequence[LiveSource]) -> Table:
+    """The streams of each source, and the clock of its server."""
+    columns = (
+        Column("stream"),
+        Column("state"),
+        Column("Hz", is_number=True, width=6),
+        Column("session", is_number=True, rank=4),
+        Column("reconnects", is_number=True, rank=3),
+        Column("restarts", is_number=True, rank=6),
+        Column("byte order", rank=7),
+        Column("rate", rank=5),
+        Column("late ms", is_number=True, rank=1),
+        Column("drift ppm", is_number=True, rank=2),
+        Column("uncertainty µs", is_number=True, rank=2),
+    )
+    return Table(columns, [_server_of(source) for source in sources], "no source so far")
+
+
+def _server_of(source: LiveSource) -> Section:
+    status = source.newest_status
+    found = facts.source_names(source)
+    where = "" if status is None else f" from {found.server} by {found.host} (version {found.version})"
+    state = facts.state(source)
+    rows, notes = [], []
+    for stream in facts.streams(source):
+        drift_ppm = stream.clock_drift_ppm if stream.has_clock else None
+        uncertainty_us = stream.clock_uncertainty_us if stream.has_clock else None
+        rows.append(
+            (
+                text_cell(stream.components),
+                text_cell(stream.state, Style.GOOD if stream.state == "streaming" else Style.WARNING),
+                number_cell(stream.frame_rate_hz, 1),
+                number_cell(stream.session),
+                number_cell(stream.num_reconnects),
+                number_cell(stream.num_restarts),
+                text_cell(stream.byte_order),
+                text_cell(stream.rate),
+                number_cell(stream.lag_ms, 1),
+                number_cell(drift_ppm, 2),
+                number_cell(uncertainty_us, 1),
+            )
+        )
+        problem = [f"{stream.components}: {stream.problem}"] if stream.problem else []
+        limitations = [f"{stream.components}: {text}" for text in stream.limitations]
+        notes += [(text, Style.BAD) for text in problem] + [(text, Style.WARNING) for text in limitations]
+        if stream.last_error:
+            time_text = event_time(stream.last_error_utime)
+            notes.append((f"{stream.components}: last error, {time_text}: {stream.last_error}", Style.FAINT))
+        if not stream.has_clock and stream.state == "streaming":
+            notes.append((f"{stream.components}: its time stamps are no clock", Style.WARNING))
+    return Section(rows, [(f"{_name(source)}{where}", _LEVEL_STYLES[state.level])], notes)
+
+
+def drops(sources: Sequence[LiveSource]) -> Table:
+    """What was lost, where, and why."""
+    columns = (
+        Column("source", rank=2),
+        Column("where"),
+        Column("cause"),
+        Column("messages", is_number=True),
+        Column("frames", is_number=True, rank=1),
+    )
+    rows = [
+        (
+            text_cell(_name(source)),
+            text_cell(loss.where),
+            text_cell(loss.cause, Style.BAD),
+            number_cell(loss.num_messages),
+            number_cell(loss.num_frames),
+        )
+        for source in sources
+        for loss in facts.losses(source)
+    ]
+    return Table(columns, [Section(rows)] if rows else [], "nothing was lost")
+
+
+def outputs(sources: Sequence[LiveSource]) -> Table:
+    """The outputs of the gateways: whether they are connected, and what they have sent."""
+    columns = (
+        Column("source"),
+        Column("output"),
+        Column("state"),
+        Column("messages", is_number=True),
+        Column("of which", rank=1),
+    )
+    rows, notes = [], []
+    for source in sources:
+        for output in facts.outputs(source):
+            is_fine = output.is_connected and not output.problem
+            rows.append(
+                (
+                    text_cell(_name(source)),
+                    text_cell(output.output),
+                    text_cell(
+                        "connected" if output.is_connected else "not connected",
+                        Style.GOOD if is_fine else Style.BAD,
+                    ),
+                    number_cell(sum(output.messages.values())),
+                    text_cell(", ".join(f"{name} {count}" for name, count in output.messages.items())),
+                )
+            )
+        notes += [(text, Style.BAD) for text in _output_problems(source)]
+    return Table(columns, [Section(rows, (), notes)] if rows else [], "no output so far")
+
+
+def questions(sources: Sequence[LiveSource]) -> Table:
+    """How many queries of peers the gateways have answered, by result."""
+    columns = (
+        Column("source"),
+        Column("output"),
+        Column("result"),
+        Column("queries", is_number=True),
+    )
+    rows = [
+        (
+            text_cell(_name(source)),
+            text_cell(output.output),
+            text_cell(result, Style.GOOD if result == "ok" else Style.WARNING),
+            number_cell(count),
+        )
+        for source in sources
+        for output in facts.outputs(source)
+        for result, count in output.queries.items()
+    ]
+    return Table(columns, [Section(rows)] if rows else [], "nobody has asked anything so far")
+
+
+def events(sources: Sequence[LiveSource]) -> Table:
+    """The last events of each source, the newest one first."""
+    columns = (Column("time"), Column("event"), Column("parameters", rank=2), Column("source", rank=1))
+    found = [(source, event) for source in sources for event in facts.events(source)]
+    found.sort(key=lambda each: each[1].capture_utime, reverse=True)
+    rows = [
+        (
+            Cell(event_time(event.capture_utime), Style.PLAIN, event.capture_utime),
+            text_cell(event.label),
+            text_cell(event.parameters),
+            text_cell(_name(source)),
+        )
+        for source, event in found
+    ]
+    return Table(columns, [Section(rows)] if rows else [], "no events so far")
+
+
+PAGES: Final = (
+    Page("overview", overview),
+    Page("markers", markers),
+    Page("tools", tools),
+    Page("server", server),
+    Page("drops", drops),
+    Page("outputs", outputs),
+    Page("questions", questions),
+    Page("events", events),
+)
+"""In the order of the keys 1 to 8."""
+
+
+def event_time(utime: int) -> str:
+    """Return a time, in µs since the Unix epoch, as local time; "?" if no calendar has it."""
+    try:
+        local = (_EPOCH + timedelta(microseconds=utime)).astimezone()
+    except (OverflowError, ValueError, OSError):
+        return "?"
+    return local.strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
+
+
+def _output_problems(source: LiveSource) -> list[str]:
+    found = facts.outputs(source)
+    return [f"{_name(source)} to {each.output}: {each.problem}" for each in found if each.problem]
+
+
+def _name(source: LiveSource) -> str:
+    return safe_text(source.name, _MAX_NAME)
+
+
+def _warning_if(is_true: bool) -> Style:
+    return Style.WARNING if is_true else Style.PLAIN

@@ -1,0 +1,313 @@
+"""Scrolling plots of selected analog and force channels."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import viser
+from viser import uplot
+
+from gateway.display.live.component import LiveComponent
+from gateway.display.live.live_data import LiveSource
+from gateway.logs.safe_text import safe_text
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
+from gateway.takes.files.component_rows import Array
+
+MAX_CHOICES: Final = 1000
+"""How many channels can be chosen from."""
+
+_MAX_LABEL_CHARACTERS: Final = 32
+
+_KEYS: Final = (ComponentType.ANALOG.key, ComponentType.FORCE.key)
+_FIELDS: Final = ITEM_DTYPES[ComponentType.FORCE].names or ()
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel of a source: an analog channel, or one field of a force plate.
+
+    ``position`` is that of the channel or the plate, ``field`` is "" for analog channels.
+    """
+
+    source: str
+    key: str
+    position: int
+    field: str
+
+
+def choices(sources: Sequence[LiveSource]) -> dict[str, Channel]:
+    """Return the channels that can be plotted, at most MAX_CHOICES, by what they are called."""
+    found: dict[str, Channel] = {}
+    for source in sources:
+        for channel, text in _channels(source):
+            if len(found) == MAX_CHOICES:
+                return found
+            found[text] = channel
+    return found
+
+
+def first_choice(offered: Mapping[str, Channel]) -> str | None:
+    """Return what most people look at first: the vertical force on a plate, otherwise the first channel."""
+    return next(
+        (text for text, channel in offered.items() if channel.field == "fz"), next(iter(offered), None)
+    )
+
+
+def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
+    for key in _KEYS:
+        component = source.components.get(key)
+        if component is None:
+            continue
+        description = component.description
+        labels, units = (map(_cut, texts[:MAX_CHOICES]) for texts in (description.labels, description.units))
+        moment_unit = _cut(description.moment_unit)
+        for position, (label, unit) in enumerate(zip(labels, units, strict=True)):
+            # Labels that are cut may be equal; the number distinguishes them.
+            name = f"{_cut(source.name)} {key} {position + 1}: {label}"
+            for field in _FIELDS if key == ComponentType.FORCE.key else ("",):
+                of_field = moment_unit if field.startswith("m") else unit
+                words = [name, field.capitalize(), f"({of_field})" if of_field else ""]
+                yield Channel(source.name, key, position, field), " ".join(filter(None, words))
+
+
+def _cut(text: str) -> str:
+    return safe_text(text, _MAX_LABEL_CHARACTERS)
+
+
+def component_of(channel: Channel, sources: Mapping[str, LiveSource]) -> LiveComponent | None:
+    """Return the component that has a channel; None if there is none."""
+    source = sources.get(channel.source)
+    return None if source is None else source.components.get(channel.key)
+
+
+def samples(channel: Channel, component: LiveComponent) -> Iterator[tuple[Array, Array]]:
+    """Return the samples of a channel in the component's batch: times and values.
+
+    Times are those of capture, in µs since the Unix epoch on the gateway's clock.
+    """
+    batch = component.batch
+    for num_items, items in batch.items.items():
+        if channel.position >= num_items:
+            continue
+        utimes = batch.heads["capture_utime"]
+        if len(batch.items) > 1:
+            utimes = utimes[batch.heads["num_items"] == num_items]
+        values = items[:, channel.position]
+        yield utimes, values[channel.field] if channel.field else values
+
+
+NUM_COLUMNS: Final = 320
+COLUMN_US: Final = 31_250
+"""320 columns of 31.25 ms are 10 s."""
+
+_MAX_STEP_COLUMNS: Final = 32
+"""If times go back, or forward, by more than a second, the envelope starts again there.
+
+A plot would connect the values before and after a gap, as if there had been some between them.
+"""
+
+
+class Envelope:
+    """The smallest and the largest value of a channel in each column of a plot.
+
+    Every sample of the last NUM_COLUMNS columns, and since the last gap, is within them. Values that are not
+    finite are missing. Times are µs since the Unix epoch.
+    """
+
+    def __init__(self) -> None:
+        self._lowest = np.full(NUM_COLUMNS, np.nan)
+        self._highest = np.full(NUM_COLUMNS, np.nan)
+        self._newest: int | None = None  # the newest column, counted from the epoch
+
+    @property
+    def newest_utime(self) -> int | None:
+        """The begin of the newest column; None before the first sample."""
+        return None if self._newest is None else self._newest * COLUMN_US
+
+    def add(self, utimes: Array, values: Array) -> None:
+        """Take samples, two arrays of shape (samples,), nearly in the order of their times."""
+        if not len(utimes):
+            return
+        columns = utimes.astype(np.int64) // COLUMN_US
+        values = values.astype(np.float64)
+        values[~np.isfinite(values)] = np.nan
+        # One step for each run of samples in the same column.
+        begins = np.concatenate([[0], 1 + np.flatnonzero(np.diff(columns))])
+        lowest, highest = np.fmin.reduceat(values, begins), np.fmax.reduceat(values, begins)
+        for column, low, high in zip(columns[begins].tolist(), lowest, highest, strict=True):
+            self._make_room(column)
+            place = column % NUM_COLUMNS
+            self._lowest[place] = np.fmin(self._lowest[place], low)
+            self._highest[place] = np.fmax(self._highest[place], high)
+
+    def columns(self, end_utime: int) -> tuple[Array, Array]:
+        """Return the smallest and the largest values, oldest first, each of shape (NUM_COLUMNS,).
+
+        The last column is that of ``end_utime``. Columns without a sample are NaN.
+        """
+        newest = self._newest
+        if newest is None:
+            return self._lowest.copy(), self._highest.copy()
+        wanted = end_utime // COLUMN_US + np.arange(1 - NUM_COLUMNS, 1)
+        is_kept = (wanted <= newest) & (wanted > newest - NUM_COLUMNS)
+        places = wanted % NUM_COLUMNS
+        lowest, highest = self._lowest[places], self._highest[places]
+        return np.where(is_kept, lowest, np.nan), np.where(is_kept, highest, np.nan)
+
+    def _make_room(self, column: int) -> None:
+        newest = self._newest
+        if newest is None or abs(column - newest) > _MAX_STEP_COLUMNS:
+            self._clear(slice(None))
+            self._newest = column
+        elif column > newest:
+            self._clear(np.arange(newest + 1, column + 1) % NUM_COLUMNS)
+            self._newest = column
+
+    def _clear(self, places: slice | Array) -> None:
+        self._lowest[places] = np.nan
+        self._highest[places] = np.nan
+
+
+MAX_PLOTS: Final = 8
+
+_NOTE: Final = (
+    f"<div class=gateway>Up to {MAX_PLOTS} channels, from the smallest to the largest value of all frames. "
+    "All viewers see the same plots.</div>"
+)
+_NO_CHANNELS: Final = "<div class=gateway>No analog or force channels have come yet.</div>"
+_CHOOSE: Final = "choose …"
+_ALL: Final = "all"
+_HEIGHT_PX: Final = 120
+_FONT: Final = "11px sans-serif"
+_LINE: Final = "#4dabf7"
+_FILL: Final = "rgba(77, 171, 247, 0.35)"
+
+_COLUMNS: Final = np.arange(1 - NUM_COLUMNS, 1)
+
+
+class _Plot:
+    """The plot of one channel."""
+
+    def __init__(self, server: viser.ViserServer, channel: Channel, title: str) -> None:
+        self.channel = channel
+        self._envelope = Envelope()
+        self._component: LiveComponent | None = None
+        line = uplot.Series(label="", stroke=_LINE, width=1, spanGaps=False, points={"show": False})
+        no_ticks = uplot.Axis_Ticks(show=False)
+        self.handle = server.gui.add_uplot(
+            self._data(time.time_ns() // 1000),
+            (uplot.Series(label="time"), line, line),
+            title=title,
+            bands=(uplot.Band(series=(2, 1), fill=_FILL),),
+            scales={"x": uplot.Scale(time=True), "y": uplot.Scale()},
+            axes=(
+                uplot.Axis(size=24, font=_FONT, ticks=no_ticks, values="{HH}:{mm}:{ss}", space=70),
+                uplot.Axis(size=52, font=_FONT, ticks=no_ticks),
+            ),
+            legend=uplot.Legend(show=False),
+            height=_HEIGHT_PX,
+            padding=(8, 8, 0, 0),
+        )
+
+    def take(self, component: LiveComponent | None) -> None:
+        """Take what came since the last call."""
+        self._component = component
+        if component is not None:
+            for utimes, values in samples(self.channel, component):
+                self._envelope.add(utimes, values)
+
+    def show(self) -> None:
+        """Send the plot to the browsers. It scrolls on when data have stopped."""
+        end_utime, component = self._envelope.newest_utime, self._component
+        if end_utime is not None:
+            if component is not None and component.is_stopped:
+                end_utime += round(1e6 * (component.age_s or 0.0))
+            self.handle.data = self._data(end_utime)
+
+    def _data(self, end_utime: int) -> tuple[Array, Array, Array]:
+        """Return the times of the columns in seconds since the Unix epoch, and the envelope.
+
+        The y axis follows the values because the times change: viser fits a plot only then. It cannot fit
+        a plot that begins with NaN, so the columns before the first value are left out.
+        """
+        lowest, highest = self._envelope.columns(end_utime)
+        times_s = (end_utime // COLUMN_US + _COLUMNS) * (COLUMN_US / 1e6)
+        first = int(np.argmax(np.isfinite(lowest)))
+        return times_s[first:], lowest[first:], highest[first:]
+
+
+class Plots:
+    """The tab in which a user chooses channels and sees their plots. All viewers see the same ones."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._note = server.gui.add_html(_NO_CHANNELS)
+        self._add = server.gui.add_dropdown("Plot", [_CHOOSE], visible=False)
+        self._remove = server.gui.add_dropdown("Remove", [_CHOOSE], visible=False)
+        self._folder = server.gui.add_folder(None)
+        self._choices: dict[str, Channel] = {}
+        self._plots: dict[str, _Plot] = {}  # by their titles
+        self._has_begun = False
+        """Whether somebody has chosen a channel, or the first one was chosen for them."""
+
+    def take(self, sources: Sequence[LiveSource]) -> None:
+        """Take what came since the last call."""
+        if self._plots:
+            by_name = {source.name: source for source in sources}
+            for plot in self._plots.values():
+                plot.take(component_of(plot.channel, by_name))
+
+    def show(self) -> None:
+        """Send the plots to the browsers."""
+        for plot in self._plots.values():
+            plot.show()
+
+    def follow_user(self) -> None:
+        """Add and remove the plots that the user chose."""
+        added, removed = self._add.value, self._remove.value
+        if added in self._choices and len(self._plots) < MAX_PLOTS and added not in self._plots:
+            self._plot(added)
+        for title in [*self._plots] if removed == _ALL else [removed]:
+            plot = self._plots.pop(title, None)
+            if plot is not None:
+                plot.handle.remove()
+        if added != _CHOOSE or removed != _CHOOSE:
+            self._add.value = _CHOOSE  # type: ignore[misc] # mypy does not find the setter
+            self._remove.value = _CHOOSE  # type: ignore[misc]
+            self._offer()
+
+    def _plot(self, title: str) -> None:
+        self._has_begun = True
+        with self._folder:
+            self._plots[title] = _Plot(self._server, self._choices[title], title)
+
+    def offer(self, sources: Sequence[LiveSource]) -> None:
+        """Offer the channels that there are now. The first time that they are known, plot a useful one."""
+        former, self._choices = self._choices, choices(sources)
+        first = first_choice(self._choices)
+        # Once the channels of the same sources and components came twice, no more come a moment later.
+        if first and not self._has_begun and self._add.value == _CHOOSE and [*former] == [*self._choices]:
+            self._plot(first)
+        titles = {plot.channel: title for title, plot in self._plots.items()}
+        for text, channel in self._choices.items():
+            title = titles.get(channel, text)
+            if title != text:
+                plot = self._plots.pop(title)
+                plot.handle.title = text
+                self._plots[text] = plot
+        self._offer()
+
+    def _offer(self) -> None:
+        is_full = len(self._plots) == MAX_PLOTS
+        offered = (text for text in self._choices if text not in self._plots and not is_full)
+        _set_options(self._add, (_CHOOSE, *offered))
+        _set_options(self._remove, (_CHOOSE, *self._plots, *([_ALL] if len(self._plots) > 1 else [])))
+        self._note.content = _NOTE if self._choices else _NO_CHANNELS
+        self._add.visible, self._remove.visible = bool(self._choices), bool(self._plots)
+
+
+def _set_options(dropdown: viser.GuiDropdownHandle[str], options: tuple[str, ...]) -> None:
+    if dropdown.options != options:  # viser sends them in any case
+        dropdown.options = options

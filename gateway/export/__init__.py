@@ -1,1 +1,0 @@
-"""Converting takes to the files of other programs: C3D, MCAP, CSV, TRC."""

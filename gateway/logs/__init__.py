@@ -1,0 +1,1 @@
+"""Logging: failures, losses and repeated events, the formats of the log, and text that is safe in it."""

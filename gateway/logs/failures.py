@@ -1,0 +1,236 @@
+"""Logging of failures, defects and repeated events, and of the context of log records."""
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from time import monotonic
+from typing import Final, TypeVar
+
+from gateway.logs.safe_text import safe_text
+
+FIELDS: Final = ("source", "stream", "peer")
+"""The context that a record can have besides its text: fields in the journal and in JSON."""
+
+HOLD_S: Final = 5.0
+MAX_HOLD_S: Final = 60.0
+"""A ``hold_s`` for FailureLog: intermittent failures are over after this time without a failure.
+
+If the next failure comes soon after that, the wait doubles, up to MAX_HOLD_S.
+"""
+
+MAX_REPEATS: Final = 5
+_REPEATS_WINDOW_S: Final = 300.0
+"""How often EventLog and FailureLog log one kind of message in this time; further ones are DEBUG."""
+
+_Result = TypeVar("_Result")
+
+_fields: ContextVar[Mapping[str, str]] = ContextVar("log fields")
+
+
+@contextmanager
+def log_fields(**fields: str) -> Iterator[dict[str, str]]:
+    """Add ``fields`` (names from FIELDS) to the records of the block and of tasks and callbacks it starts.
+
+    The event loop runs a callback in the context in which it was registered. So all records of a
+    connection have the fields, without naming them in each call. The block gets all fields as a dict. If it
+    changes them, the records of its tasks and callbacks change too.
+    """
+    all_fields = {**current_log_fields(), **fields}
+    token = _fields.set(all_fields)
+    try:
+        yield all_fields
+    finally:
+        _fields.reset(token)
+
+
+def current_log_fields() -> Mapping[str, str]:
+    """Return the fields of records that are logged here."""
+    return _fields.get({})
+
+
+class _Repeats:
+    """The times of the newest messages of one kind, and how many others were not logged since then."""
+
+    def __init__(self, most: int = MAX_REPEATS) -> None:
+        self._most = most
+        self._times_s: deque[float] = deque(maxlen=most)
+        self._num_hidden = 0
+
+    def count(self) -> str | None:
+        """Count a message. Return what to add to its text, None if it is one too many."""
+        now_s = monotonic()
+        if len(self._times_s) == self._most and now_s - self._times_s[0] < _REPEATS_WINDOW_S:
+            self._num_hidden += 1
+            return None
+        self._times_s.append(now_s)
+        num_hidden, self._num_hidden = self._num_hidden, 0
+        return f" ({num_hidden} more like this since the last one)" if num_hidden else ""
+
+
+class EventLog:
+    """Logs events that a server or a peer can cause as often as it likes.
+
+    Of each kind, it logs some events in a few minutes as ``log`` says and further ones as DEBUG, and the next
+    loud message says how many these were. ``subject`` is the same as for FailureLog.
+    """
+
+    def __init__(self, logger: logging.Logger, subject: object) -> None:
+        self._logger = logger
+        self._subject = subject
+        self._repeats: dict[str, _Repeats] = {}
+
+    def log(self, level: int, text: str, kind: str, most: int = MAX_REPEATS) -> None:
+        """Log an event. There must be few kinds, so they never come from a network.
+
+        ``most`` is how many of this kind are logged in a few minutes.
+        """
+        repeats = self._repeats.get(kind)
+        if repeats is None:
+            repeats = self._repeats[kind] = _Repeats(most)
+        addition = repeats.count()
+        if addition is None:
+            self._logger.debug("%s: %s", self._subject, text)
+        else:
+            self._logger.log(level, "%s: %s%s", self._subject, text, addition)
+
+
+class FailureLog:
+    """Logs the first of several failures in a row as WARNING, repeats as DEBUG, and recovery as INFO.
+
+    ``subject`` begins every message, for example "lab" or "lcm". It can be any object; its str may change.
+    Successes within ``hold_s`` after a failure do not count as recovery, so intermittent failures are logged
+    as one. If failures come and go nevertheless, these messages are limited as by EventLog.
+    """
+
+    def __init__(self, logger: logging.Logger, subject: object, hold_s: float = 0.0) -> None:
+        self._logger = logger
+        self._subject = subject
+        self._first_hold_s = self._hold_s = hold_s
+        self._failures = 0
+        self._first_s = self._last_s = 0.0
+        self._recovered_s = float("-inf")
+        self._repeats = _Repeats()
+        self._is_hidden = False  # the first failure, because there were too many before
+
+    @property
+    def failing(self) -> bool:
+        """Whether there was a failure, and it is not over yet."""
+        return self._failures > 0
+
+    def failed(self, text: str) -> None:
+        """Log a failure; ``text`` says what happened and what to do."""
+        self._failures += 1
+        self._last_s = monotonic()
+        if self._failures > 1:
+            self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
+            return
+        self._first_s = self._last_s
+        is_soon = self._last_s - self._recovered_s < MAX_HOLD_S
+        self._hold_s = min(2 * self._hold_s, MAX_HOLD_S) if is_soon else self._first_hold_s
+        addition = self._repeats.count()
+        self._is_hidden = addition is None
+        self._logger.log(
+            logging.DEBUG if addition is None else logging.WARNING,
+            "%s: %s%s",
+            *(self._subject, text, addition or ""),
+        )
+
+    def recovered(self, text: str) -> None:
+        """After a failure, log the recovery with its duration, unless ``hold_s`` is not over yet.
+
+        Cheap if nothing has failed, so it can be called after each success.
+        """
+        if not self._failures:
+            return
+        now_s = monotonic()
+        if now_s - self._last_s >= self._hold_s:
+            count = "" if self._failures == 1 else f" and {self._failures} failures"
+            self._logger.log(
+                logging.DEBUG if self._is_hidden else logging.INFO,
+                "%s: %s, after %.1f s%s",
+                *(self._subject, text, now_s - self._first_s, count),
+            )
+            self._failures = 0
+            self._recovered_s = now_s
+
+    def succeeded(self, text: str) -> None:
+        """Log a success even if nothing has failed; after a failure, do the same as ``recovered``."""
+        if self._failures:
+            self.recovered(text)
+        else:
+            self._logger.info("%s: %s", self._subject, text)
+
+
+class DefectTotal:
+    """How often there was a defect since the program started, wherever it was logged."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+
+defect_total: Final = DefectTotal()
+
+
+class DefectLog:
+    """Logs each defect in this program once as ERROR, with its traceback, and repeats as DEBUG.
+
+    ``former`` is a log whose defects count as logged here, too.
+    """
+
+    def __init__(self, logger: logging.Logger, subject: object, former: "DefectLog | None" = None) -> None:
+        self._logger = logger
+        self._subject = subject
+        # Of defects, in the source code: there are few.
+        self._counts: dict[tuple[str, str, int], int] = {}
+        if former is not None:
+            self._counts = former._counts  # noqa: SLF001 - of the same class
+
+    @property
+    def count(self) -> int:
+        """How often there was a defect, repeats included."""
+        return sum(self._counts.values())
+
+    def attempt(self, call: Callable[[], _Result], otherwise: _Result) -> _Result:
+        """Return what ``call`` returns. If it raises, log that and return ``otherwise``: others continue."""
+        try:
+            return call()
+        except Exception as defect:  # noqa: BLE001 - see above
+            self.log(defect)
+            return otherwise
+
+    def log(self, defect: BaseException, text: str = "") -> None:
+        """Log a defect. One that is raised at the same place as an earlier one is a repeat."""
+        text = text or f"{defect_text(defect)}; report this with the log"
+        place = _place(single(defect))
+        repeats = self._counts.get(place, 0)
+        defect_total.count += 1
+        self._counts[place] = repeats + 1
+        if repeats:
+            self._logger.debug("%s: %s (again)", self._subject, text)
+        else:
+            self._logger.error("%s: %s", self._subject, text, exc_info=defect)
+
+
+def single(defect: BaseException) -> BaseException:
+    """Return the first exception in a group of them; any other exception as it is."""
+    while isinstance(defect, BaseExceptionGroup):
+        defect = defect.exceptions[0]
+    return defect
+
+
+def defect_text(defect: BaseException) -> str:
+    """Return what happened, for messages about a defect: "defect in the gateway: KeyError: 'lab'"."""
+    first = single(defect)
+    return safe_text(f"defect in the gateway: {type(first).__name__}: {first}")
+
+
+def _place(error: BaseException) -> tuple[str, str, int]:
+    """Return the type of an exception, and the file and line that raised it."""
+    trace = error.__traceback__
+    if trace is None:
+        return type(error).__name__, "", 0
+    while trace.tb_next is not None:
+        trace = trace.tb_next
+    return type(error).__name__, trace.tb_frame.f_code.co_filename, trace.tb_lineno

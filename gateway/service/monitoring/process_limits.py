@@ -1,0 +1,170 @@
+"""What may stop the whole process: no further threads or open files, and an event loop that is late."""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import resource
+import threading
+import time
+from pathlib import Path
+from typing import Final
+
+from gateway.errors import FILES_ADVICE, NO_FILES
+from gateway.logs.failures import HOLD_S, FailureLog
+from gateway.workers import thread_starts
+
+MAX_FILES: Final = 65_536
+"""How many files the gateway wants to open at most: more than the clients that its outputs accept."""
+
+logger = logging.getLogger(__name__)
+
+
+def raise_file_limit() -> None:
+    """Let the process open as many files as the system allows it, at most MAX_FILES.
+
+    The limit that programs start with is usually 1024, for the sake of programs that use select().
+    """
+    with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        wanted = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
+        if soft != resource.RLIM_INFINITY and soft < wanted:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+class ProcessLimits:
+    """Finds out what the system refuses now, and logs when that begins and ends."""
+
+    def __init__(self) -> None:
+        self._files = FailureLog(logger, "gateway", HOLD_S)
+        self._threads = FailureLog(logger, "gateway", HOLD_S)
+
+    def problems(self) -> list[str]:
+        """Return what the system refuses now, and what to do. Call it once a second, or more often."""
+        problems = []
+        for failures, problem, recovery in (
+            (self._files, _file_problem(), "files can be opened again"),
+            (self._threads, _thread_problem(), "threads can be started again"),
+        ):
+            if problem:
+                failures.failed(problem)
+                problems.append(problem)
+            else:
+                failures.recovered(recovery)
+        return problems
+
+
+def _file_problem() -> str:
+    most = ""
+    try:
+        os.close(os.open(os.devnull, os.O_RDONLY))
+    except OSError as error:
+        if error.errno == errno.ENFILE:
+            return (
+                "the computer has no file descriptor left, so nobody can connect, and no file can be opened; "
+                "end programs that have many files open, or raise fs.file-max"
+            )
+        if error.errno in NO_FILES:
+            with contextlib.suppress(OSError):  # a sandbox may forbid it
+                most = f" {resource.getrlimit(resource.RLIMIT_NOFILE)[0]}"
+            return (
+                f"all{most} file descriptors of the gateway are in use, so nobody can connect, and no file "
+                f"can be opened; {FILES_ADVICE}"
+            )
+    return ""
+
+
+def _thread_problem() -> str:
+    thread_starts.check()
+    if not thread_starts.is_failing:
+        return ""
+    return (
+        f"no further thread can be started beside the {_num_threads()} of the gateway "
+        f"({thread_starts.num_failed} attempts failed), so parts of it do not work; end other programs of "
+        "its user, or let it have more (TasksMax of the service)"
+    )
+
+
+def _num_threads() -> int:
+    try:
+        return sum(1 for _ in Path("/proc/self/task").iterdir())
+    except OSError:
+        return threading.active_count()
+
+
+class ReservedFiles:
+    """File descriptors that are kept for when none is left.
+
+    ``use`` frees one, and whatever opens a file next gets it. ``refill`` takes back what is free again.
+    """
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._reserved: list[int] = []
+
+    def use(self) -> bool:
+        """Free one; return False if none is left."""
+        if not self._reserved:
+            return False
+        os.close(self._reserved.pop())
+        return True
+
+    def refill(self) -> None:
+        """Reserve as many as are missing, if the system allows it."""
+        with contextlib.suppress(OSError):
+            while len(self._reserved) < self._number:
+                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
+
+    def close(self) -> None:
+        """Free all."""
+        while self.use():
+            pass
+
+
+_PERIOD_S: Final = 0.1
+_WINDOW_S: Final = 60.0
+
+
+class LoopDelay:
+    """Measures every 0.1 s how late a timer fires. Call ``start`` in the running event loop."""
+
+    def __init__(self) -> None:
+        self.last_s = 0.0
+        """The delay of the newest measurement."""
+        self._max_s = self._previous_max_s = 0.0  # of this minute and of the one before
+        self._window_end_s = self._due_s = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def max_s(self) -> float:
+        """The largest delay of the last one to two minutes, so a scrape each minute misses none."""
+        return max(self._max_s, self._previous_max_s)
+
+    def start(self) -> None:
+        """Start measuring."""
+        self._window_end_s = time.monotonic() + _WINDOW_S
+        self._schedule()
+
+    def close(self) -> None:
+        """Stop measuring."""
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def record(self, now_s: float, delay_s: float) -> None:
+        """Add one measurement, made at ``now_s`` on the monotonic clock."""
+        self.last_s = delay_s
+        if now_s >= self._window_end_s:
+            self._previous_max_s, self._max_s = self._max_s, 0.0
+            self._window_end_s = now_s + _WINDOW_S
+        self._max_s = max(self._max_s, delay_s)
+
+    def _schedule(self) -> None:
+        # time.monotonic, because uvloop's own clock counts whole milliseconds
+        self._due_s = time.monotonic() + _PERIOD_S
+        self._timer = asyncio.get_running_loop().call_later(_PERIOD_S, self._measure)
+
+    def _measure(self) -> None:
+        now_s = time.monotonic()
+        self.record(now_s, max(0.0, now_s - self._due_s))  # uvloop's timers may be up to 1 ms early
+        self._schedule()

@@ -1,0 +1,359 @@
+"""One source: the supervisors of its streams, its fan-out, and the queries about it."""
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from gateway.c3d_files.receiving import SourceFiles
+from gateway.c3d_files.spool import Spool, StoredFile
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.errors import LinkError, QueryError
+from gateway.logs.failures import HOLD_S, DefectLog, FailureLog, log_fields
+from gateway.messages.decode import C3D
+from gateway.messages.encode import NOT_PUBLISHED
+from gateway.messages.texts import encode_within_limits
+from gateway.outputs.contract import Answer, ServerFile, ServerParameters
+from gateway.publish.fan_out import FanOut
+from gateway.publish.status_messages import clock_message, status_message
+from gateway.queries.answers import FilePayload
+from gateway.queries.known_parameters import ServerAnswer
+from gateway.queries.parameter_cache import ParameterRefresh
+from gateway.queries.server_requests import RecordingAccess, StreamAccess
+from gateway.queries.service import SourceQueries
+from gateway.rtc3d.components import only_components
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.stream.replies import UNANSWERED, Connection
+from gateway.stream.source_warnings import SourceWarnings
+from gateway.stream.state import StreamState
+from gateway.stream.status import SessionNumbers, StreamStatus
+from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
+from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
+
+logger = logging.getLogger(__name__)
+
+
+class Source:
+    """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries.
+
+    ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
+    they change, and returns when they have been sent; ``announce_file`` with the name and every C3D file
+    that was stored. ``before`` is the source that this one replaces after a reload; its
+    session and sequence numbers and its parameters continue.
+    """
+
+    def __init__(
+        self,
+        settings: SourceSettings,
+        fan_out: FanOut,
+        spool: Spool,
+        publish_parameters: Callable[[str, ServerParameters], Awaitable[None]],
+        announce_file: Callable[[str, ServerFile], None],
+        follow_recording: Callable[[str, bool, str], Awaitable[Mapping[str, Any]]],
+        before: "Source | None" = None,
+    ) -> None:
+        self.settings = settings
+        self._warnings = SourceWarnings(settings.name)
+        self.defects: DefectLog = DefectLog(logger, settings.name, None if before is None else before.defects)
+        """The log of defects in handling this source."""
+        self.spool = spool
+        self.fan_out = fan_out
+        self._refresh = ParameterRefresh(
+            settings,
+            lambda: self.queries.parameters.refresh(),  # noqa: PLW0108 - assigned below
+            lambda: self.queries.parameters.last_read_s,
+        )
+        self.fan_out.on_items_changed = self._refresh.request
+        self.sessions: SessionNumbers = SessionNumbers() if before is None else before.sessions
+        """The numbers of the connections."""
+        self.parameters_version: int = 0 if before is None else before.parameters_version
+        """The version of the server's parameters; 0 before the first."""
+        self._files = SourceFiles(settings.name, lambda: self.spool, self._on_stored)
+        self._spool_problems = FailureLog(logger, settings.name, HOLD_S)
+        self._streams: ConfiguredStreams | AutomaticStreams = (
+            AutomaticStreams(settings.stall_timeout_s, self._new_stream)
+            if settings.streams == "auto"
+            else ConfiguredStreams(settings.streams, self._new_stream)
+        )
+        self._follow_recording = follow_recording
+        self.queries = self._new_queries(before)
+        self._publish_parameters = publish_parameters
+        self._announce_file = announce_file
+        self._failure: asyncio.Future[None] | None = None  # ends ``run``
+        # The names and units of the former server do not apply to another one, not even until its handshake.
+        self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
+            *(settings.host, settings.port),
+        )
+        self._has_new_frame = before is not None and not before.settings.has_frame_of(settings)
+        self._has_new_components = before is not None and before.settings.components != settings.components
+        self.sequence: int = NOT_PUBLISHED if before is None else before.sequence
+        """The sequence number of the newest status and clock messages."""
+        self._newest_status: bytes = self._encoded_status()
+
+    def _new_queries(self, before: "Source | None") -> SourceQueries:
+        return SourceQueries(
+            self.settings,
+            lambda: [
+                StreamAccess(stream.settings.components, stream.status, stream.session)
+                for stream in self.streams
+            ],
+            newest_message=self.fan_out.newest,
+            status_message=lambda: self._newest_status,
+            last_c3d=self._last_c3d,
+            recording=RecordingAccess(self._record, partial(self._follow_recording, self.settings.name)),
+            announce_parameters=self._announce_parameters,
+            before=None if before is None else before.queries,
+        )
+
+    @property
+    def name(self) -> str:
+        """The source's name."""
+        return self.settings.name
+
+    @property
+    def streams(self) -> Sequence[Supervisor]:
+        """The streams: those of the configuration, or the present ones with ``streams: auto``."""
+        return self._streams.streams
+
+    @property
+    def statuses(self) -> list[StreamStatus]:
+        """The status of each stream."""
+        return [stream.status for stream in self.streams]
+
+    @property
+    def rated_statuses(self) -> list[tuple[StreamStatus, float]]:
+        """The status of each stream, with its frame rate in Hz at the last ``publish_status``."""
+        return [(stream.status, stream.frame_rate.rate_hz) for stream in self.streams]
+
+    async def run(self) -> None:
+        """Run every stream until cancelled; then send Bye to the server.
+
+        Raises any exception that is a defect, of the source or of a stream. The caller builds the source
+        again, because the state of this one can no longer be trusted.
+        """
+        self._failure = asyncio.get_running_loop().create_future()
+        if not self.known_parameters.version:
+            self.fan_out.begin(self.known_parameters)
+        if self._has_new_server:
+            await self.queries.parameters.known.make_void("the configuration names another server")
+        elif self._has_new_frame and self.known_parameters.version:
+            await self.queries.parameters.begin_version()
+        elif self._has_new_components and self.known_parameters.version:
+            await self._publish_parameters(self.name, self.known_parameters)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(_wait_for(self._failure))
+                tasks.create_task(self._refresh.run())
+                await self._streams.run()
+                raise RuntimeError("the streams have ended, and nobody stopped them")
+        finally:
+            await self._files.finish()
+            for stream in self._streams.known:
+                stream.status.losses.close()
+
+    async def change_frame(self, settings: SourceSettings) -> None:
+        """Use ``settings``, which differ only in the frame of poses, and tell outputs. Streams continue."""
+        self.settings = self.queries.settings = settings
+        if self.known_parameters.version:
+            await self.queries.parameters.begin_version()
+        else:
+            self.fan_out.begin(self.known_parameters)
+
+    # Status.
+
+    def fail(self, defect: Exception) -> None:
+        """End ``run`` with this defect."""
+        if self._failure is not None and not self._failure.done():
+            self._failure.set_exception(defect)
+
+    def show_restart(self, defect: str) -> None:
+        """Show why this source was built again, until its streams are connected."""
+        self.fan_out.show_streaming(False)
+        for status in self.statuses:
+            status.record_error(defect)
+
+    def publish_status(self) -> None:
+        """Check the streams, and publish the status and the clock of this source. Called once a second.
+
+        A defect in checking the streams ends ``run``. One in publishing does not: the data is what matters.
+        """
+        with log_fields(source=self.name):
+            self.sequence += 1
+            try:
+                self._streams.check()
+            except Exception as defect:  # noqa: BLE001 - ``run`` raises it
+                self.fail(defect)
+            for work in (
+                self._files.check,
+                self._check_logs,
+                self._publish_newest_status,
+                self._publish_clock,
+            ):
+                try:
+                    work()
+                except Exception as defect:  # noqa: BLE001 - the next status may succeed
+                    self.defects.log(defect)
+
+    def _check_logs(self) -> None:
+        for stream in self._streams.known:
+            stream.status.check()
+        self.fan_out.check_losses()
+
+    def _publish_newest_status(self) -> None:
+        for stream in self.streams:
+            stream.frame_rate.update(stream.status.frames_in)
+        self._newest_status = self._encoded_status()
+        self.fan_out.publish_status(self._newest_status)
+
+    def _publish_clock(self) -> None:
+        # One server has one clock: publish the best estimate of all streams.
+        best = min(self.statuses, key=_uncertainty_us)
+        clock = clock_message(self.queries.session, self.sequence, best)
+        self.fan_out.publish_clock(encode_within_limits(clock))
+
+    def _encoded_status(self) -> bytes:
+        message = status_message(
+            source=self.name,
+            server=f"{self.settings.host}:{self.settings.port}",
+            sequence=self.sequence,
+            streams=self.rated_statuses,
+            outputs=[
+                (status, output.health(), (output.query_results or {}).get(self.name, {}))
+                for output, status in self.fan_out.outputs
+            ],
+            stall_timeout_s=self.settings.stall_timeout_s,
+            frame=self.queries.frame,
+        )
+        return encode_within_limits(message)
+
+    def _new_stream(self, stream: StreamSettings, listener: Listener) -> Supervisor:
+        status = StreamStatus(
+            component_keys(stream.components),
+            name=stream_name(self.settings, stream.components),
+            on_state=lambda former: self._on_state(status, former),
+            session=self.sessions.newest,
+            sessions=self.sessions,
+            parameters_version=self.parameters_version,
+            known_defects=self.defects,
+            warnings=self._warnings,
+        )
+        return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
+
+    def _callbacks(self, status: StreamStatus) -> Callbacks:
+        return Callbacks(
+            publish=self.fan_out.publish,
+            skip=self.fan_out.skip,
+            read_parameters=self._read_parameters,
+            on_restart=self._refresh.request,
+            files=self._files.receiver(lambda error: status.file_lost(str(error))),
+            has_subscribers=self.fan_out.has_subscribers,
+        )
+
+    def _on_state(self, status: StreamStatus, former: StreamState) -> None:
+        is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
+        self.fan_out.show_streaming(is_streaming)
+        has_no_data = any(status.state is StreamState.NO_MEASUREMENT for status in self.statuses)
+        self.fan_out.show_measurement(True if is_streaming else False if has_no_data else None)
+        if status.state is StreamState.WAITING:
+            self.fan_out.forget_layouts()
+        if former is StreamState.NO_MEASUREMENT and status.state is StreamState.STREAMING:
+            self._refresh.request()  # a new measurement may have other markers and tools
+
+    # Parameters.
+
+    @property
+    def known_parameters(self) -> ServerParameters:
+        """The newest parameters as the outputs get them; empty ones if the server gives none."""
+        known = self.queries.parameters.known
+        components = self.settings.components
+        return ServerParameters(
+            b"" if known.newest is None else known.newest.xml,
+            *(self.queries.session, known.version),
+            parsed=only_components(self._parsed, components),
+            frame=self.queries.frame,
+            components=components,
+        )
+
+    @property
+    def _parsed(self) -> Parameters:
+        newest = self.queries.parameters.known.newest
+        return Parameters() if newest is None else newest.parsed.parameters
+
+    def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:
+        return self.queries.parameters.read_for_handshake(connection)
+
+    async def _announce_parameters(self, answer: ServerAnswer | None, version: int) -> None:
+        """Publish parameters, empty ones if the former are void; then mark the frames with their version."""
+        try:
+            await self._publish_parameters(self.name, self.known_parameters)
+        finally:
+            if version != self.parameters_version:
+                self.parameters_version = version
+                for stream in self._streams.known:
+                    stream.status.parameters_changed(version)
+                    if answer is not None:
+                        stream.status.replace_limitation(UNANSWERED, "")
+                self._streams.parameters_changed(self._parsed)
+            self.fan_out.set_parameters(self.known_parameters)
+
+    # C3D files and recordings.
+
+    def _on_stored(self, stored: StoredFile) -> None:
+        try:
+            self._report_stored(stored)
+        except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
+            self.defects.log(defect)
+
+    def _report_stored(self, stored: StoredFile) -> None:
+        """Log and announce a file. It is there, even if old ones could not be deleted."""
+        deleted = f"; deleted the oldest ({len(stored.deleted)})"
+        logger.info(
+            "%s: the server sent a C3D file of %d bytes, kept as %s%s",
+            *(self.name, stored.num_bytes, stored.path, deleted if stored.deleted else ""),
+        )
+        if stored.problem:
+            self._spool_problems.failed(f"old C3D files are not deleted: {stored.problem}")
+        else:
+            self._spool_problems.recovered("old C3D files can be deleted again")
+        self._announce_file(self.name, ServerFile(stored.path, stored.num_bytes))
+
+    async def _last_c3d(self) -> Answer:
+        spool, timeout_s = self.spool, self.settings.query_timeout_s
+
+        def find() -> FilePayload | None:
+            path = spool.newest(self.name)
+            return None if path is None else FilePayload(path)
+
+        try:
+            async with asyncio.timeout(timeout_s):
+                newest = await spool.reader.run(find)
+        except TimeoutError:
+            text = f"the disk of the gateway did not find the file within {timeout_s:g} s"
+            raise QueryError(text, code="timeout") from None
+        except OSError as error:
+            text = f"the newest C3D file of source {self.name!r} cannot be read: {error.strerror}"
+            raise QueryError(text, code="nothing-yet") from error
+        if newest is None:
+            raise QueryError(f"source {self.name!r} has sent no C3D file so far", code="nothing-yet")
+        return Answer(newest, C3D, {"name": newest.name, "bytes": newest.num_bytes})
+
+    def _record(self, start: bool) -> bool:
+        for stream in self.streams:
+            if stream.session is not None:
+                try:
+                    stream.session.control_recording(start=start)
+                except LinkError:
+                    continue
+                return True
+        return False
+
+
+async def _wait_for(failure: "asyncio.Future[None]") -> None:
+    await failure
+
+
+def _uncertainty_us(status: StreamStatus) -> float:
+    return status.clock.uncertainty_us if status.clock.has_clock else math.inf

@@ -1,0 +1,61 @@
+"""The clock of the time during which this process runs; ``process_timeout`` says what it is for."""
+
+import asyncio
+import threading
+from collections import deque
+from typing import Final
+
+_TICK_S: Final = 0.1
+_MAX_STEP_S: Final = 0.2
+"""How much a stop counts, however long it is. A loop whose timers are at most 0.1 s late loses no time."""
+
+_DELAY_S: Final = 0.05
+"""Delays of this length and more are kept: with less, no buffer between server and gateway is full."""
+
+_DELAY_WINDOW_S: Final = 30.0
+"""How long a delay is kept. What waited meanwhile is read by then: at twice its rate, or faster."""
+
+
+class RunningClock:
+    """The seconds during which an event loop has run. It stands still while the process is stopped."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.loop = loop
+        self._loop_time = loop.time  # saves looking it up for every read
+        self._time_s = 0.0  # at the newest tick
+        self._tick_s = loop.time()
+        self._delays_s: deque[tuple[float, float]] = deque(maxlen=round(_DELAY_WINDOW_S / _TICK_S))
+        self._tick()
+
+    def time(self) -> float:
+        """Return the seconds since the clock was made, without those during which the process was stopped."""
+        since_tick_s = self._loop_time() - self._tick_s
+        return self._time_s + min(_MAX_STEP_S, since_tick_s)
+
+    def longest_delay_s(self) -> float:
+        """Return the longest time in the last 30 s for which the loop did not run, so nobody read; or 0."""
+        now_s = self._loop_time()
+        recent = [delay_s for time_s, delay_s in self._delays_s if now_s - time_s < _DELAY_WINDOW_S]
+        present_s = now_s - self._tick_s - _TICK_S
+        return max([*recent, present_s if present_s >= _DELAY_S else 0.0])
+
+    def _tick(self) -> None:
+        self._time_s = self.time()
+        now_s = self._loop_time()
+        if now_s - self._tick_s - _TICK_S >= _DELAY_S:
+            self._delays_s.append((now_s, now_s - self._tick_s - _TICK_S))
+        self._tick_s = now_s
+        self.loop.call_later(_TICK_S, self._tick)
+
+
+_clocks: Final = threading.local()  # its attribute ``clock`` is the newest one of the thread
+
+
+def running_clock() -> RunningClock:
+    """Return the clock of the running event loop; there is one per loop."""
+    loop = asyncio.get_running_loop()
+    clock: RunningClock | None = getattr(_clocks, "clock", None)
+    if clock is None or clock.loop is not loop:
+        clock = RunningClock(loop)
+        _clocks.clock = clock
+    return clock

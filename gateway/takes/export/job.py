@@ -1,0 +1,97 @@
+"""An export: which part of which take becomes which file, and what is reported about it."""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from gateway.errors import SelectionError, TakeError
+from gateway.takes.files.new_file import NewFiles
+from gateway.takes.files.take import Take, open_take
+
+_MAX_NAMED: Final = 10
+
+
+def _no_progress(*_: object) -> None:
+    """Show nothing."""
+
+
+@dataclass
+class ExportJob:
+    """What to export, and where it goes.
+
+    ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
+    the take. ``progress`` is called with what is being done, how much of it is done, and how much there is
+    (0: that is not known). ``notes`` are sentences about what was changed or left out.
+    """
+
+    take: Path
+    out: Path
+    source: str | None = None
+    from_s: float | None = None
+    to_s: float | None = None
+    progress: Callable[[str, int, int], None] = _no_progress
+    notes: list[str] = field(default_factory=list)
+    files: NewFiles = field(default_factory=NewFiles)
+
+    def note(self, text: str) -> None:
+        """Report a sentence about what was changed or left out; the same one is reported once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def open_take(self, components: Collection[str] | None = None) -> Take:
+        """Return the chosen part of the take, and report what could not be read. Raises TakeError.
+
+        ``components`` are the keys of those to load; None means all.
+        """
+        text = f"reading {self.take.name}"
+        take = open_take(
+            self.take,
+            sources=None if self.source is None else [self.source],
+            components=components,
+            from_s=self.from_s,
+            to_s=self.to_s,
+            progress=lambda done, total: self.progress(text, done, total),
+        )
+        if take.num_damaged:
+            places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"
+            self.note(f"the take is damaged at {places}: {take.damaged_bytes} bytes cannot be read")
+        if take.unknown:
+            channels = ", ".join([*take.unknown][:_MAX_NAMED]) + (
+                ", …" if len(take.unknown) > _MAX_NAMED else ""
+            )
+            count = sum(take.unknown.values())
+            self.note(
+                f"messages of other programs or versions were left out: {count}, on the channels {channels}"
+            )
+        for source in take.sources.values():
+            if not source.parameters:
+                self.note(
+                    f"the take has no parameters of {source.name}: labels, units and rates are not known"
+                )
+        if components is None:
+            self.note_malformed(take)
+        return take
+
+    def note_malformed(self, take: Take) -> None:
+        """Report messages that could not be read."""
+        for source in take.sources.values():
+            for key, count in source.malformed.items():
+                if count:
+                    self.note(f"malformed messages of {key} of {source.name} were left out: {count}")
+
+    def file_name(self, *parts: str) -> Path:
+        """Return the name of one of several files: the name of ``out`` with these parts at its end."""
+        stem = "-".join([self.out.stem, *(part.replace("/", "_") for part in parts if part)])
+        return self.out.with_name(stem + self.out.suffix)
+
+
+def nothing_to_export(job: ExportJob, what: str) -> TakeError:
+    """Return the error for a take without data that the format can hold."""
+    part = "" if job.from_s is None and job.to_s is None else " between --from and --to"
+    source = "" if job.source is None else f" of {job.source}"
+    error = SelectionError if part else TakeError
+    return error(
+        f"{job.take} has no {what}{source}{part}, and {job.out.suffix} holds nothing else; "
+        "`rtc3d-gateway take info` lists what the take has"
+    )

@@ -1,0 +1,276 @@
+"""Export to MCAP with Foxglove's types, for Foxglove, Lichtblick and rerun.
+
+The file is written while the take is read, so its size does not matter.
+"""
+
+import bisect
+import logging
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import IO, Final, Self
+
+import foxglove
+import numpy as np
+from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+
+from gateway.errors import ProtocolError, TakeError
+from gateway.foxglove_schemas.messages import FoxgloveSource
+from gateway.foxglove_schemas.topics import MAX_FIELDS, MAX_UTIME, FloatTopics, FoxgloveMessage, Topic
+from gateway.messages.decode import decode
+from gateway.messages.encode import ITEMS_OFFSET
+from gateway.messages.texts import xml_bytes
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
+from gateway.rtc3d.parameters import Parameters, differ_in_statistics_only
+from gateway.takes.export.job import ExportJob, nothing_to_export
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.take import Take, TakeSource
+
+_MAX_CHANNELS: Final = 1000
+"""More can only come from labels that change all the time."""
+
+# foxglove-sdk logs errors of the file, which McapFile raises. Without a handler, they would go to stderr.
+logging.getLogger("foxglove").addHandler(logging.NullHandler())
+
+
+class McapFile:
+    """An MCAP file in chunks compressed by zstd. The end of the block writes its index.
+
+    The file itself stays open. Its errors are raised by the next call, and at the end of the block.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.num_messages = 0
+        self._file = _WatchedFile(file)
+        self._context = foxglove.Context()
+        self._channels: dict[Topic, foxglove.Channel] = {}
+        options = MCAPWriteOptions(compression=MCAPCompression.Zstd)
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self._writer.close()
+        except Exception:
+            if error is None and not self._file.has_failed:
+                raise
+        self._file.raise_error()  # in place of foxglove-sdk's own
+
+    def write(self, message: FoxgloveMessage) -> None:
+        """Append a message."""
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._create_channel(message.topic)
+        channel.log(message.data, log_time=message.utime * 1000)
+        self.num_messages += 1
+        self._file.raise_error()
+
+    def write_metadata(self, name: str, content: dict[str, str]) -> None:
+        """Add a table of texts."""
+        self._writer.write_metadata(name, content)
+
+    def attach(self, utime: int, name: str, media_type: str, data: bytes) -> None:
+        """Add a file in the file. ``utime`` is its time in µs since 1970."""
+        self._writer.attach(
+            log_time=utime * 1000, create_time=utime * 1000, name=name, media_type=media_type, data=data
+        )
+
+    def _create_channel(self, topic: Topic) -> foxglove.Channel:
+        if len(self._channels) == _MAX_CHANNELS:
+            raise TakeError(
+                f"the labels in the take change so often that there would be more than {_MAX_CHANNELS} "
+                "channels; choose a part by --from and --to"
+            )
+        schema = foxglove.Schema(name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema)
+        channel = foxglove.Channel(
+            topic.name, schema=schema, message_encoding=topic.encoding, context=self._context
+        )
+        self._channels[topic] = channel
+        return channel
+
+
+class _WatchedFile:
+    """A file whose errors foxglove-sdk would log only."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._error: BaseException | None = None
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether there was an error."""
+        return self._error is not None
+
+    def raise_error(self) -> None:
+        """Raise the first error of the file, if there was one."""
+        if self._error is not None:
+            raise self._error
+
+    def write(self, data: bytes | bytearray) -> int:
+        """See IO.write."""
+        with self._watched():
+            return self._file.write(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """See IO.seek."""
+        with self._watched():
+            return self._file.seek(offset, whence)
+
+    def flush(self) -> None:
+        """See IO.flush."""
+        with self._watched():
+            self._file.flush()
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            self._error = self._error or error
+            raise
+
+
+_HEAD: Final = struct.Struct(">8xqq8x4xi4xqi")
+"""Of a component's message: utime, capture_utime, version of the parameters, time stamp, number of items."""
+
+_EVENT_HEADER_BYTES: Final = 50  # about, with the channel
+_PROGRESS_BYTES: Final = 1024 * 1024
+_MAX_CONVERTERS: Final = 100
+_NO_PARAMETERS: Final = -1
+_NUMBERS: Final = (ComponentType.ANALOG, ComponentType.FORCE)
+"""The components whose messages have a field for each number."""
+
+
+def export_mcap(job: ExportJob) -> None:
+    """Write the sources of a take to one file, each with topics of its own."""
+    take = job.open_take(components=())
+    job.note_malformed(take)
+    sources = {name: _SourceExport(source) for name, source in take.sources.items()}
+    with McapFile(job.files.create(job.out)) as file:
+        _write_messages(job, take, sources, file)
+        for source in sources.values():
+            file.write_metadata(source.name, source.metadata)
+    if not file.num_messages:
+        raise nothing_to_export(job, "frames")
+    for source in sources.values():
+        for problem in source.problems:
+            job.note(problem)
+
+
+def _write_messages(job: ExportJob, take: Take, sources: dict[str, "_SourceExport"], file: McapFile) -> None:
+    """Write the messages of the chosen time, and all parameters."""
+    reader = TakeReader(job.take)
+    total = sum(log.path.stat().st_size for log in reader.logs)
+    first = None if job.from_s is None else take.start_utime + round(job.from_s * 1e6)
+    last = None if job.to_s is None else take.start_utime + round(job.to_s * 1e6)
+    done = shown = 0
+    for utime, name, key, message in reader.messages():
+        done += len(message) + _EVENT_HEADER_BYTES
+        if done - shown >= _PROGRESS_BYTES:
+            shown = done
+            job.progress(f"writing {job.out.name}", min(done, total), total)
+        source = sources.get(name)
+        if source is None:
+            continue
+        if key == "parameters":
+            source.attach_parameters(message, file)
+        elif (
+            key in COMPONENTS_BY_KEY and (first is None or utime >= first) and (last is None or utime < last)
+        ):
+            source.write(key, message, file)
+
+
+class _SourceExport:
+    """One source of a take on its way to a file."""
+
+    def __init__(self, source: TakeSource) -> None:
+        self.name = source.name
+        self._source = source
+        self._entries = source.parameters
+        self._by_version: dict[int, list[int]] = {}  # indices of parameters, in the order of their times
+        for index in sorted(range(len(self._entries)), key=lambda index: self._entries[index].utime):
+            self._by_version.setdefault(self._entries[index].version, []).append(index)
+        self._topics = FloatTopics(source.name)
+        self._converters: dict[int, FoxgloveSource] = {}  # by the index of the parameters
+        self._xml = b""  # of the newest attachment
+        self._num_attached = 0
+        self._left_out: Counter[str] = Counter()
+        self._lacking: dict[str, None] = {}  # sentences
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the take says about the source."""
+        source = self._source
+        details = {name: text for name, text in source.details._asdict().items() if text}
+        return {"server": source.server, "gateway_version": source.gateway_version, **details}
+
+    @property
+    def problems(self) -> list[str]:
+        """Sentences about what was left out, or what the parameters lack."""
+        left_out = [f"{what} of {self.name} were left out: {count}" for what, count in self._left_out.items()]
+        return left_out + [f"{self.name}: {problem}" for problem in self._lacking]
+
+    def write(self, key: str, message: bytes, file: McapFile) -> None:
+        """Write the message of a component."""
+        component = COMPONENTS_BY_KEY[key]
+        dtype = ITEM_DTYPES[component]
+        if len(message) < ITEMS_OFFSET:
+            self._left_out[f"malformed messages of {key}"] += 1
+            return
+        utime, capture_utime, version, timestamp_us, num_items = _HEAD.unpack_from(message)
+        if len(message) != ITEMS_OFFSET + num_items * dtype.itemsize:
+            self._left_out[f"malformed messages of {key}"] += 1
+            return
+        if not 0 <= capture_utime <= MAX_UTIME:
+            self._left_out[f"messages from before 1970 or after 2106 in {key}"] += 1
+            return
+        if component in _NUMBERS and (len(message) - ITEMS_OFFSET) // 4 > MAX_FIELDS:
+            self._left_out[f"messages with more than {MAX_FIELDS} numbers in {key}"] += 1
+            return
+        converter = self._converter(version, utime, capture_utime, file)
+        items = np.frombuffer(message, dtype, num_items, ITEMS_OFFSET)
+        for converted in converter.convert(component, items, capture_utime, timestamp_us):
+            file.write(converted)
+
+    def attach_parameters(self, message: bytes, file: McapFile) -> None:
+        """Attach the server's XML if it is new."""
+        try:
+            decoded = decode(message)
+        except ProtocolError:
+            return  # open_take has counted it
+        xml = xml_bytes(decoded.xml)
+        if self._num_attached and differ_in_statistics_only(self._xml, xml):
+            return
+        self._xml = xml
+        self._num_attached += 1
+        utime = min(max(decoded.utime, 0), MAX_UTIME)
+        file.attach(utime, f"{self.name}-parameters-{self._num_attached}.xml", "application/xml", xml)
+
+    def _converter(self, version: int, utime: int, capture_utime: int, file: McapFile) -> FoxgloveSource:
+        """Return the converter for a message; describe the source before its first message."""
+        index = self._entry(version, utime)
+        found = self._converters.get(index)
+        if found is None:
+            parameters = Parameters() if index == _NO_PARAMETERS else self._entries[index].parameters
+            if len(self._converters) == _MAX_CONVERTERS:
+                self._converters.clear()
+            found = self._converters[index] = FoxgloveSource(self._topics, parameters, version)
+            if found.problem:
+                self._lacking[found.problem] = None
+            for message in found.describe(capture_utime):
+                file.write(message)
+        return found
+
+    def _entry(self, version: int, utime: int) -> int:
+        """Return which parameters describe a message: those that ``Series.parameters_of`` would return."""
+        indices = self._by_version.get(version, ())
+        if len(indices) <= 1:
+            return indices[0] if indices else _NO_PARAMETERS
+        older = bisect.bisect_right(indices, utime, key=lambda index: self._entries[index].utime)
+        return indices[max(older - 1, 0)]

@@ -1,0 +1,269 @@
+"""The measurements of a take: parts that have one rate, one set of labels and one count of the server's
+time.
+
+C3D and TRC have a rate and no times. A frame that is missing becomes a row without values, so that all others
+keep their places. The times of capture are not used: their jitter would bend the grid.
+"""
+
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from gateway.errors import TakeError
+from gateway.takes.export.job import ExportJob, nothing_to_export
+from gateway.takes.files.component_rows import Array
+from gateway.takes.files.series import Series, regular_step
+from gateway.takes.files.take import TakeSource
+
+MAX_GAP_S: Final = 10.0
+"""After a longer gap, a new grid begins."""
+
+_TOLERANCE: Final = 0.02
+"""How much the measured rate may differ from the announced one, as a part of it, to be the same rate."""
+
+
+class Grid(NamedTuple):
+    """Where frames of a series belong: ``rows`` has the row of each of ``frames``, which are indices.
+
+    Both have the shape (frames,) and are in order of time; no row occurs twice. ``times_us`` are the server's
+    time stamps of these frames (``has_time_stamps``), or their times of capture if the server sends none.
+    """
+
+    rate_hz: float
+    rows: Array
+    frames: Array
+    times_us: Array
+    has_time_stamps: bool
+
+    @property
+    def num_rows(self) -> int:
+        """The number of rows from the first frame to the last."""
+        return int(self.rows[-1]) + 1
+
+
+def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
+    """Return the places of a run's frames, in several grids if there are gaps of more than 10 s.
+
+    The distance of two frames is the difference of their time stamps, divided by the period and rounded to at
+    least 1. Thus a server's clock that is a little fast or slow does no harm. If the time stamps do not
+    progress (field note 25), or are not to be used, it is the difference of the sequence numbers.
+    """
+    order = np.argsort(run.sequence, kind="stable")
+    order = order[np.concatenate([[True], np.diff(run.sequence[order]) > 0])]
+    sequence = run.sequence[order]
+    stamps = run.timestamp_us[order]
+    has_time_stamps = by_time_stamps and _progresses(stamps)
+    times = stamps if has_time_stamps else run.capture_utime[order]
+    period_us = regular_step(np.diff(times)[np.diff(sequence) == 1])
+    rate_hz = _rate_hz(period_us, run.rate_hz)
+    if has_time_stamps and period_us:
+        distances = np.diff(times) / period_us
+        steps = np.maximum(np.round(np.minimum(distances, 1e15)), 1).astype(np.int64)
+    else:
+        steps = np.diff(sequence)
+    cuts = np.flatnonzero(steps > MAX_GAP_S * rate_hz) + 1
+    rows = np.concatenate([[0], np.cumsum(np.where(steps > MAX_GAP_S * rate_hz, 1, steps))])
+    return [
+        Grid(rate_hz, rows[start:stop] - rows[start], order[start:stop], times[start:stop], has_time_stamps)
+        for start, stop in zip([0, *cuts.tolist()], [*cuts.tolist(), len(order)], strict=True)
+    ]
+
+
+def _progresses(stamps: Array) -> bool:
+    return len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5)
+
+
+def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
+    """Return the announced rate, or the part of it that was recorded, or else the measured rate."""
+    if period_us is None:
+        return announced_hz or 1.0
+    measured_hz = 1e6 / period_us
+    if announced_hz:
+        divisor = max(1, round(announced_hz / measured_hz))
+        if abs(announced_hz / divisor - measured_hz) <= _TOLERANCE * measured_hz:
+            return announced_hz / divisor
+    rounded_hz = round(measured_hz)
+    return float(rounded_hz) if abs(rounded_hz - measured_hz) <= 0.001 * measured_hz else measured_hz
+
+
+_SAME_CLOCK_S: Final = 0.2
+"""Two time stamps are of the same measurement if they differ from the times of capture equally, within
+this."""
+
+_MAX_FILES: Final = 1000
+_COMPARED: Final = 9
+"""How many pairs of frames are compared to decide this."""
+
+_SECOND_US: Final = 1_000_000
+_MARGIN_US: Final = 1_000_000
+"""Frames captured within this time before or after a measurement may belong to it."""
+
+
+class Part(NamedTuple):
+    """Frames of a run in the rows of a measurement: ``rows`` increase, ``frames`` are indices in
+    ``series``."""
+
+    series: Series
+    rows: Array
+    frames: Array
+
+
+class Placed:
+    """One component of a measurement in its rows; its parts have the same labels."""
+
+    def __init__(self, parts: list[Part]) -> None:
+        self.parts = parts
+        self.series = parts[0].series
+        """A run that has the labels and units of all."""
+        self.first_row = min(int(part.rows[0]) for part in parts)
+        self.last_row = max(int(part.rows[-1]) for part in parts)
+
+    @property
+    def num_items(self) -> int:
+        """The number of markers, channels or plates."""
+        return int(self.series.values.shape[1])
+
+    def block(self, start: int, stop: int) -> Array:
+        """Return the values of rows ``start`` to ``stop``, NaN where one is missing.
+
+        The shape is (rows, items, fields); of analog, (rows, items).
+        """
+        block = np.full((stop - start, *self.series.values.shape[1:]), np.nan, np.float32)
+        for part in self.parts:
+            first, last = np.searchsorted(part.rows, [start, stop])
+            block[part.rows[first:last] - start] = part.series.values[part.frames[first:last]]
+        return block
+
+    def num_missing(self, start: int, stop: int) -> int:
+        """Return how many of these rows have no frame."""
+        found = np.zeros(stop - start, bool)
+        for part in self.parts:
+            first, last = np.searchsorted(part.rows, [start, stop])
+            found[part.rows[first:last] - start] = True
+        return int((~found).sum())
+
+
+class Measurement(NamedTuple):
+    """One measurement of a source. ``grid`` has the places of the frames of ``base``.
+
+    ``runs`` are the runs of all components of the source, by key.
+    """
+
+    source: TakeSource
+    runs: dict[str, list[Series]]
+    base: Series
+    grid: Grid
+
+    @property
+    def frames(self) -> Placed:
+        """The frames of ``base`` in their rows."""
+        return Placed([Part(self.base, self.grid.rows, self.grid.frames)])
+
+    def runs_of(self, key: str) -> list[Series]:
+        """Return the runs of a component that were captured at the time of this measurement."""
+        captures = self.base.capture_utime[self.grid.frames]
+        first, last = captures.min() - _MARGIN_US, captures.max() + _MARGIN_US
+        found = self.runs.get(key, [])
+        return [run for run in found if run.capture_utime.max() >= first and run.capture_utime.min() <= last]
+
+    def parts(self, run: Series, rows_per_row: int) -> list[Part]:
+        """Return the parts of another component's run in this measurement; [] if it is of another one.
+
+        It has ``rows_per_row`` rows in each row of the measurement, of which the first has the same time.
+        """
+        stop = self.grid.num_rows * rows_per_row
+        parts = []
+        for grid in place(run, by_time_stamps=self.grid.has_time_stamps):
+            first_row = self._row_of(run, grid, rows_per_row)
+            if first_row is not None:
+                rows = grid.rows + first_row
+                first, last = np.searchsorted(rows, [0, stop])
+                if first < last:
+                    parts.append(Part(run, rows[first:last], grid.frames[first:last]))
+        return parts
+
+    def seconds_of(self, times_us: Array, capture_utime: Array) -> Array:
+        """Return times of the server in seconds from the first row; NaN if they are of another
+        measurement."""
+        base_times, base_captures = self._times()
+        times = times_us if self.grid.has_time_stamps else capture_utime
+        nearest = _nearest(base_times, times)
+        offset_us = (capture_utime - times) - (base_captures - base_times)[nearest]
+        belongs = (times >= base_times[0] - _MARGIN_US) & (times <= base_times[-1] + _MARGIN_US)
+        belongs &= abs(offset_us) <= _SAME_CLOCK_S * _SECOND_US
+        return np.where(belongs, (times - base_times[0]) / _SECOND_US, np.nan)
+
+    def _row_of(self, run: Series, grid: Grid, rows_per_row: int) -> int | None:
+        """Return the row of a run's first frame; None if it is not of this measurement."""
+        base_times, base_captures = self._times()
+        captures = run.capture_utime[grid.frames]
+        if grid.has_time_stamps and self.grid.has_time_stamps:
+            times = grid.times_us
+        else:
+            times, base_times = captures, base_captures
+        overlap = np.flatnonzero(
+            (times >= base_times[0] - _MARGIN_US) & (times <= base_times[-1] + _MARGIN_US)
+        )
+        if not len(overlap):
+            return None
+        compared = overlap[np.linspace(0, len(overlap) - 1, _COMPARED).astype(np.int64)]
+        nearest = _nearest(base_times, times[compared])
+        offsets_us = (captures - times)[compared] - (base_captures - base_times)[nearest]
+        if abs(np.median(offsets_us)) > _SAME_CLOCK_S * _SECOND_US:
+            return None
+        # The first frame within the measurement decides: differences of the clocks' rates cannot add up.
+        inside = np.flatnonzero(times >= base_times[0])
+        anchor = int(inside[0]) if len(inside) else int(overlap[-1])
+        near = int(_nearest(base_times, times[anchor : anchor + 1])[0])
+        period_us = _SECOND_US / (self.grid.rate_hz * rows_per_row)
+        distance = round(float(times[anchor] - base_times[near]) / period_us)
+        return int(self.grid.rows[near]) * rows_per_row + distance - int(grid.rows[anchor])
+
+    def _times(self) -> tuple[Array, Array]:
+        """Return the times of the base's frames on the server's clock, and on the gateway's."""
+        return self.grid.times_us, self.base.capture_utime[self.grid.frames]
+
+
+def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list[tuple[Measurement, Path]]:
+    """Return the measurements of a take, each with the name of its file. Raises TakeError if there are none.
+
+    The frames are those of the first component of ``keys`` that a source has; ``what`` is what they are
+    called. A measurement begins where the server's time stamps start again or pause for more than 10 s, with
+    each session, and where the labels change.
+    """
+    by_source = {source.name: _measurements(source, keys) for source in job.open_take().sources.values()}
+    by_source = {name: found for name, found in by_source.items() if found}
+    total = sum(map(len, by_source.values()))
+    if not total:
+        raise nothing_to_export(job, what)
+    if total > _MAX_FILES:
+        raise TakeError(
+            f"{job.take} has {total} measurements, and each becomes a file; choose a part by --from and --to"
+        )
+    if total > 1:
+        job.note(f"there are {total} measurements, so there are {total} files")
+    named = []
+    for name, found in by_source.items():
+        for number, measurement in enumerate(found, start=1):
+            source_part = name if len(by_source) > 1 else ""
+            number_part = str(number) if len(found) > 1 else ""
+            path = job.file_name(source_part, number_part) if total > 1 else job.out
+            named.append((measurement, path))
+    return named
+
+
+def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement]:
+    # A server may send a frame without items while it sees nothing: that is no measurement of its own.
+    runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
+    base_key = next((key for key in keys if key in runs), None)
+    base_runs = [] if base_key is None else runs[base_key]
+    return [Measurement(source, runs, run, grid) for run in base_runs for grid in place(run)]
+
+
+def _nearest(times: Array, wanted: Array) -> Array:
+    """Return the indices of the times that are nearest to the wanted ones."""
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(times) - 1)
+    return np.where(wanted - times[before] <= times[after] - wanted, before, after)

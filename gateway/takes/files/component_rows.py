@@ -1,0 +1,117 @@
+"""Decoding many messages of one component at once, with numpy and without a loop over items."""
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from gateway.messages.encode import ITEMS_OFFSET
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
+
+HEAD: Final = np.dtype(
+    [
+        ("fingerprint", ">u8"),
+        ("utime", ">i8"),
+        ("capture_utime", ">i8"),
+        ("sequence", ">i8"),
+        ("session", ">i4"),
+        ("parameters_version", ">i4"),
+        ("frame_number", ">i4"),
+        ("timestamp_us", ">i8"),
+        ("num_items", ">i4"),
+    ]
+)
+"""Everything in a component's message before its items (docs/reference/messages.md)."""
+assert HEAD.itemsize == ITEMS_OFFSET  # noqa: S101 - both describe the same bytes
+
+NATIVE_ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
+    component: dtype.newbyteorder("=") for component, dtype in ITEM_DTYPES.items()
+}
+"""ITEM_DTYPES in the byte order of this computer."""
+
+Array: TypeAlias = npt.NDArray[Any]
+
+
+class Rows(NamedTuple):
+    """The content of messages of one component, in their order.
+
+    ``heads`` has the dtype HEAD, shape (messages,). ``items`` has an entry for each number of items: the
+    items of the messages with this number, shape (messages, items), as in NATIVE_ITEM_DTYPES. ``malformed``
+    is how many messages were left out, because their size contradicts their number of items.
+    """
+
+    heads: Array
+    items: dict[int, Array]
+    malformed: int
+
+
+def decode_rows(component: ComponentType, messages: Sequence[bytes]) -> Rows:
+    """Return the content of messages of one component. Their fingerprints are not checked."""
+    sizes = np.fromiter(map(len, messages), np.int64, len(messages))
+    item_bytes = ITEM_DTYPES[component].itemsize
+    if len(messages) and sizes[0] >= ITEMS_OFFSET and (sizes == sizes[0]).all():
+        table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), sizes[0])
+        heads = np.ascontiguousarray(table[:, :ITEMS_OFFSET]).view(HEAD)[:, 0]
+        num_items = int(heads["num_items"][0])
+        if sizes[0] == ITEMS_OFFSET + num_items * item_bytes and (heads["num_items"] == num_items).all():
+            return Rows(heads, {num_items: _items(component, table[:, ITEMS_OFFSET:], num_items)}, 0)
+    return _decode_different(component, messages, sizes)
+
+
+def _decode_different(component: ComponentType, messages: Sequence[bytes], sizes: Array) -> Rows:
+    """Return the content of messages of different sizes, some of which may be malformed."""
+    heads = np.frombuffer(
+        b"".join([message[:ITEMS_OFFSET].ljust(ITEMS_OFFSET, b"\0") for message in messages]), HEAD
+    )
+    counts = heads["num_items"].astype(np.int64)
+    is_whole = sizes == ITEMS_OFFSET + ITEM_DTYPES[component].itemsize * counts
+    items: dict[int, Array] = {}
+    for num_items in np.unique(counts[is_whole]).tolist():
+        (indices,) = np.nonzero(is_whole & (counts == num_items))
+        data = b"".join([messages[index][ITEMS_OFFSET:] for index in indices.tolist()])
+        table = np.frombuffer(data, np.uint8).reshape(len(indices), -1 if data else 0)
+        items[num_items] = _items(component, table, num_items)
+    return Rows(heads[is_whole], items, len(messages) - int(is_whole.sum()))
+
+
+def _items(component: ComponentType, table: Array, num_items: int) -> Array:
+    """Return items of shape (messages, num_items) from their bytes, shape (messages, bytes)."""
+    dtype = ITEM_DTYPES[component]
+    if component is ComponentType.EVENT:
+        items = np.ascontiguousarray(table).view(dtype).astype(NATIVE_ITEM_DTYPES[component])
+    else:
+        # Swapping words is much faster than converting field by field, and keeps the bits of each NaN.
+        words = np.ascontiguousarray(table).view(">u4").astype(np.uint32)
+        items = words.view(NATIVE_ITEM_DTYPES[component])
+    return items.reshape(len(table), num_items)
+
+
+_GROWTH: Final = 1.125
+"""How much more room each enlargement makes: what is not filled takes memory, too."""
+
+
+class GrowingArray:
+    """Rows of a fixed shape. The system enlarges large arrays by moving their pages, not their content."""
+
+    def __init__(self, dtype: np.dtype[Any], row_shape: tuple[int, ...] = ()) -> None:
+        self._rows: Array = np.empty((0, *row_shape), dtype)
+        self._num_rows = 0
+
+    def extend(self, rows: Array) -> None:
+        """Append rows; they are converted to the dtype."""
+        stop = self._num_rows + len(rows)
+        if stop > len(self._rows):
+            self._resize(max(stop, int(len(self._rows) * _GROWTH)))
+        self._rows[self._num_rows : stop] = rows
+        self._num_rows = stop
+
+    def take(self) -> Array:
+        """Return the rows, and forget them."""
+        self._resize(self._num_rows)
+        rows, self._rows, self._num_rows = self._rows, self._rows[:0].copy(), 0
+        return rows
+
+    def _resize(self, num_rows: int) -> None:
+        # Nothing else refers to the array, and it is not used while it is resized.
+        self._rows.resize((num_rows, *self._rows.shape[1:]), refcheck=False)

@@ -1,0 +1,321 @@
+"""LCM event logs: their format, and a reader that survives damage.
+
+An event is a header (big-endian: sync word, number, time, sizes), the channel, and the message. lcm.EventLog
+reads the same format, but ends at the first damaged byte.
+"""
+
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple
+
+from gateway.config.files import check_is_file
+from gateway.errors import TakeError
+from gateway.logs.safe_text import safe_text
+
+SYNC: Final = bytes.fromhex("eda1da01")
+_HEADER: Final = struct.Struct(">4sqqii")
+"""Sync word, event number, time in µs since the Unix epoch, size of the channel, size of the message."""
+_HEADER_BYTES: Final = _HEADER.size
+
+MAX_CHANNEL_BYTES: Final = 255
+MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
+"""An event with a longer channel or message is damage. LCM's own channels have at most 63 bytes."""
+
+MAX_LISTED_DAMAGE: Final = 100
+"""How many places of damage are listed; all are counted."""
+
+_MAX_NAMES: Final = 1000
+"""How many names of channels are kept, so that each is decoded only once."""
+
+_READ_BYTES: Final = 1024 * 1024
+_AHEAD_BYTES: Final = 32 * 1024 * 1024
+"""How far the system reads ahead, so that a slow disk does not delay what is replayed."""
+
+_MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
+"""A file without an event in its first 64 MiB is no event log."""
+
+
+class Event(NamedTuple):
+    """One message in an event log. ``offset`` is where the event begins in the file, in bytes."""
+
+    number: int
+    utime: int
+    channel: str
+    message: bytes
+    offset: int
+
+
+class Damage(NamedTuple):
+    """Bytes of a file that belong to no readable event."""
+
+    offset: int
+    num_bytes: int
+
+
+def encode_event(number: int, utime: int, channel: bytes, message: bytes) -> bytes:
+    """Return an event as in a file; ``utime`` is its time in µs since the Unix epoch."""
+    header = _HEADER.pack(SYNC, number, utime, len(channel), len(message))
+    return b"%b%b%b" % (header, channel, message)
+
+
+class EventLogReader:
+    """Reads the events of one file, in their order; bytes that are damaged are skipped and counted.
+
+    ``events`` may be called again. ``damage`` and ``damaged_bytes`` describe the newest complete pass.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[Damage] = []
+        """The first MAX_LISTED_DAMAGE places of damage."""
+        self.num_damaged = 0
+        """How many places of damage there are."""
+        self.damaged_bytes = 0
+        """How many bytes belong to no readable event."""
+
+    def events(self, start_offset: int = 0) -> Iterator[Event]:
+        """Yield the events from a place in the file on. Raises TakeError if it is no event log."""
+        self.damage, self.num_damaged, self.damaged_bytes = [], 0, 0
+        try:
+            with open_file(self.path) as file:
+                file.seek(start_offset)
+                yield from self._events(_Window(file, start_offset))
+        except (OSError, ValueError) as error:  # ValueError: of a path with NUL
+            reason = getattr(error, "strerror", None) or error
+            raise TakeError(f"{safe_text(str(self.path))} cannot be read: {reason}") from error
+
+    def _events(self, window: "_Window") -> Iterator[Event]:
+        has_events = False
+        damage_start: int | None = None
+        while window.has(1):
+            if damage_start is None:
+                for intact in window.intact_events():
+                    has_events = True
+                    yield intact
+            event = _event(window)
+            if event is None:
+                if damage_start is None:
+                    damage_start = window.offset
+                window.skip_to_sync()
+                if not has_events and window.offset - damage_start > _MAX_FOREIGN_BYTES:
+                    break
+                continue
+            if damage_start is not None:
+                self._add_damage(damage_start, event.offset)
+                damage_start = None
+            has_events = True
+            yield event
+        if damage_start is not None:
+            self._add_damage(damage_start, window.offset)
+        if not has_events:
+            what = f"has {window.offset} bytes without an LCM event" if window.offset else "is empty"
+            raise TakeError(f"{safe_text(str(self.path))} {what}; choose a recording (.lcmlog)")
+
+    def _add_damage(self, start: int, stop: int) -> None:
+        if len(self.damage) < MAX_LISTED_DAMAGE:
+            self.damage.append(Damage(start, stop - start))
+        self.num_damaged += 1
+        self.damaged_bytes += stop - start
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file to read it. Raises OSError, also if it is something else, and ValueError."""
+    check_is_file(path)
+    # With O_NONBLOCK, this does not wait for a writer if a pipe has replaced the file since the check.
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb", buffering=0)
+
+
+class EventBoundary:
+    """Finds the end of the last complete event in a log that arrives in pieces.
+
+    After damage, everything counts as complete.
+    """
+
+    def __init__(self) -> None:
+        self._num_bytes = 0
+        self._complete_bytes = 0
+        self._header = bytearray()  # the beginning of one
+        self._left = 0  # of the present event, after its header
+        self._is_damaged = False
+
+    @property
+    def complete_bytes(self) -> int:
+        """How many bytes the complete events have together."""
+        return self._num_bytes if self._is_damaged else self._complete_bytes
+
+    def feed(self, data: bytes) -> None:
+        """Take the next bytes of the log."""
+        place = 0
+        while place < len(data) and not self._is_damaged:
+            if len(self._header) < _HEADER.size:
+                more = data[place : place + _HEADER.size - len(self._header)]
+                self._header += more
+                place += len(more)
+                if len(self._header) < _HEADER.size:
+                    break
+                fields = _plausible_header(self._header)
+                if fields is None:
+                    self._is_damaged = True
+                    break
+                self._left = fields[3] + fields[4]
+            taken = min(self._left, len(data) - place)
+            self._left -= taken
+            place += taken
+            if not self._left:
+                self._complete_bytes = self._num_bytes + place
+                self._header.clear()
+        self._num_bytes += len(data)
+
+
+class _Window:
+    """A part of a file in memory, which moves forward. ``offset`` is the present place in the file."""
+
+    def __init__(self, file: BinaryIO, offset: int) -> None:
+        self._file = file
+        self._names: dict[bytes, str] = {}
+        self._data = b""
+        self._start = 0  # of the present place in _data
+        self.offset = offset
+        os.posix_fadvise(file.fileno(), offset, _AHEAD_BYTES, os.POSIX_FADV_WILLNEED)
+
+    def has(self, num_bytes: int) -> bool:
+        """Whether the file has this many more bytes; they are in memory then."""
+        while (missing := self._start + num_bytes - len(self._data)) > 0:
+            more = self._file.read(max(missing, _READ_BYTES))
+            ahead = self._file.tell() + _AHEAD_BYTES
+            os.posix_fadvise(self._file.fileno(), ahead, _READ_BYTES, os.POSIX_FADV_WILLNEED)
+            if not more:
+                break
+            self._data = self._data[self._start :] + more
+            self._start = 0
+        return len(self._data) - self._start >= num_bytes
+
+    def intact_events(self) -> Iterator[Event]:
+        """Yield the next events, as far as each is in memory and another one follows directly.
+
+        This is the fast way through a log without damage; ``_event`` has all the rules.
+        """
+        data, start = self._data, self._start
+        to_offset = self.offset - start
+        last_header = len(data) - _HEADER.size
+        unpack, new_event, names = _HEADER.unpack_from, tuple.__new__, self._names
+        if start > last_header:
+            return
+        sync, number, utime, channel_bytes, message_bytes = unpack(data, start)
+        while (
+            sync == SYNC
+            and 0 < channel_bytes <= MAX_CHANNEL_BYTES
+            and 0 <= message_bytes <= MAX_MESSAGE_BYTES
+        ):
+            message_start = start + _HEADER_BYTES + channel_bytes
+            stop = message_start + message_bytes
+            if stop > last_header:
+                break
+            channel = data[start + _HEADER_BYTES : message_start]
+            sync, next_number, next_utime, next_channel_bytes, next_message_bytes = unpack(data, stop)
+            name = names.get(channel)
+            if sync != SYNC or (name is None and (name := self._name(channel)) is None):
+                break
+            yield new_event(Event, (number, utime, name, data[message_start:stop], to_offset + start))
+            start = stop
+            number, utime = next_number, next_utime
+            channel_bytes, message_bytes = next_channel_bytes, next_message_bytes
+        self.move(start - self._start)
+
+    def _name(self, channel: bytes) -> str | None:
+        try:
+            name = channel.decode()
+        except UnicodeDecodeError:
+            return None
+        if len(self._names) < _MAX_NAMES:
+            self._names[channel] = name
+        return name
+
+    def header(self, ahead: int = 0) -> tuple[bytes, int, int, int, int] | None:
+        """Return the fields of a plausible header ``ahead`` bytes from here; None if there is none."""
+        if not self.has(ahead + _HEADER.size):
+            return None
+        return _plausible_header(self._data, self._start + ahead)
+
+    def bytes(self, ahead: int, num_bytes: int) -> bytes:
+        """Return bytes that ``has`` has found."""
+        start = self._start + ahead
+        return self._data[start : start + num_bytes]
+
+    def find_sync(self, ahead: int, stop: int) -> int:
+        """Return how many bytes from here the next sync word begins; -1 if none begins before ``stop``."""
+        self.has(stop + len(SYNC) - 1)
+        found = self._data.find(SYNC, self._start + ahead, self._start + stop + len(SYNC) - 1)
+        return found - self._start if found >= 0 else -1
+
+    def move(self, num_bytes: int) -> None:
+        """Go forward."""
+        self._start += num_bytes
+        self.offset += num_bytes
+
+    def skip_to_sync(self) -> None:
+        """Go forward by at least one byte, to the next sync word or the end of the file."""
+        self.has(_READ_BYTES)
+        rest = len(self._data) - self._start
+        found = self._data.find(SYNC, self._start + 1)
+        if found >= 0:
+            self.move(found - self._start)
+        elif rest < _READ_BYTES:
+            self.move(rest)
+        else:
+            self.move(rest - len(SYNC) + 1)
+            self._skip_hole()
+
+    def _skip_hole(self) -> None:
+        """Go to the next data if the file has a hole here: many GB of zeros that are not on the disk."""
+        descriptor, position = self._file.fileno(), self._file.tell()
+        try:
+            data = os.lseek(descriptor, position, os.SEEK_DATA)
+        except OSError:  # there is none
+            data = os.lseek(descriptor, 0, os.SEEK_END)
+        if data > position:
+            # What is left in memory, three bytes, cannot begin a sync word that goes on with zeros.
+            self._data, self._start, self.offset = b"", 0, data
+        else:
+            os.lseek(descriptor, position, os.SEEK_SET)
+
+
+def _plausible_header(data: bytes | bytearray, offset: int = 0) -> tuple[bytes, int, int, int, int] | None:
+    """Return the fields of the header at ``offset``; None if they cannot be those of one."""
+    fields: tuple[bytes, int, int, int, int] = _HEADER.unpack_from(data, offset)
+    sync, _, _, channel_bytes, message_bytes = fields
+    is_plausible = (
+        sync == SYNC and 0 < channel_bytes <= MAX_CHANNEL_BYTES and 0 <= message_bytes <= MAX_MESSAGE_BYTES
+    )
+    return fields if is_plausible else None
+
+
+def _event(window: _Window) -> Event | None:
+    """Return the event at the present place and move behind it; None, without moving, if it is damaged."""
+    header = window.header()
+    if header is None:
+        return None
+    _, number, utime, channel_bytes, message_bytes = header
+    size = _HEADER.size + channel_bytes + message_bytes
+    if not window.has(size):
+        return None
+    channel = window.bytes(_HEADER.size, channel_bytes)
+    # What follows confirms the size. If it is no event, and one begins inside of this event, the end of this
+    # one is lost, or its size is wrong.
+    if window.has(size + 1) and window.bytes(size, len(SYNC)) != SYNC[: len(window.bytes(size, len(SYNC)))]:
+        inside = window.find_sync(len(SYNC), size)
+        while inside >= 0:
+            if window.header(inside) is not None:
+                return None
+            inside = window.find_sync(inside + 1, size)
+    try:
+        name = channel.decode()
+    except UnicodeDecodeError:
+        return None
+    event = Event(
+        number, utime, name, window.bytes(_HEADER.size + channel_bytes, message_bytes), window.offset
+    )
+    window.move(size)
+    return event

@@ -1,0 +1,150 @@
+"""The names of takes, and new files that appear under their names when they are complete."""
+
+import os
+import re
+import secrets
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self
+
+from gateway.errors import QueryError, TakeError
+
+MAX_NAME_LENGTH: Final = 100
+
+_NAME: Final = re.compile(r"[\w.+-][\w .+-]*")
+_EXTENSION: Final = re.compile(r"\.[A-Za-z]\w{1,4}$")
+_OTHER: Final = re.compile(r"[^\w .+-]")
+_NUMBER: Final = re.compile(r"(\d+)")
+
+
+def check_name(name: str) -> None:
+    """Raise QueryError unless a take can have this name, which becomes that of a file."""
+    if not name or len(name) > MAX_NAME_LENGTH or not _NAME.fullmatch(name) or name[0] == ".":
+        raise QueryError(
+            f"{name[:MAX_NAME_LENGTH]!r} cannot be the name of a take: expected 1 to {MAX_NAME_LENGTH} "
+            "letters, digits, spaces and any of '_.-+', without a space or a dot at the beginning"
+        )
+
+
+def name_of_file(path: str) -> str:
+    """Return the name of the take of a server's file: without folder, extension and what no take can have.
+
+    Returns "" if nothing remains.
+    """
+    name = _EXTENSION.sub("", re.split(r"[\\/]", path)[-1].strip("'\" "))
+    return _OTHER.sub("_", name).lstrip(" .")[:MAX_NAME_LENGTH]
+
+
+def default_name(source: str) -> str:
+    """Return the name of a take that begins now: SOURCE-YYYYMMDD-hhmmss, in local time."""
+    return f"{source}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def numbered(name: str, number: int) -> str:
+    """Return NAME, NAME-2, NAME-3, … for the numbers from 1 on."""
+    return name if number == 1 else f"{name}-{number}"
+
+
+def by_number(path: Path) -> tuple[list[str | int], str]:
+    """Return the key that sorts files by name, and the numbers in names by value: 999 before 1000."""
+    parts = _NUMBER.split(path.name)
+    return [int(part) if position % 2 else part for position, part in enumerate(parts)], path.name
+
+
+_BUFFER_BYTES: Final = 1024 * 1024
+
+
+class NewFiles:
+    """One or several new files, which get their names together, when the block ends without an error.
+
+    ::
+
+        with NewFiles() as files:
+            file = files.create(Path("walk.csv"))
+            file.write(b"...")
+
+    Until then each has a temporary name in the same folder, which ends like its own. If the block fails, or
+    if one of the names is taken in the meantime, none of the files remains. Raises TakeError if a file exists
+    already, and in place of each OSError of the block, such as a full disk.
+    """
+
+    def __init__(self) -> None:
+        self.paths: list[Path] = []
+        """The files, in the order of their creation."""
+        self._temporary: list[Path] = []
+        self._open: list[IO[bytes]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            try:
+                if error is None:
+                    self._publish()
+            finally:
+                self._remove_temporary()
+        except OSError as failure:
+            raise self._as_take_error(failure) from failure
+        if isinstance(error, OSError):
+            raise self._as_take_error(error) from error
+
+    def create(self, path: Path) -> IO[bytes]:
+        """Open a new file for writing. It has its name when the block ends. Raises TakeError."""
+        if os.path.lexists(path) or path in self.paths:
+            raise _exists(path)
+        temporary = path.with_name(f".{secrets.token_hex(8)}.part{path.suffix}")
+        self.paths.append(path)
+        self._temporary.append(temporary)  # first: a signal can end the block as soon as the file exists
+        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        file = os.fdopen(descriptor, "w+b", buffering=_BUFFER_BYTES)
+        self._open.append(file)
+        return file
+
+    def _publish(self) -> None:
+        for file in self._open:
+            file.flush()
+            os.fsync(file.fileno())
+        done: list[Path] = []
+        try:
+            for temporary, path in zip(self._temporary, self.paths, strict=True):
+                _rename(temporary, path)
+                done.append(path)
+        except BaseException:
+            for path in done:
+                path.unlink(missing_ok=True)
+            raise
+
+    def _remove_temporary(self) -> None:
+        for file in self._open:
+            try:
+                file.close()
+            except OSError:
+                continue  # the rest of a file that is removed does not fit on the disk
+        for temporary in self._temporary:
+            temporary.unlink(missing_ok=True)
+
+    def _as_take_error(self, error: OSError) -> TakeError:
+        path = self.paths[-1] if self.paths else error.filename
+        if isinstance(error, FileExistsError):
+            return _exists(path)
+        return TakeError(f"{path} cannot be written: {error.strerror or error}; nothing was written")
+
+
+def _rename(temporary: Path, path: Path) -> None:
+    """Give a file its name. Raises FileExistsError if the name is taken."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links, such as that of a USB stick
+        if os.path.lexists(path):
+            raise FileExistsError from None
+        temporary.rename(path)
+
+
+def _exists(path: Path | str) -> TakeError:
+    return TakeError(f"{path} exists already, and nothing is overwritten; choose another name, or remove it")

@@ -1,0 +1,331 @@
+"""Reading a take: which source and which kind of message each event of its files belongs to."""
+
+import itertools
+import stat
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import rtc3d
+
+from gateway.errors import ProtocolError, TakeError
+from gateway.logs.safe_text import safe_text
+from gateway.messages.decode import decode, message_type
+from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
+from gateway.takes.files.event_log import Event, EventLogReader
+from gateway.takes.files.new_file import by_number
+
+NAMED_WITHIN_EVENTS: Final = 50_000
+"""Each source is named within this many events: by its description, or by its status once a second."""
+
+_POSE: Final = "_6D_"
+
+
+class SourceNames:
+    """The names of the sources by the beginning of their channels, such as MOCAP_LAB.
+
+    A source is named by its description or its status. Without both, its name is made from the channels.
+    Each source has another name, also if two gateways with different prefixes have sources of one name.
+    """
+
+    def __init__(self, events: Iterable[Event]) -> None:
+        self._names: dict[str, str] = {}  # by the beginning of the channels
+        for event in events:
+            try:
+                kind = message_type(event.message)
+                if kind is rtc3d.take_t or kind is rtc3d.status_t:
+                    self._add(event.channel.rpartition("_")[0], decode(event.message).source)
+            except ProtocolError:
+                continue
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the sources so far."""
+        return list(self._names.values())
+
+    def source(self, channels: str) -> str:
+        """Return the name of the source whose channels begin with this, such as MOCAP_LAB."""
+        if channels not in self._names:
+            self._add(channels, channels.partition("_")[2].lower() or channels.lower() or "take")
+        return self._names[channels]
+
+    def source_and_tool(self, channel: str) -> tuple[str, str] | None:
+        """Return the source and the key of a tool's pose; None if it is not the channel of one.
+
+        Labels and names of sources may have the separator in them, too.
+        """
+        known = [channels for channels in self._names if channel.startswith(channels + _POSE)]
+        channels = max(known, key=len, default="") or channel.partition(_POSE)[0]
+        label = channel[len(channels) + len(_POSE) :]
+        return (self.source(channels), f"6d/{label}") if label else None
+
+    def _add(self, channels: str, name: str) -> None:
+        if channels in self._names:
+            return
+        taken = set(self._names.values())
+        if not name or name in taken:
+            name = channels.lower()
+        number, candidate = 1, name
+        while candidate in taken:
+            number += 1
+            candidate = f"{name}_{number}"
+        self._names[channels] = candidate
+
+
+SUFFIX: Final = ".lcmlog"
+"""The extension of an event log."""
+
+_BATCH_BYTES: Final = 4 * 1024 * 1024
+_BATCH_MESSAGES: Final = 20_000
+"""A batch ends at this many bytes or messages, whichever comes first."""
+
+_EVENT_BYTES: Final = 40
+"""About how many bytes of a file an event has besides its message."""
+
+_MAX_ROUTES: Final = 10_000
+
+_MAX_SHOWN: Final = 5
+"""How many channels an error lists."""
+
+_KEYS: Final[dict[type[Any], str]] = {
+    **{message_type: component.key for component, message_type in MESSAGE_TYPES.items()},
+    rtc3d.status_t: "status",
+    rtc3d.clock_t: "clock",
+    rtc3d.parameters_t: "parameters",
+    rtc3d.take_t: "take",
+    rtc3d.take_details_t: "details",
+    rtc3d.take_end_t: "end",
+}
+
+
+DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
+"""The keys of messages that are in files only, without numbers."""
+
+
+class TakeMessage(NamedTuple):
+    """One message of a take.
+
+    ``key`` is the part of its Zenoh key below the source: "3d", "6d", "analog", "force", "event", "status",
+    "clock", "parameters", "6d/LABEL" (a pose), "take" for a ``take_t``, "details" for a
+    ``take_details_t``, or "end" for a ``take_end_t``. ``utime`` is the event's time.
+    """
+
+    utime: int
+    source: str
+    key: str
+    message: bytes
+
+
+class Place(NamedTuple):
+    """Where an event begins: the number of the file in ``TakeReader.logs``, and the offset in it in bytes."""
+
+    log: int
+    offset: int
+
+
+FIRST_PLACE: Final = Place(0, 0)
+
+
+@dataclass(slots=True)
+class MessageBatch:
+    """Messages of one source and key in their order, with the times of their events in µs since 1970."""
+
+    source: str
+    key: str
+    utimes: list[int] = field(default_factory=list)
+    messages: list[bytes] = field(default_factory=list)
+
+
+class TakeReader:
+    """Reads a take: an event log, or a folder of them (a saved take) as one.
+
+    Creating it reads the beginning, and raises TakeError if there is no take.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.logs = [EventLogReader(log) for log in log_paths(path)]
+        """The files. After a complete pass, they know their damage."""
+        self.unknown: Counter[str] = Counter()
+        """How many messages have a type that this version does not know, by channel, in the newest pass."""
+        self.empty_files: dict[Path, str] = {}
+        """Files of a folder without any event, and why, in the newest pass."""
+        self.read_bytes = 0
+        """How far the newest pass of ``batches`` has come."""
+        self._log = 0
+        self._offset = 0
+        self._names = SourceNames(itertools.islice(self.events(), NAMED_WITHIN_EVENTS))
+        self._routes: dict[tuple[str, bytes], tuple[str, str] | None] = {}  # by channel and fingerprint
+        self.start_utime: int = next(self.events()).utime
+        """The time of the first event."""
+
+    @property
+    def num_bytes(self) -> int:
+        """The size of all files; 0 for a file that is gone."""
+        return sum(_size(log.path) for log in self.logs)
+
+    @property
+    def source_names(self) -> list[str]:
+        """The names of the sources in what was read so far."""
+        return self._names.names
+
+    @property
+    def place(self) -> Place:
+        """Where the newest message of ``messages`` begins."""
+        return Place(self._log, self._offset)
+
+    def events(self, start: Place = FIRST_PLACE) -> Iterator[Event]:
+        """Yield the events of all files, from a place on. Raises TakeError."""
+        self.empty_files = {}
+        for number, log in enumerate(self.logs[start.log :], start=start.log):
+            self._log = number
+            try:
+                yield from log.events(start.offset if number == start.log else 0)
+            except TakeError as error:
+                # After a loss of power, one file of a folder may be empty.
+                self.empty_files[log.path] = str(error)
+                if len(self.empty_files) == len(self.logs):
+                    raise
+
+    def messages(self, start: Place = FIRST_PLACE) -> Iterator[TakeMessage]:
+        """Yield the messages of a gateway, in their order, from a place on.
+
+        Raises TakeError, also if there are none.
+        """
+        self.unknown.clear()
+        routes, new_message = self._routes, tuple.__new__
+        for event in self.events(start):
+            _, utime, channel, message, offset = event
+            self._offset = offset
+            identity = (channel, message[:8])
+            if identity not in routes:
+                self._add_route(identity)
+            route = routes[identity]
+            if route is None:
+                self.unknown[channel] += 1
+            else:
+                yield new_message(TakeMessage, (utime, *route, message))
+        self._check_is_take()
+
+    def batches(self) -> Iterator[list[MessageBatch]]:
+        """Yield the messages of a gateway in batches of some MB, each with one entry per source and key.
+
+        This is the fast way to read everything. A batch ends before parameters that differ from those
+        before. Raises TakeError, also if there are no such messages.
+        """
+        self.unknown.clear()
+        self.read_bytes = 0
+        batches: dict[tuple[str, bytes], MessageBatch | None] = {}
+        newest: dict[str, bytes] = {}
+        num_bytes = num_messages = 0
+        for _, utime, channel, message, _ in self.events():
+            identity = (channel, message[:8])
+            if identity in batches:
+                batch = batches[identity]
+            else:
+                batch = batches[identity] = self._new_batch(identity)
+            num_messages += 1
+            num_bytes += len(message)
+            if batch is None:
+                self.unknown[channel] += 1
+                continue
+            is_news = batch.key == "parameters" and newest.get(batch.source) != message[VERSION_OFFSET:]
+            if is_news or num_bytes >= _BATCH_BYTES or num_messages >= _BATCH_MESSAGES:
+                if is_news:
+                    newest[batch.source] = message[VERSION_OFFSET:]
+                self.read_bytes += num_bytes + num_messages * _EVENT_BYTES
+                yield [filled for filled in batches.values() if filled is not None and filled.messages]
+                num_bytes = num_messages = 0
+                batch = MessageBatch(batch.source, batch.key)
+                batches = {identity: batch}
+            batch.utimes.append(utime)
+            batch.messages.append(message)
+        yield [filled for filled in batches.values() if filled is not None and filled.messages]
+        self._check_is_take()
+
+    def _check_is_take(self) -> None:
+        """Raise TakeError if no message of a gateway was found."""
+        if self._names.names:
+            return
+        channels = [safe_text(channel) for channel in sorted(self.unknown)]
+        shown = ", ".join(channels[:_MAX_SHOWN]) + (", …" if len(channels) > _MAX_SHOWN else "")
+        version = (
+            "; they may be of another version of the gateway"
+            if any(map(is_gateways_channel, self.unknown))
+            else ""
+        )
+        raise TakeError(
+            f"{safe_text(str(self.path))} has no message of this gateway, but "
+            f"{sum(self.unknown.values())} messages of other types, on channel {shown}{version}"
+        )
+
+    def _new_batch(self, identity: tuple[str, bytes]) -> MessageBatch | None:
+        if identity not in self._routes:
+            self._add_route(identity)
+        route = self._routes[identity]
+        return None if route is None else MessageBatch(*route)
+
+    def _add_route(self, identity: tuple[str, bytes]) -> None:
+        """Find the source and the key of a channel; None if the type of its messages is unknown."""
+        channel, fingerprint = identity
+        if len(self._routes) >= _MAX_ROUTES:
+            self._routes.clear()  # a log of damage, or of a program with millions of channels
+        kind = _type_of(fingerprint)
+        if kind is rtc3d.tool_pose_t:
+            self._routes[identity] = self._names.source_and_tool(channel)
+        elif kind in _KEYS:
+            self._routes[identity] = self._names.source(channel.rpartition("_")[0]), _KEYS[kind]
+        else:
+            self._routes[identity] = None
+
+
+def log_paths(path: Path) -> list[Path]:
+    """Return the event logs of a take: the file itself, or those in a folder, by name. Raises TakeError.
+
+    If a folder has no .lcmlog files, it may have those of lcm-logger: NAME.0, NAME.1, … or NAME.00, …, which
+    are sorted by their first events, because lcm-logger may number them backwards.
+    """
+    try:
+        if not stat.S_ISDIR(path.stat().st_mode):
+            return [path]
+        entries = sorted(path.iterdir(), key=by_number)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TakeError(f"{safe_text(str(path))} cannot be read: {reason}") from error
+    logs = [entry for entry in entries if entry.suffix == SUFFIX]
+    if not logs:
+        numbered = [entry for entry in entries if entry.suffix[1:].isdecimal()]
+        logs = sorted(numbered, key=_first_utime)
+    if not logs:
+        raise TakeError(
+            f"{safe_text(str(path))} has no recordings ({SUFFIX}); choose a recording or the folder of one"
+        )
+    return logs
+
+
+def _first_utime(log: Path) -> int:
+    try:
+        return next(EventLogReader(log).events()).utime
+    except TakeError:
+        return 0
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0
+
+
+def is_gateways_channel(channel: str) -> bool:
+    """Return whether a channel is named as one of a gateway."""
+    return channel.rpartition("_")[2].lower() in _KEYS.values()
+
+
+def _type_of(message: bytes) -> type[Any] | None:
+    try:
+        return message_type(message)
+    except ProtocolError:
+        return None

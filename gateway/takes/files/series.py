@@ -1,0 +1,367 @@
+"""One component of one source of a take, as numpy arrays."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from gateway.descriptions.labels import Description, common, describe, event_labels
+from gateway.errors import TakeError
+from gateway.rtc3d.components import MISSING, ComponentType
+from gateway.rtc3d.parameters import Parameters
+from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array, GrowingArray, Rows
+from gateway.takes.files.gaps import find_restarts
+
+_COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
+
+_MAX_PADDING: Final = 4
+"""How many times as large as what was recorded ``items`` may become, when the labels change."""
+_MIN_LIMIT_BYTES: Final = 256 * 1024 * 1024
+
+
+class ParametersEntry(NamedTuple):
+    """Parameters of a server: when the gateway sent them (``parameters_t.utime``), and their version."""
+
+    utime: int
+    version: int
+    parameters: Parameters
+
+
+class Series:
+    """A component of one source: arrays with one row per frame; of events, with one row per event.
+
+    ``key`` is "3d", "6d", "analog", "force" or "event". The arrays have the shape (frames,):
+
+    ======================  =======  ============================================================
+    ``utime``               int64    when the gateway received the frame, in µs since 1970
+    ``capture_utime``       int64    when the server captured it, on the same clock: use this time
+    ``sequence``            int64    grows by one per message; a gap is a loss
+    ``session``             int32    the number of the connection to the server
+    ``parameters_version``  int32    the version of the parameters that describe the frame
+    ``frame_number``        int32    the server's number, unchanged
+    ``timestamp_us``        int64    the server's time stamp in µs since its start, unchanged
+    ======================  =======  ============================================================
+
+    docs/reference/messages.md describes them. The rows are in the order of their arrival. ``items`` has the
+    values. ``start_utime`` is the time of the take's first event.
+    """
+
+    utime: Array
+    capture_utime: Array
+    sequence: Array
+    session: Array
+    parameters_version: Array
+    frame_number: Array
+    timestamp_us: Array
+
+    def __init__(
+        self,
+        component: ComponentType,
+        columns: dict[str, Array],
+        recorded: dict[int, Array],
+        parameters: Sequence[ParametersEntry],
+        start_utime: int,
+    ) -> None:
+        self.component = component
+        self.key = component.key
+        self.start_utime = start_utime
+        self._parameters = parameters
+        self._recorded = recorded  # items by their number, as in Rows; of events, all below 1
+        self._columns = columns
+        for name in _COLUMNS:
+            setattr(self, name, columns[name])
+        self._num_items = columns["num_items"]
+        self._entries = _entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
+
+    def __len__(self) -> int:
+        """Return the number of frames (of events: the number of events)."""
+        return len(self.utime)
+
+    def __repr__(self) -> str:
+        """Return a summary."""
+        return f"<Series {self.key}: {len(self)} rows, {len(self.labels)} labels>"
+
+    @property
+    def seconds(self) -> Array:
+        """The time of capture in seconds since the beginning of the take, float64, shape (frames,)."""
+        return self.seconds_of(self.capture_utime)
+
+    def seconds_of(self, utime: Array) -> Array:
+        """Return times in µs since 1970 as seconds since the beginning of the take, float64."""
+        return (utime - self.start_utime) / 1e6
+
+    def parameters_of(self, row: int) -> Parameters:
+        """Return the server's parameters that describe a row; without any section if the take has none."""
+        entry = int(self._entries[row])
+        return self._parameters[entry].parameters if entry >= 0 else Parameters()
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """The names of the columns of ``items``, each different; () for events.
+
+        If the labels change within the take, these are all labels that occur.
+        """
+        return tuple(dict.fromkeys(label for layout in self._layouts.values() for label in layout.labels))
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each column: of positions, voltages or forces; "" if it is not known or changes."""
+        found: dict[str, set[str]] = {label: set() for label in self.labels}
+        for layout in self._layouts.values():
+            for label, unit in zip(layout.labels, layout.units, strict=True):
+                found[label].add(unit)
+        return tuple(common(units) or "" for units in found.values())
+
+    @property
+    def unit(self) -> str:
+        """The unit of all columns; "" if they differ, or if it changes within the take."""
+        return common(self.units) or ""
+
+    @property
+    def moment_unit(self) -> str:
+        """The unit of the plates' moments; "" if it is not known, or changes."""
+        return common(layout.moment_unit for layout in self._layouts.values()) or ""
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The rate of frames that the server announces; None if it announces none, or it changes."""
+        return common(layout.rate_hz for layout in self._layouts.values())
+
+    @cached_property
+    def measured_rate_hz(self) -> float | None:
+        """The rate of the recorded frames by the server's time stamps, without gaps; None if unknown.
+
+        If the time stamps are constant, it is computed from the times of arrival.
+        """
+        for times in (self.timestamp_us, self.utime):
+            step_us = regular_step(
+                np.diff(times)[(np.diff(self.sequence) == 1) & (np.diff(self.session) == 0)]
+            )
+            if step_us is not None:
+                return 1e6 / step_us
+        return None
+
+    @cached_property
+    def items(self) -> Array:
+        """The values as a structured array, shape (frames, items), with a column for each of ``labels``.
+
+        The fields are those of the message: x, y, z, reliability (markers); q0, qx, qy, qz, x, y, z, error
+        (tools); fx, fy, fz, mx, my, mz (plates). Analog is plain float32. What is missing is NaN; so are the
+        columns of labels that do not exist in a frame. Of events, the shape is (events,), with the fields id,
+        timestamp (µs), param1, param2, param3.
+
+        Raises TakeError if the labels change so much that this array would be several times as large as the
+        recording; use ``runs`` then.
+        """
+        if self.component is ComponentType.EVENT:
+            return self._recorded[1][:, 0]
+        if len(self._recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
+            return next(iter(self._recorded.values()))
+        dtype = NATIVE_ITEM_DTYPES[self.component]
+        recorded_bytes = sum(items.nbytes for items in self._recorded.values())
+        num_bytes = len(self) * len(self.labels) * dtype.itemsize
+        if num_bytes > max(_MAX_PADDING * recorded_bytes, _MIN_LIMIT_BYTES):
+            raise TakeError(
+                f"the labels of {self.key} change so often that an array with all {len(self.labels)} of them "
+                f"would take {num_bytes / 1e9:.1f} GB; read the parts with equal labels one by one: runs()"
+            )
+        items = np.full((len(self), len(self.labels)), MISSING, np.float32 if not dtype.names else dtype)
+        columns = {label: column for column, label in enumerate(self.labels)}
+        rows_of = self._rows_by_number()
+        for (entry, num_items), layout in self._layouts.items():
+            rows = rows_of[num_items]
+            chosen = self._entries[rows] == entry
+            places = np.array([columns[label] for label in layout.labels], np.intp)
+            items[rows[chosen][:, None], places] = self._recorded[num_items][chosen]
+        return items
+
+    @property
+    def values(self) -> Array:
+        """``items`` as plain numbers, float32: shape (frames, items, fields), of analog (frames, items).
+
+        It is a view. Events have integers of different sizes; use ``items``.
+        """
+        if self.component is ComponentType.EVENT:
+            raise TakeError("events have integers of different sizes; use items instead of values")
+        items = self.items
+        if not items.dtype.names:
+            return items
+        num_fields = len(items.dtype.names)
+        return items.view(np.float32).reshape(*items.shape, num_fields)
+
+    @property
+    def positions(self) -> Array:
+        """The positions of markers or tools, float32, shape (frames, items, 3), in ``unit``; NaN is missing.
+
+        It is a view of ``items``.
+        """
+        return self.values[..., self._field("x") : self._field("z") + 1]
+
+    @property
+    def quaternions(self) -> Array:
+        """The orientations of tools, float32, shape (frames, tools, 4), scalar first; NaN is missing."""
+        return self.values[..., self._field("q0") : self._field("qz") + 1]
+
+    @property
+    def is_visible(self) -> Array:
+        """Whether each marker or tool is visible in each frame, bool, shape (frames, items)."""
+        values = self.values if self.component is ComponentType.TOOLS else self.positions
+        return ~np.asarray(np.isnan(values).any(axis=2))
+
+    @property
+    def event_labels(self) -> tuple[str, ...]:
+        """The label of each event (§6.6), one per row; "" if the server gives none. Of events only."""
+        if self.component is not ComponentType.EVENT:
+            return ()
+        names = {
+            entry: event_labels(self._parameters[entry].parameters if entry >= 0 else None)
+            for entry in np.unique(self._entries).tolist()
+        }
+        rows = zip(self._entries.tolist(), self.items["id"].tolist(), strict=True)
+        return tuple(names[entry].get(number, "") for entry, number in rows)
+
+    def runs(self) -> "list[Series]":
+        """Return the parts with constant labels, units and rates, in their order; they share the memory.
+
+        A part also ends where the server's time stamps or frame numbers start again (a new measurement, or a
+        new start of the server), where another session begins, and where the gateway starts again.
+        """
+        if not len(self):
+            return []
+        restarts = find_restarts(self.utime, self.sequence, self.timestamp_us, self.frame_number)
+        is_start = (np.diff(self.session) != 0) | restarts.sequence | restarts.server
+        if self.component is not ComponentType.EVENT:
+            is_start |= np.diff(self._layout_numbers()) != 0
+        starts = [0, *(np.flatnonzero(is_start) + 1).tolist(), len(self)]
+        before = dict.fromkeys(self._recorded, 0)
+        runs = []
+        for start, stop in pairwise(starts):
+            num_items = int(self._num_items[start])
+            first = before[num_items]
+            before[num_items] += stop - start
+            recorded = {num_items: self._recorded[num_items][first : before[num_items]]}
+            columns = {name: values[start:stop] for name, values in self._columns.items()}
+            runs.append(Series(self.component, columns, recorded, self._parameters, self.start_utime))
+        return runs
+
+    def without_empty_frames(self) -> "Series":
+        """Return the frames that have items; all frames if none has."""
+        has_items = self._num_items > 0
+        if has_items.all() or not has_items.any():
+            return self
+        columns = {name: values[has_items] for name, values in self._columns.items()}
+        recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
+        return Series(self.component, columns, recorded, self._parameters, self.start_utime)
+
+    @cached_property
+    def _layouts(self) -> dict[tuple[int, int], Description]:
+        """What describes rows, by index in ``_parameters`` and number of items, as they appear."""
+        pairs = np.stack([self._entries, self._num_items], axis=1)
+        unique, first = np.unique(pairs, axis=0, return_index=True)
+        layouts = {}
+        for entry, num_items in unique[np.argsort(first)].tolist():
+            parameters = self._parameters[entry].parameters if entry >= 0 else None
+            layouts[entry, num_items] = describe(self.component, parameters, num_items)
+        return layouts
+
+    def _layout_numbers(self) -> Array:
+        """Return a number for each row; rows with the same number have the same description."""
+        numbers: dict[Description, int] = {}
+        result = np.zeros(len(self), np.int64)
+        for (entry, num_items), layout in self._layouts.items():
+            number = numbers.setdefault(layout, len(numbers))
+            if number:
+                result[(self._entries == entry) & (self._num_items == num_items)] = number
+        return result
+
+    def _rows_by_number(self) -> dict[int, Array]:
+        """Return the indices of the rows with each number of items."""
+        return {number: np.flatnonzero(self._num_items == number) for number in self._recorded}
+
+    def _field(self, name: str) -> int:
+        names = NATIVE_ITEM_DTYPES[self.component].names or ()
+        if name not in names:
+            raise TakeError(f"{self.key} has no {name}; its fields are {', '.join(names) or 'plain numbers'}")
+        return names.index(name)
+
+
+class SeriesBuilder:
+    """Collects the messages of one component."""
+
+    def __init__(self, component: ComponentType) -> None:
+        self._component = component
+        self._columns = {name: GrowingArray(HEAD[name].newbyteorder("=")) for name in _COLUMNS}
+        self._items: dict[int, GrowingArray] = {}
+
+    def add(self, rows: Rows) -> None:
+        """Append the content of messages."""
+        heads, items = rows.heads, rows.items
+        if self._component is ComponentType.EVENT:
+            heads, items = _one_row_per_event(rows)
+        for name, column in self._columns.items():
+            column.extend(heads[name])
+        for num_items, values in items.items():
+            if num_items not in self._items:
+                dtype = NATIVE_ITEM_DTYPES[self._component]
+                self._items[num_items] = GrowingArray(dtype, (num_items,))
+            self._items[num_items].extend(values)
+
+    def build(self, parameters: Sequence[ParametersEntry], start_utime: int) -> Series | None:
+        """Return what was collected, and forget it; None if it is nothing."""
+        columns = {name: column.take() for name, column in self._columns.items()}
+        recorded = {num_items: items.take() for num_items, items in self._items.items()}
+        if not len(columns["utime"]):
+            return None
+        return Series(self._component, columns, recorded, parameters, start_utime)
+
+
+def regular_step(steps: Array) -> float | None:
+    """Return the mean of the steps, without those that are not positive or differ from the others by half.
+
+    Returns None if there are none.
+    """
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None
+    median = np.median(steps)
+    return float(steps[abs(steps - median) <= median / 2].mean())
+
+
+def _one_row_per_event(rows: Rows) -> tuple[Array, dict[int, Array]]:
+    """Return heads and items so that each event has a row of its own, in the order of the messages."""
+    counts = rows.heads["num_items"].astype(np.int64)
+    heads = np.repeat(rows.heads, counts)
+    heads["num_items"] = 1
+    items = np.empty((len(heads), 1), NATIVE_ITEM_DTYPES[ComponentType.EVENT])
+    starts = np.cumsum(counts) - counts
+    for num_items, values in rows.items.items():
+        places = starts[counts == num_items][:, None] + np.arange(num_items)
+        items[places.ravel(), 0] = values.ravel()
+    return heads, {1: items}
+
+
+def _entries_of_rows(utime: Array, version: Array, parameters: Sequence[ParametersEntry]) -> Array:
+    """Return the index of the parameters that describe each row; -1 if there are none.
+
+    Versions start again with the gateway. Of several parameters with the version of a row, the newest that
+    are older than the row describe it, or else the first.
+    """
+    entries = np.full(len(utime), -1, np.int64)
+    by_version: dict[int, list[int]] = {}
+    for index, entry in enumerate(parameters):
+        by_version.setdefault(entry.version, []).append(index)
+    for number in np.unique(version).tolist():
+        indices = by_version.get(number, [])
+        if not indices:
+            continue
+        rows = version == number
+        if len(indices) == 1:
+            entries[rows] = indices[0]
+            continue
+        indices.sort(key=lambda index: parameters[index].utime)
+        times = np.array([parameters[index].utime for index in indices], np.int64)
+        found = np.searchsorted(times, utime[rows], side="right") - 1
+        entries[rows] = np.array(indices, np.int64)[np.maximum(found, 0)]
+    return entries

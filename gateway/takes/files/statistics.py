@@ -1,0 +1,332 @@
+"""What is in a take, and what is missing from it: one pass over its files, with bounded memory."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from gateway.descriptions.labels import describe, event_labels
+from gateway.errors import ParametersError, ProtocolError
+from gateway.messages.decode import decode
+from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
+from gateway.messages.texts import xml_bytes
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.parameters import (
+    Parameters,
+    changed_sections,
+    describe_renames,
+    differ_in_statistics_only,
+    sections_of,
+)
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.takes.files.component_rows import decode_rows
+from gateway.takes.files.component_statistics import ComponentStatistics, MessageStatistics
+from gateway.takes.files.description import NO_DETAILS, decoded_details, has_end
+from gateway.takes.files.event_log import MAX_LISTED_DAMAGE
+from gateway.takes.files.gaps import ClockSteps
+from gateway.takes.files.reader import DESCRIPTIONS, TakeReader
+
+MAX_LISTED_CHANGES: Final = 100
+"""How many changes of the parameters are listed; all are counted."""
+
+_MAX_VERSIONS: Final = 32
+"""How many versions of the parameters are kept to label what follows."""
+_MAX_TEXTS: Final = 20
+_MAX_KEYS: Final = 1000
+_HEAD_BYTES: Final = FINGERPRINT_BYTES + PREFIX.size
+
+
+class ParametersChange(NamedTuple):
+    """The server's parameters at the beginning or after a change; ``text`` says what changed."""
+
+    utime: int
+    version: int
+    text: str
+
+
+class SourceStatistics:
+    """What a take has of one source."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.take_name = self.recorder = self.host = ""
+        """What the newest description in the take says; "" without a description."""
+        self.details = NO_DETAILS
+        """Who and what the take is about, according to the newest details."""
+        self.servers: list[str] = []
+        """HOST:PORT of the server; several if it changed."""
+        self.gateway_versions: list[str] = []
+        self.components: dict[str, ComponentStatistics] = {}
+        """By key: 3d, 6d, analog, force, event."""
+        self.others: dict[str, MessageStatistics] = {}
+        """Other messages by key: status, clock, parameters, 6d/LABEL (poses), take."""
+        self.parameters_changes: list[ParametersChange] = []
+        self.num_parameters_changes = 0
+        self.event_labels: dict[int, str] = {}
+        """The labels of events by id (§6.6)."""
+        self.drops: dict[tuple[str, str], int] = {}
+        """Messages that the gateway lost during the take, by stream or output and by cause."""
+        self.num_lost = 0
+        """Messages that the recorder lost, according to the ends of the files."""
+        self.clock_steps = ClockSteps()
+        self._num_open = 0  # files that should have an end, and have none so far
+        self._drops: dict[tuple[str, str], int] | None = None  # in the newest status
+        self._parameters: dict[int, Parameters] = {}  # by version
+        self._newest: tuple[int, bytes, Parameters] | None = None  # version, XML, content
+        self._clock_key = ""
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether a file was not ended in order; files of earlier versions have no end."""
+        return self._num_open > 0
+
+    @property
+    def sessions(self) -> int:
+        """How many connections to the server the take has."""
+        return max((len(component.sessions) for component in self.components.values()), default=0)
+
+    @property
+    def server_restarts(self) -> int:
+        """How often the server's time stamps or frame numbers started again."""
+        return max((component.server_restarts for component in self.components.values()), default=0)
+
+    @property
+    def measurements(self) -> int:
+        """How many measurements the server made, as far as its time shows: each begins with a new time."""
+        return self.server_restarts + 1 if self.components else 0
+
+    @property
+    def gateway_restarts(self) -> int:
+        """How often the sequence numbers started again."""
+        return max((component.gaps.restarts for component in self.components.values()), default=0)
+
+    def announced_hz(self, key: str) -> float | None:
+        """Return the rate of a component in the newest parameters; None if they do not say it."""
+        if self._newest is None or key not in self.components:
+            return None
+        component = self.components[key]
+        return describe(component.component, self._newest[2], component.max_items or 0).rate_hz
+
+    def add(self, key: str, messages: list[bytes]) -> None:
+        """Take the next messages with this key."""
+        if key in COMPONENTS_BY_KEY:
+            self._add_components(COMPONENTS_BY_KEY[key], messages)
+        elif key in self.others or len(self.others) < _MAX_KEYS:
+            self._add_others(key, messages)
+
+    def finish(self) -> None:
+        """Count what is left under its labels. Call it at the end."""
+        for part in (*self.components.values(), *self.others.values()):
+            part.gaps.finish()
+        for component in self.components.values():
+            for version in component.versions:
+                component.set_labels(version, self._parameters.get(version))
+
+    def _add_components(self, component: ComponentType, messages: list[bytes]) -> None:
+        key = component.key
+        statistics = self.components.get(key)
+        if statistics is None:
+            statistics = self.components[key] = ComponentStatistics(component)
+        statistics.num_bytes += sum(map(len, messages))
+        rows = decode_rows(component, messages)
+        statistics.add(rows)
+        self._clock_key = self._clock_key or key
+        if key == self._clock_key:
+            heads = rows.heads
+            self.clock_steps.add(heads["utime"].astype(np.int64), heads["timestamp_us"].astype(np.int64))
+
+    def _add_others(self, key: str, messages: list[bytes]) -> None:
+        statistics = self.others.setdefault(key, MessageStatistics())
+        statistics.num_bytes += sum(map(len, messages))
+        whole = [message for message in messages if len(message) >= _HEAD_BYTES or key in DESCRIPTIONS]
+        statistics.malformed += len(messages) - len(whole)
+        for message in whole if "/" not in key and key != "clock" else ():
+            try:
+                self._describe(key, decode(message))
+            except ProtocolError:
+                statistics.malformed += 1
+        if key in DESCRIPTIONS or key == "parameters":  # repeated in each file, or without numbers
+            statistics.num_messages += len(whole)
+        else:
+            heads = np.frombuffer(b"".join([message[8:32] for message in whole]), ">i8").reshape(-1, 3)
+            statistics.add_messages(heads[:, 0].astype(np.int64), heads[:, 2].astype(np.int64))
+
+    def _describe(self, key: str, message: Any) -> None:
+        if key == "parameters":
+            self._set_parameters(message)
+            return
+        if key == "end":
+            self.num_lost += message.messages_lost
+            self._num_open -= 1
+            return
+        if key == "details":
+            self.details = decoded_details(message)
+            return
+        if message.server:
+            _note(self.servers, message.server)
+        if message.gateway_version:
+            _note(self.gateway_versions, message.gateway_version)
+        if key == "take":
+            self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
+            self._num_open += has_end(message)
+        else:
+            self._count_drops(message)
+
+    def _count_drops(self, status: Any) -> None:
+        """Add what was lost since the status before; the gateway counts from its own start."""
+        places = [(stream.components, stream.drops) for stream in status.streams]
+        places += [(output.name, output.drops) for output in status.outputs]
+        newest = {(name, loss.cause): loss.messages for name, drops in places for loss in drops}
+        before = newest if self._drops is None else self._drops
+        for place, number in newest.items():
+            lost = number - before.get(place, 0)
+            if lost < 0:  # the gateway has started again
+                lost = number
+            if lost and (place in self.drops or len(self.drops) < _MAX_KEYS):
+                self.drops[place] = self.drops.get(place, 0) + lost
+        self._drops = newest
+
+    def _set_parameters(self, message: Any) -> None:
+        version, xml = message.parameters_version, xml_bytes(message.xml)
+        is_first = self._newest is None
+        before = Parameters()
+        if self._newest is not None:
+            before = self._newest[2]
+            if version == self._newest[0] and differ_in_statistics_only(self._newest[1], xml):
+                return
+        try:
+            parameters = parse_parameters(xml).parameters if xml else Parameters()
+        except ParametersError:
+            self.others["parameters"].malformed += 1
+            parameters = Parameters()
+        self._label(version)  # what came before, if versions start again
+        self.num_parameters_changes += 1
+        if len(self.parameters_changes) < MAX_LISTED_CHANGES:
+            text = _change_text(before, parameters, is_first=is_first)
+            self.parameters_changes.append(ParametersChange(message.utime, version, text))
+        self.event_labels |= event_labels(parameters)
+        self._newest = version, xml, parameters
+        self._parameters[version] = parameters
+        if len(self._parameters) > _MAX_VERSIONS:
+            oldest = next(iter(self._parameters))
+            self._label(oldest)
+            del self._parameters[oldest]
+
+    def _label(self, version: int) -> None:
+        if version in self._parameters:
+            for component in self.components.values():
+                component.set_labels(version, self._parameters[version])
+
+
+def _change_text(before: Parameters, after: Parameters, *, is_first: bool) -> str:
+    if is_first:
+        return "first: " + (", ".join(sorted(sections_of(after))) or "none")
+    if after == Parameters():
+        return "the server gives no parameters now"
+    texts = [describe_renames(before, after), ", ".join(changed_sections(before, after))]
+    return "; ".join(text for text in texts if text) or "the same"
+
+
+def _note(texts: list[str], text: str) -> None:
+    if text not in texts and len(texts) < _MAX_TEXTS:
+        texts.append(text)
+
+
+_MAX_SOURCES: Final = 100
+
+
+class FileDamage(NamedTuple):
+    """Bytes of a file that belong to no readable event."""
+
+    file: Path
+    offset: int
+    num_bytes: int
+
+
+@dataclass
+class TakeStatistics:
+    """What a take has, and what is missing.
+
+    Times are in µs since 1970, on the clock of the recording computer. ``seconds`` is from the first event to
+    the latest. ``unknown`` counts messages that are none of a gateway's, by channel.
+    """
+
+    path: Path
+    files: list[Path]
+    num_bytes: int
+    start_utime: int
+    end_utime: int = 0
+    num_messages: int = 0
+    sources: dict[str, SourceStatistics] = field(default_factory=dict)
+    unknown: dict[str, int] = field(default_factory=dict)
+    num_damaged: int = 0
+    damaged_bytes: int = 0
+    damage: list[FileDamage] = field(default_factory=list)
+    """The first places of damage, at most MAX_LISTED_DAMAGE."""
+    empty_files: dict[Path, str] = field(default_factory=dict)
+    """Files of a folder without any event, and why."""
+
+    @property
+    def seconds(self) -> float:
+        """The duration in s."""
+        return (self.end_utime - self.start_utime) / 1e6
+
+    def seconds_at(self, utime: int) -> float:
+        """Return a time as seconds since the beginning."""
+        return (utime - self.start_utime) / 1e6
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there is no damage, no gap, no malformed message, and the recorder lost nothing."""
+        parts = [
+            part
+            for source in self.sources.values()
+            for part in (*source.components.values(), *source.others.values())
+        ]
+        return (
+            not self.num_damaged
+            and not any(part.gaps.missing or part.malformed for part in parts)
+            and not self.was_cut_short
+        )
+
+    @property
+    def was_cut_short(self) -> bool:
+        """Whether the recorder was cut off, or lost messages."""
+        return any(source.is_cut_off or source.num_lost for source in self.sources.values())
+
+
+def take_statistics(path: Path, progress: Callable[[int, int], object] | None = None) -> TakeStatistics:
+    """Return the statistics of a take. ``progress`` gets the bytes that were read, and those in all.
+
+    Raises TakeError if there is no take.
+    """
+    reader = TakeReader(path)
+    files = [log.path for log in reader.logs]
+    statistics = TakeStatistics(path, files, reader.num_bytes, reader.start_utime, reader.start_utime)
+    for batches in reader.batches():
+        for batch in batches:
+            statistics.num_messages += len(batch.messages)
+            statistics.end_utime = max(statistics.end_utime, *batch.utimes)
+            name = batch.source
+            if name in statistics.sources or len(statistics.sources) < _MAX_SOURCES:
+                statistics.sources.setdefault(name, SourceStatistics(name)).add(batch.key, batch.messages)
+        if progress is not None:
+            progress(reader.read_bytes, statistics.num_bytes)
+    for source in statistics.sources.values():
+        source.finish()
+    _add_damage(statistics, reader)
+    return statistics
+
+
+def _add_damage(statistics: TakeStatistics, reader: TakeReader) -> None:
+    statistics.unknown = dict(reader.unknown)
+    statistics.num_messages += sum(reader.unknown.values())
+    for log in reader.logs:
+        statistics.num_damaged += log.num_damaged
+        statistics.damaged_bytes += log.damaged_bytes
+        statistics.damage += [FileDamage(log.path, *damage) for damage in log.damage]
+    statistics.num_damaged += len(reader.empty_files)
+    statistics.empty_files = dict(reader.empty_files)
+    del statistics.damage[MAX_LISTED_DAMAGE:]

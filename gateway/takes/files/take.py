@@ -1,0 +1,213 @@
+"""Reading a take into numpy arrays, for analysis and for conversion to other formats."""
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import rtc3d
+
+from gateway.errors import ParametersError, ProtocolError, SelectionError
+from gateway.messages.decode import decode
+from gateway.messages.texts import xml_bytes
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.rtc3d.parameters import Parameters, differ_in_statistics_only
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.takes.files.component_rows import decode_rows
+from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
+from gateway.takes.files.reader import MessageBatch, TakeReader
+from gateway.takes.files.series import ParametersEntry, Series, SeriesBuilder
+
+
+@dataclass
+class TakeSource:
+    """One source (a server) of a take. A component that was not recorded is None.
+
+    ``server`` is HOST:PORT and ``gateway_version`` the version of the gateway that published the messages,
+    both "" if the take does not say. ``details`` has ``subject``, ``session`` and ``note``, each "" if nobody
+    said it. ``parameters`` has the server's parameters at the beginning and at each change, in order.
+    ``malformed`` is how many messages could not be read, by component.
+    """
+
+    name: str
+    server: str = ""
+    gateway_version: str = ""
+    details: TakeDetails = NO_DETAILS
+    markers: Series | None = None
+    tools: Series | None = None
+    analog: Series | None = None
+    forces: Series | None = None
+    events: Series | None = None
+    parameters: list[ParametersEntry] = field(default_factory=list)
+    malformed: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def series(self) -> dict[str, Series]:
+        """The recorded components by their keys: "3d", "6d", "analog", "force", "event"."""
+        by_key = {key: getattr(self, name) for key, name in _FIELDS.items()}
+        return {key: series for key, series in by_key.items() if series is not None}
+
+    def runs(self, key: str) -> list[Series]:
+        """Return the parts of a component with constant labels, one measurement each: see ``Series.runs``."""
+        found = self.series.get(key)
+        return [] if found is None else found.runs()
+
+
+_MAX_LATE_US: Final = 10_000_000
+"""This long after the end of a range, no more messages belong to it."""
+
+_FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "forces", "event": "events"}
+"""The fields of TakeSource by the keys of components."""
+
+
+@dataclass
+class Take:
+    """A take in memory: its sources by name.
+
+    ``start_utime`` is the time of the first event, in µs since 1970; all seconds count from it.
+    ``num_damaged`` places of the files, with ``damaged_bytes`` in all, could not be read. ``unknown`` is how
+    many messages have a type that is none of a gateway's, by channel.
+    """
+
+    path: Path
+    start_utime: int
+    sources: dict[str, TakeSource]
+    num_damaged: int = 0
+    damaged_bytes: int = 0
+    unknown: dict[str, int] = field(default_factory=dict)
+
+
+def open_take(
+    path: Path | str,
+    *,
+    sources: Collection[str] | None = None,
+    components: Collection[str] | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Take:
+    """Read a take (an event log, or the folder of a saved take) into numpy arrays.
+
+    ::
+
+        from gateway.takes import open_take
+
+        take = open_take("lab-20261122-101500.lcmlog")
+        markers = take.sources["lab"].markers
+        print(markers.labels, markers.unit, markers.rate_hz)
+        head = markers.positions[:, markers.labels.index("head")]  # (frames, 3), NaN where it is missing
+        plt.plot(markers.seconds, head)
+
+    ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
+    and ``to_s`` the time of the events, in seconds from the first event of the take; what comes after
+    ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
+    much memory as their part of the file. Damage is skipped and counted. Raises TakeError if there is
+    no take, and SelectionError, a TakeError, if a source or component is not in it.
+    """
+    wanted = _components(components)
+    reader = TakeReader(Path(path))
+    first_utime = -math.inf if from_s is None else reader.start_utime + from_s * 1e6
+    end_utime = math.inf if to_s is None else reader.start_utime + to_s * 1e6
+    loader = _Loader(sources, wanted)
+    for batches in reader.batches():
+        for batch in batches:
+            loader.add(batch, first_utime, end_utime)
+        if min((min(batch.utimes) for batch in batches), default=-math.inf) > end_utime + _MAX_LATE_US:
+            break
+        if progress is not None:
+            progress(reader.read_bytes, reader.num_bytes)
+    take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
+    take.num_damaged = sum(log.num_damaged for log in reader.logs) + len(reader.empty_files)
+    take.damaged_bytes = sum(log.damaged_bytes for log in reader.logs)
+    take.unknown = dict(reader.unknown)
+    missing = set(sources or ()) - take.sources.keys()
+    if missing:
+        names = ", ".join(reader.source_names) or "none of a gateway"
+        raise SelectionError(f"{path} has no source {min(missing)!r}; its sources are: {names}")
+    return take
+
+
+def _components(keys: Collection[str] | None) -> frozenset[str]:
+    known = frozenset(COMPONENTS_BY_KEY)
+    unknown = set(keys or ()) - known
+    if unknown:
+        raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
+    return known if keys is None else frozenset(keys)
+
+
+class _Loader:
+    """Collects the messages of a take."""
+
+    def __init__(self, sources: Collection[str] | None, components: frozenset[str]) -> None:
+        self._wanted = None if sources is None else frozenset(sources)
+        self._components = components
+        self._sources: dict[str, TakeSource] = {}
+        self._xml: dict[str, bytes] = {}  # the newest parameters, by source
+        self._builders: dict[tuple[str, str], SeriesBuilder] = {}
+
+    def add(self, batch: MessageBatch, first_utime: float, end_utime: float) -> None:
+        """Take messages in a range of time; parameters are taken from the whole take."""
+        if self._wanted is not None and batch.source not in self._wanted:
+            return
+        source = self._sources.get(batch.source)
+        if source is None:
+            source = self._sources[batch.source] = TakeSource(batch.source)
+        if batch.key in self._components:
+            messages = batch.messages
+            if not first_utime <= min(batch.utimes) <= max(batch.utimes) < end_utime:
+                times = zip(batch.utimes, messages, strict=True)
+                messages = [message for utime, message in times if first_utime <= utime < end_utime]
+            self._add_frames(source, batch.key, messages)
+        elif batch.key in ("take", "details", "status", "parameters"):
+            for message in batch.messages:
+                if batch.key in ("details", "parameters") or not source.server:
+                    self._describe(source, batch.key, message)
+
+    def finish(self, start_utime: int) -> dict[str, TakeSource]:
+        """Return the sources with their arrays."""
+        for (name, key), builder in self._builders.items():
+            source = self._sources[name]
+            setattr(source, _FIELDS[key], builder.build(source.parameters, start_utime))
+        return self._sources
+
+    def _add_frames(self, source: TakeSource, key: str, messages: list[bytes]) -> None:
+        rows = decode_rows(COMPONENTS_BY_KEY[key], messages)
+        if rows.malformed:
+            _count(source.malformed, key, rows.malformed)
+        builder = self._builders.get((source.name, key))
+        if builder is None:
+            builder = self._builders[source.name, key] = SeriesBuilder(COMPONENTS_BY_KEY[key])
+        builder.add(rows)
+
+    def _describe(self, source: TakeSource, key: str, message: bytes) -> None:
+        try:
+            decoded = decode(message)
+        except ProtocolError:
+            _count(source.malformed, key, 1)
+            return
+        if key == "parameters":
+            self._add_parameters(source, decoded)
+        elif key == "details":
+            source.details = decoded_details(decoded)
+        else:
+            source.server, source.gateway_version = decoded.server, decoded.gateway_version
+
+    def _add_parameters(self, source: TakeSource, decoded: rtc3d.parameters_t) -> None:
+        """Add the parameters if they differ from those before; they are repeated every few seconds."""
+        xml = xml_bytes(decoded.xml)
+        version = decoded.parameters_version
+        newest = source.parameters[-1] if source.parameters else None
+        if newest and newest.version == version and differ_in_statistics_only(self._xml[source.name], xml):
+            return
+        self._xml[source.name] = xml
+        try:
+            parameters = parse_parameters(xml).parameters if xml else Parameters()
+        except ParametersError:
+            _count(source.malformed, "parameters", 1)
+            parameters = Parameters()
+        source.parameters.append(ParametersEntry(decoded.utime, version, parameters))
+
+
+def _count(counts: dict[str, int], key: str, number: int) -> None:
+    counts[key] = counts.get(key, 0) + number

@@ -1,0 +1,193 @@
+"""Publishing the messages of a take on outputs, as the gateway that recorded them did."""
+
+import asyncio
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+from gateway.errors import OutputError, ParametersError, ProtocolError
+from gateway.messages.decode import decode, message_type
+from gateway.messages.encode import CONTENT_OFFSET, lcm_type_name
+from gateway.messages.texts import xml_bytes
+from gateway.messages.topics import Topic, lcm_channel, unique_name
+from gateway.outputs.contract import Output, ServerParameters
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_xml import parse_parameters
+
+_PARAMETERS_S: Final = 1.0
+"""How long messages wait at most until the outputs have sent the parameters that describe them."""
+
+
+MAX_TOPICS: Final = 4096
+MAX_SOURCES: Final = 256
+"""Further keys and sources are left out: a gateway has at most 261 keys per source."""
+
+MAX_NAME_LENGTH: Final = 24
+_NOT_IN_NAMES: Final = re.compile("[^A-Za-z0-9_-]+")
+"""Names of sources are like those in a configuration; a log of other programs may have any."""
+
+
+class Refusal(NamedTuple):
+    """What an output did not accept: the key of the messages, the output, and its cause."""
+
+    key: str
+    output: str
+    cause: str
+
+
+@dataclass
+class ReplayedSource:
+    """What was published of one source: its newest parameters, and when; the newest message by key."""
+
+    name: str
+    parameters: ServerParameters | None = None
+    published_s: float = 0.0
+    newest: dict[str, bytes] = field(default_factory=dict)
+
+
+class _Route(NamedTuple):
+    """Where the messages of one key go: the newest is kept, and each output has a publisher."""
+
+    newest: dict[str, bytes]
+    component: str
+    publishers: Sequence[tuple[str, Callable[[bytes], None]]]
+
+
+class Publication:
+    """Publishes the messages of a take in one thread; what outputs do not allow there is done in ``loop``.
+
+    ``sources`` gets the sources, by name.
+    """
+
+    def __init__(
+        self,
+        outputs: Sequence[Output],
+        sources: dict[str, ReplayedSource],
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        self.sources = sources
+        self.num_messages: Counter[str] = Counter()
+        """How many messages were published, by key without the labels of tools."""
+        self.refusals: Counter[Refusal] = Counter()
+        """What the outputs did not accept."""
+        self.num_unreadable: Counter[str] = Counter()
+        """How many messages without a whole prefix, and parameters, could not be read, by source."""
+        self.num_surplus = 0
+        """How many messages had too many different keys or sources to be published."""
+        self.without_parameters: set[str] = set()
+        """The sources of which a component came before any parameters."""
+        self._outputs = outputs
+        self._loop = loop
+        self._routes: dict[tuple[str, str], _Route] = {}  # by the recorded source and the key
+        self._recorded_sources: dict[str, ReplayedSource] = {}
+
+    # In the thread that publishes.
+
+    def publish(self, source: str, key: str, message: bytes) -> None:
+        """Publish one message. What an output refuses is counted."""
+        if key == "parameters":
+            self._publish_parameters(source, message)
+            return
+        if len(message) < CONTENT_OFFSET:
+            self.num_unreadable[source] += 1
+            return
+        route = self._routes.get((source, key)) or self._open(source, key, message)
+        if route is None:
+            self.num_surplus += 1
+            return
+        route.newest[key] = message
+        for output, publish in route.publishers:
+            try:
+                publish(message)
+            except OutputError as error:
+                self.refusals[Refusal(route.component, output, error.cause)] += 1
+        self.num_messages[route.component] += 1
+
+    def _open(self, recorded_source: str, key: str, message: bytes) -> _Route | None:
+        source = self._source(recorded_source)
+        if source is None or len(self._routes) >= MAX_TOPICS:
+            return None
+        if source.parameters is None and key not in {"status", "clock"}:
+            self.without_parameters.add(source.name)
+        name, _, label = key.partition("/")
+        path = (name, _recorded_label(label, source.parameters)) if label else (name,)
+        topic = Topic(source.name, path, lcm_type_name(message_type(message)))
+        publishers = [(output.name, output.publisher(topic).publish) for output in self._outputs]
+        route = _Route(source.newest, f"{name}/tool" if label else name, publishers)
+        self._routes[recorded_source, key] = route
+        return route
+
+    def _source(self, recorded_name: str) -> ReplayedSource | None:
+        """Return a source, which gets a name that is possible in a key; None if there are too many."""
+        source = self._recorded_sources.get(recorded_name)
+        if source is None and len(self.sources) < MAX_SOURCES:
+            name = unique_name(_NOT_IN_NAMES.sub("-", recorded_name) or "-", self.sources, MAX_NAME_LENGTH)
+            source = self.sources[name] = self._recorded_sources[recorded_name] = ReplayedSource(name)
+            self._in_loop(self._announce(name))
+        return source
+
+    def _publish_parameters(self, recorded_source: str, message: bytes) -> None:
+        try:
+            recorded = decode(message)
+        except ProtocolError:
+            self.num_unreadable[recorded_source] += 1
+            return
+        source = self._source(recorded_source)
+        if source is None:
+            self.num_surplus += 1
+            return
+        before, xml = source.parameters, xml_bytes(recorded.xml)
+        parameters = ServerParameters(
+            xml,
+            recorded.session,
+            recorded.parameters_version,
+            message=message,
+            parsed=before.parsed if before is not None and before.xml == xml else _parsed(xml),
+        )
+        source.parameters, source.published_s = parameters, time.monotonic()
+        is_new = before is None or before[:3] != parameters[:3]
+        self._in_loop(self._send_parameters(source.name, parameters, wait=is_new))
+        self.num_messages["parameters"] += 1
+
+    def _in_loop(self, work: Coroutine[Any, Any, None]) -> None:
+        asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    # In the event loop.
+
+    async def _announce(self, source: str) -> None:
+        for output in self._outputs:
+            output.announce(source)
+            output.show_streaming(source, True)
+
+    async def _send_parameters(self, source: str, parameters: ServerParameters, *, wait: bool) -> None:
+        """Publish parameters; if ``wait``, wait until no message can overtake them, as the gateway does."""
+        sent = [output.publish_parameters(source, parameters) for output in self._outputs]
+        pending = [future for future in sent if future is not None]
+        if wait and pending:
+            await asyncio.wait(pending, timeout=_PARAMETERS_S)
+
+    def show_streaming(self, is_streaming: bool) -> None:
+        """Show peers whether messages come, or the replay pauses."""
+        for output in self._outputs:
+            for source in list(self.sources):
+                output.show_streaming(source, is_streaming)
+
+
+def _parsed(xml: bytes) -> Parameters:
+    """Return the parameters in recorded XML; none if it cannot be read."""
+    try:
+        return parse_parameters(xml).parameters
+    except ParametersError:
+        return Parameters()
+
+
+def _recorded_label(label: str, parameters: ServerParameters | None) -> str:
+    """Return the label of a tool from the parameters; ``label`` is what the channel has of it."""
+    tools = None if parameters is None else parameters.parsed.tools
+    for tool in () if tools is None else tools.tools:
+        if lcm_channel("", tool.label) == lcm_channel("", label):
+            return tool.label.strip()
+    return label

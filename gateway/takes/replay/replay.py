@@ -1,0 +1,188 @@
+"""A replay from opening the outputs to closing them."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from gateway.errors import OutputError, TakeError
+from gateway.outputs.contract import Output
+from gateway.outputs.kind import OutputKind, SubscriptionRequest
+from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.zenoh.config import command_config
+from gateway.outputs.zenoh.kind import ZENOH
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.takes.replay.player import Player
+from gateway.takes.replay.publication import Publication, ReplayedSource
+from gateway.takes.replay.queries import ReplayQueries
+from gateway.workers import WorkerThread
+
+OPENING_S: Final = 5.0
+"""How long an output may need to open."""
+
+LISTENING_S: Final = 1.5
+"""How long to listen for others before the replay; a gateway publishes its status every second."""
+
+_MAX_NAMED: Final = 3
+_POLL_S: Final = 0.02
+
+
+class Destination(NamedTuple):
+    """An output on which to replay, its entry in the registry, and how to subscribe to it."""
+
+    output: Output
+    kind: OutputKind
+    request: SubscriptionRequest
+
+
+@dataclass(frozen=True)
+class ZenohAddress:
+    """How to open Zenoh: connect to an endpoint as a client, listen on one, or as a file says."""
+
+    connect: str | None = None
+    listen: str | None = None
+    config: Path | None = None
+
+
+def zenoh_destination(prefix: str, address: ZenohAddress) -> Destination:
+    """Return Zenoh as a destination. Raises ConfigError if Zenoh does not accept the file."""
+    keys: dict[str, object] = {}
+    if address.connect is not None:
+        keys = {
+            "mode": "client",
+            "connect": {"endpoints": [address.connect]},
+            "scouting": {"multicast": {"enabled": False}},
+        }
+    elif address.listen is not None:
+        keys = {"listen": {"endpoints": [address.listen]}}
+    settings = ZenohSettings(prefix=prefix, config=keys)
+    config = None if address.config is None else command_config(address.config)
+    if config is not None and address.connect is not None:
+        for name, value in (
+            ("mode", "client"),
+            ("connect/endpoints", [address.connect]),
+            ("scouting/multicast/enabled", False),
+        ):
+            config.insert_json5(name, json.dumps(value))
+    output = ZenohOutput(settings, config)
+    return Destination(
+        output, ZENOH, SubscriptionRequest(prefix=prefix, address=address.connect, config=address.config)
+    )
+
+
+def lcm_destination(prefix: str, url: str | None) -> Destination:
+    """Return LCM as a destination."""
+    settings = LcmSettings(prefix=prefix, url=url)
+    return Destination(LcmOutput(settings), LCM, SubscriptionRequest(prefix=prefix, address=url))
+
+
+async def until_open(destination: Destination) -> None:
+    """Wait until the output is open. Raises OutputError after OPENING_S, with what is wrong."""
+    output = destination.output
+    try:
+        async with asyncio.timeout(OPENING_S):
+            while not output.health().connected:
+                await asyncio.sleep(_POLL_S)
+                output.maintain()
+    except TimeoutError:
+        raise OutputError(f"{output.name}: {output.health().problem}", cause="not open") from None
+
+
+async def require_silence(destinations: Sequence[Destination]) -> None:
+    """Listen for LISTENING_S, and raise TakeError if somebody publishes under one of the prefixes.
+
+    Otherwise subscribers would take recorded data for live data, or mix two replays.
+    """
+    heard: dict[str, None] = {}
+    with ExitStack() as stack:
+        for destination in destinations:
+            subscribe = destination.kind.subscribe
+            if subscribe is not None:
+                request = destination.request
+                subscription = await WorkerThread(f"listen {destination.kind.name}").run(
+                    lambda subscribe=subscribe, request=request: subscribe(  # type: ignore[misc]
+                        request, lambda name, _message: heard.setdefault(name)
+                    )
+                )
+                stack.callback(subscription.close)
+        await asyncio.sleep(LISTENING_S)
+    if heard:
+        names = sorted(heard)
+        more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+        raise TakeError(
+            f"somebody else publishes {', '.join(names[:_MAX_NAMED])}{more}: a gateway or another replay; "
+            "stop it, or choose another --prefix"
+        )
+
+
+_MAINTENANCE_S: Final = 1.0
+_STOP_S: Final = 1.0
+"""How long the thread may need to end: an output may be waiting for a peer."""
+
+
+@contextlib.asynccontextmanager
+async def open_publication(
+    destinations: Sequence[Destination], *, are_required: bool, warn: Callable[[str], None]
+) -> AsyncIterator[Publication]:
+    """Provide a publication on the destinations, after nobody else was heard there.
+
+    If an output does not open, raise OutputError if all ``are_required`` or it is the only one; otherwise,
+    ``warn`` with the reason and leave it out.
+    """
+    sources: dict[str, ReplayedSource] = {}
+    queries = ReplayQueries(sources)
+    async with contextlib.AsyncExitStack() as stack:
+        for destination in destinations:
+            destination.output.serve_queries(queries)
+            destination.output.start()
+            stack.push_async_callback(_close, destination)
+        opened = []
+        problems: list[OutputError] = []
+        for destination in destinations:
+            try:
+                await until_open(destination)
+                opened.append(destination)
+            except OutputError as error:
+                problems.append(error)
+        if problems and (are_required or not opened):
+            raise problems[0]
+        for problem in problems:
+            warn(f"not replayed there: {problem}")
+        await require_silence(opened)
+        outputs = [destination.output for destination in opened]
+        maintenance = asyncio.create_task(_maintain(opened))
+        stack.callback(maintenance.cancel)
+        yield Publication(outputs, sources, asyncio.get_running_loop())
+
+
+async def _maintain(destinations: Sequence[Destination]) -> None:
+    while True:
+        await asyncio.sleep(_MAINTENANCE_S)
+        for destination in destinations:
+            destination.output.maintain()
+
+
+async def _close(destination: Destination) -> None:
+    await destination.output.stop_queries()
+    await WorkerThread(f"close {destination.kind.name}").run(destination.output.close)
+
+
+@contextlib.asynccontextmanager
+async def playing(player: Player) -> AsyncIterator[None]:
+    """Run the player's thread during the block, which may end before it. Raises what ended the thread."""
+    player.start()
+    try:
+        yield
+    finally:
+        player.stop()
+        # The thread may be waiting for the event loop.
+        await WorkerThread("join replay").run(lambda: player.join(_STOP_S))
+    if player.error is not None:
+        raise player.error

@@ -1,0 +1,91 @@
+"""What ``echo`` says while it hears nothing; tests/integration/commands has the tests of the command."""
+
+from collections.abc import Callable
+
+import pytest
+
+from gateway.cli import echo_sources as silence_module
+from gateway.cli.echo_sources import Silence
+from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
+from gateway.errors import OutputError, QueryError
+from gateway.outputs.kind import SubscriptionRequest
+from tests.waiting import wait_until
+
+
+def found_of(*components: str) -> FoundSources:
+    """Return the source lab with a stream of each of these components."""
+    found = FoundSources()
+    found.hear("lab")
+    streams = tuple(FoundStream(each, "streaming 200.0 Hz", "streaming", "", 200.0, 0) for each in components)
+    found.add(FoundSource("lab", server="192.0.2.20:3020", host="pc", streams=streams))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(silence_module, "LOOK_S", 0.0)
+    monkeypatch.setattr(silence_module, "SAY_S", 0.0)
+
+
+Said = Callable[..., str]
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
+    """Return a function that returns what is said within the time of many checks, or raises what they do."""
+
+    def say(found: FoundSources | Exception, absence: str = "", component: str | None = None) -> str:
+        def find(*_: object) -> tuple[FoundSources, str]:
+            if isinstance(found, Exception):
+                raise found
+            return found, absence
+
+        monkeypatch.setattr(silence_module, "find_sources", find)
+        silence = Silence("zenoh", SubscriptionRequest(component=component))
+        texts: list[str] = []
+
+        def is_said() -> bool:
+            silence.check()
+            texts.append(capsys.readouterr().err)
+            return any(texts)
+
+        wait_until(is_said)
+        for _ in range(100):
+            silence.check()
+        return "".join(texts) + capsys.readouterr().err
+
+    return say
+
+
+def test_without_a_gateway_the_reason_is_said_once(said: Said) -> None:
+    assert said(FoundSources(), "no gateway found") == "no gateway found\n"
+
+
+def test_a_source_that_none_of_the_gateways_has_is_an_error(said: Said) -> None:
+    with pytest.raises(QueryError, match="no gateway serves source 'hall'"):
+        said(found_of("3d"), "no gateway serves source 'hall'; sources found: lab")
+
+
+def test_a_component_is_looked_for_in_all_streams(said: Said) -> None:
+    text = said(found_of("3d 6d", "analog"), component="analog")
+    assert text == "nothing heard of analog although a gateway runs (lab: streaming 200.0 Hz)\n"
+    with pytest.raises(QueryError, match=r"^no force from lab; accepted for --component: 3d, 6d, analog, "):
+        said(found_of("3d 6d", "analog"), component="force")
+
+
+def test_a_gateway_that_does_not_answer_proves_nothing(said: Said) -> None:
+    found = found_of("3d")
+    found.add_silent(["hall"])
+    assert "hall: its gateway does not answer" in said(found, component="force")
+
+
+@pytest.mark.parametrize("problem", [RuntimeError("odd"), OutputError("odd", cause="not open")])
+def test_a_search_that_fails_ends_nothing(said: Said, problem: Exception) -> None:
+    assert said(problem).endswith("odd\n")
+
+
+def test_outputs_that_cannot_be_searched_stay_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    silence = Silence("example", SubscriptionRequest())
+    for _ in range(10):
+        silence.check()
+    assert capsys.readouterr().err == ""

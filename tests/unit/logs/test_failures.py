@@ -1,0 +1,214 @@
+"""Logging of failures, defects and repeated events: what is loud, what is hidden, and for how long."""
+
+import asyncio
+import logging
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.logs.failures import (
+    FIELDS,
+    HOLD_S,
+    MAX_HOLD_S,
+    MAX_REPEATS,
+    DefectLog,
+    EventLog,
+    FailureLog,
+    log_fields,
+)
+from gateway.logs.log_format import ContextFilter
+from tests.settable_clock import Clock
+
+LOGGER = logging.getLogger("tests.failures")
+
+
+@pytest.fixture(autouse=True)
+def _clock_and_every_level(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("gateway.logs.failures.monotonic", clock)
+    caplog.set_level(logging.DEBUG, LOGGER.name)
+
+
+def logged(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
+    return [(record.levelname, record.message) for record in caplog.records]
+
+
+def levels(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.levelname for record in caplog.records]
+
+
+def test_a_failure_is_loud_once_and_its_recovery_too(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """What fails for hours must not fill the log, but its begin and its end must be there."""
+    failures = FailureLog(LOGGER, "lab")
+    failures.recovered("streaming")
+    is_failing = [failures.failing]
+    assert logged(caplog) == []
+    for _ in range(3):
+        failures.failed("no answer; check the cable")
+        clock.now_s += 1.5
+    is_failing.append(failures.failing)
+    failures.recovered("streaming")
+    failures.recovered("streaming")
+    assert [*is_failing, failures.failing] == [False, True, False]
+    assert logged(caplog) == [
+        ("WARNING", "lab: no answer; check the cable"),
+        ("DEBUG", "lab: no answer; check the cable (failure 2 in a row)"),
+        ("DEBUG", "lab: no answer; check the cable (failure 3 in a row)"),
+        ("INFO", "lab: streaming, after 4.5 s and 3 failures"),
+    ]
+
+
+def test_success_is_always_logged_and_ends_a_failure(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """Each connection is logged, and a new failure after it is loud again."""
+    failures = FailureLog(LOGGER, "lab")
+    failures.succeeded("streaming")
+    for _ in range(2):
+        failures.failed("no answer")
+        clock.now_s += 1.0
+        failures.succeeded("streaming")
+    failure = [("WARNING", "lab: no answer"), ("INFO", "lab: streaming, after 1.0 s")]
+    assert logged(caplog) == [("INFO", "lab: streaming"), *failure, *failure]
+
+
+def test_intermittent_failures_are_over_after_the_hold_time_without_one(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A link that loses every other packet is one failure, not a thousand."""
+    failures = FailureLog(LOGGER, "lab", hold_s=5.0)
+    for second in range(4):
+        clock.now_s = float(second)
+        failures.failed("too large")
+        failures.recovered("sending")
+    clock.now_s = 7.9
+    failures.recovered("sending")
+    is_failing = [failures.failing]
+    clock.now_s = 8.0
+    failures.recovered("sending")
+    assert [*is_failing, failures.failing] == [True, False]
+    assert levels(caplog) == ["WARNING", "DEBUG", "DEBUG", "DEBUG", "INFO"]
+    assert caplog.messages[-1] == "lab: sending, after 8.0 s and 4 failures"
+
+
+@pytest.mark.parametrize(
+    ("pause_s", "holds_s"), [(MAX_HOLD_S - 1, [5, 10, 20, 40, 60, 60]), (MAX_HOLD_S, [5, 5, 5])]
+)
+def test_the_hold_time_doubles_while_failures_come_back_soon(
+    clock: Clock, pause_s: float, holds_s: list[float]
+) -> None:
+    """The wait ends at a minute, and starts again after a minute without a failure."""
+    failures = FailureLog(LOGGER, "lab", HOLD_S)
+    for hold_s in holds_s:
+        failures.failed("closed")
+        clock.now_s += hold_s - 0.1
+        failures.recovered("streaming")
+        is_failing = [failures.failing]
+        clock.now_s += 0.1
+        failures.recovered("streaming")
+        assert [*is_failing, failures.failing] == [True, False], hold_s
+        clock.now_s += pause_s
+
+
+def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptureFixture) -> None:
+    """The recovery of a hidden failure is hidden, too."""
+    failures = FailureLog(LOGGER, "lab")
+    for _ in range(100):
+        failures.failed("no router")
+        failures.recovered("connected")
+    assert levels(caplog) == ["WARNING", "INFO"] * MAX_REPEATS + ["DEBUG"] * 2 * (100 - MAX_REPEATS)
+
+
+def test_an_event_is_loud_some_times_in_five_minutes(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """The window slides: after it, as many are loud again as are older, and the next says what was hidden."""
+    events = EventLog(LOGGER, "lab")
+    begin_s = clock.now_s
+    for seconds in (0, 10, 20, 30, 40, 299.9, 300.0, 300.1, 310.0):
+        clock.now_s = begin_s + seconds
+        events.log(logging.WARNING, "renamed", "renamed")
+    events.log(logging.INFO, "changed", "changed")
+    hidden, loud = (
+        ("DEBUG", "lab: renamed"),
+        ("WARNING", "lab: renamed (1 more like this since the last one)"),
+    )
+    assert levels(caplog)[:MAX_REPEATS] == ["WARNING"] * 5
+    assert logged(caplog)[MAX_REPEATS:] == [hidden, loud, hidden, loud, ("INFO", "lab: changed")]
+    for _ in range(3):
+        events.log(logging.WARNING, "late", "late", most=1)
+    assert levels(caplog)[-3:] == ["WARNING", "DEBUG", "DEBUG"]
+
+
+@pytest.fixture
+def records() -> Iterator[list[logging.LogRecord]]:
+    """Collect the records that a handler with the filter receives."""
+    records: list[logging.LogRecord] = []
+    handler = logging.Handler()
+    handler.emit = records.append  # type: ignore[assignment, method-assign] # shorter than a class
+    handler.addFilter(ContextFilter())
+    LOGGER.addHandler(handler)
+    yield records
+    LOGGER.removeHandler(handler)
+
+
+def fields(record: logging.LogRecord) -> dict[str, str]:
+    return {name: getattr(record, name) for name in FIELDS if hasattr(record, name)}
+
+
+def test_records_have_the_fields_that_are_set_and_no_others(records: list[logging.LogRecord]) -> None:
+    """Blocks nest, and what they set ends with them."""
+    LOGGER.warning("before")
+    with log_fields(source="lab"):
+        with log_fields(stream="3d", peer="192.0.2.20:3020"):
+            LOGGER.warning("inside")
+        LOGGER.warning("outside")
+    LOGGER.warning("after")
+    inside = {"source": "lab", "stream": "3d", "peer": "192.0.2.20:3020"}
+    assert [fields(record) for record in records] == [{}, inside, {"source": "lab"}, {}]
+
+
+async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_them(
+    records: list[logging.LogRecord],
+) -> None:
+    """Two sources run in one loop, and their records must not be mixed up."""
+
+    async def run(source: str) -> None:
+        with log_fields(source=source):
+            asyncio.get_running_loop().call_soon(LOGGER.warning, "callback")
+            await asyncio.create_task(asyncio.sleep(0))
+            LOGGER.warning("task")
+
+    await asyncio.gather(run("hall"), run("lab"))
+    found = [(fields(record)["source"], record.getMessage()) for record in records]
+    assert sorted(found) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]
+
+
+def test_a_defect_is_an_error_with_its_traceback_once_for_each_place(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A defect that every frame meets is reported, and does not fill the disk."""
+    defects = DefectLog(LOGGER, "lab")
+    for text in ("one", "two", "3"):
+        try:
+            number = int(text)
+            [0, 1].remove(number)
+        except ValueError as defect:
+            defects.log(defect)
+    first, again, other = caplog.records
+    assert first.levelname == other.levelname == "ERROR"
+    assert first.message.startswith("lab: defect in the gateway: ValueError: invalid literal")
+    assert first.message.endswith("'one'; report this with the log")
+    assert first.exc_info is not None
+    assert (again.levelname, again.exc_info) == ("DEBUG", None)
+    assert again.message.endswith("'two'; report this with the log (again)")
+
+
+def test_a_log_of_defects_can_continue_a_former_one(caplog: pytest.LogCaptureFixture) -> None:
+    """After a reload of the configuration, known defects are still known."""
+    former = DefectLog(LOGGER, "lab")
+    logs = [former, DefectLog(LOGGER, "lab (3d)", former)]
+    for defects in logs:
+        try:
+            int("x")
+        except ValueError as defect:
+            defects.log(defect)
+    assert levels(caplog) == ["ERROR", "DEBUG"]
+    assert [defects.count for defects in logs] == [2, 2]

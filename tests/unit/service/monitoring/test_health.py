@@ -1,0 +1,285 @@
+"""/healthz and the status line for streams and outputs in every state."""
+
+import json
+import logging
+import time
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
+from gateway.logs.losses import Losses
+from gateway.outputs.contract import OutputHealth
+from gateway.outputs.memory import MemoryOutput
+from gateway.rtc3d.components import ComponentType
+from gateway.service.gateway import Gateway
+from gateway.service.monitoring.health import health_page, loss_lines, output_lines, source_line, status_lines
+from gateway.stream.process_clock import running_clock
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
+from tests.configurations import make_settings
+
+MARKERS, ANALOG, EVENT = ((ComponentType.MARKERS,), (ComponentType.ANALOG,), (ComponentType.EVENT,))
+STALL_TIMEOUT_S = 3.0
+
+
+class Lab:
+    """A gateway that is not running; the tests set the states."""
+
+    def __init__(self, *streams: StreamSettings) -> None:
+        self.output = MemoryOutput()
+        self.output.start()
+        source = SourceSettings(
+            name="lab", host="192.0.2.20", streams=streams, stall_timeout_s=STALL_TIMEOUT_S
+        )
+        settings = make_settings(sources=(source,), metrics=MetricsSettings(enabled=False))
+        self.gateway = Gateway(settings, [self.output])
+        self.statuses = self.gateway.sources[0].statuses
+
+    def health(self) -> tuple[int, dict[str, Any]]:
+        """Return the HTTP status and the JSON body."""
+        page = health_page(self.gateway)
+        assert page.content_type == "application/json"
+        return page.status, json.loads(page.body)
+
+    def line(self) -> str:
+        """Return the status line of the source."""
+        [line, *_] = status_lines(self.gateway)
+        return line
+
+    def problem(self) -> str:
+        """Return the problem of the only stream, and check that the HTTP status matches it."""
+        status, body = self.health()
+        [stream] = body["streams"]
+        assert (status, body["healthy"]) == ((503, False) if stream["problem"] else (200, True))
+        return str(stream["problem"])
+
+
+def set_state(status: StreamStatus, state: StreamState, age_s: float | None) -> None:
+    status.state = state
+    status.last_frame_s = None if age_s is None else running_clock().time() - age_s
+
+
+def lab_with(state: StreamState, age_s: float | None) -> Lab:
+    """Return a gateway with one stream, of markers, in this state."""
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], state, age_s)
+    return lab
+
+
+@pytest.mark.parametrize("state", StreamState)
+async def test_a_recent_frame_is_healthy_in_every_state_and_others_only_without_a_measurement(
+    state: StreamState,
+) -> None:
+    """The page turns unhealthy when the gateway gives up the stream, not later."""
+    lab = lab_with(state, STALL_TIMEOUT_S - 1)
+    assert lab.problem() == ""
+    for age_s, text in (
+        (STALL_TIMEOUT_S, "no frame for"),
+        (None, "no frame so far"),
+        (41.5, "no frame for 41.5 s"),
+    ):
+        set_state(lab.statuses[0], state, age_s)
+        assert lab.problem()[: len(text)] == ("" if state is StreamState.NO_MEASUREMENT else text)
+
+
+async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
+    lab = lab_with(StreamState.STREAMING, STALL_TIMEOUT_S - 0.5)
+    time.sleep(0.8)  # noqa: ASYNC251 - the process stands still
+    assert lab.problem() == ""
+
+
+async def test_the_problem_names_the_reason_and_what_to_check() -> None:
+    lab = lab_with(StreamState.CONNECTING, None)
+    assert lab.problem() == "no frame so far: connecting to 192.0.2.20:3020"
+    set_state(lab.statuses[0], StreamState.WAITING, 41.5)
+    lab.statuses[0].record_error("connection refused by 192.0.2.20:3020; is the RT server running?")
+    assert lab.problem() == (
+        "no frame for 41.5 s (limit 3 s): connection refused by 192.0.2.20:3020; is the RT server running?"
+    )
+    lab.statuses[0].state = StreamState.IDLE  # the last error is out of date in this state
+    assert "is a measurement running?" in lab.problem()
+
+
+async def test_only_an_idle_on_demand_stream_without_subscribers_needs_no_frames() -> None:
+    for on_demand in (True, False):
+        lab = Lab(StreamSettings(components=MARKERS, on_demand=on_demand))
+        set_state(lab.statuses[0], StreamState.IDLE, None)
+        assert lab.problem() != ""
+        lab.output.has_subscriber = False
+        assert (lab.problem() == "") == on_demand
+        lab.statuses[0].state = StreamState.WAITING
+        assert lab.problem() != ""
+
+
+async def test_a_stream_of_events_needs_no_recent_frame() -> None:
+    lab = Lab(StreamSettings(components=EVENT))
+    for state in (StreamState.IDLE, StreamState.STREAMING):
+        set_state(lab.statuses[0], state, None)
+        assert lab.problem() == ""
+    set_state(lab.statuses[0], StreamState.WAITING, None)
+    assert lab.problem() != ""
+
+
+async def test_one_unhealthy_stream_makes_the_gateway_unhealthy() -> None:
+    lab = Lab(StreamSettings(components=MARKERS), StreamSettings(components=ANALOG))
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    set_state(lab.statuses[1], StreamState.STALLED, 41.5)
+    status, body = lab.health()
+    assert status == 503
+    good, bad = body["streams"]
+    assert (good["source"], good["stream"], good["state"], good["problem"]) == ("lab", "3d", "streaming", "")
+    assert (bad["source"], bad["stream"], bad["state"]) == ("lab", "analog", "stalled")
+    assert bad["problem"]
+    assert bad["last_frame_age_s"] >= 41.5
+
+
+async def test_an_output_that_cannot_send_is_listed_with_its_problem() -> None:
+    lab = lab_with(StreamState.STREAMING, 0.01)
+    assert lab.health()[0] == 200
+    lab.output.close()
+    status, body = lab.health()
+    assert status == 503
+    assert body["healthy"] is False
+    assert body["outputs"] == [{"output": "memory", "problem": lab.output.health().problem}]
+
+
+async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200() -> None:
+    lab = lab_with(StreamState.STREAMING, 0.01)
+    status, body = lab.health()
+    assert (status, body["status"], body["reasons"], body["losses"]) == (200, "healthy", [], [])
+    for _ in range(436):
+        lab.statuses[0].frame_skipped(2)
+    lab.output.close()
+    lab.gateway.sources[0].fan_out.publish_status(b"status")
+    lab.output.start()
+    status, body = lab.health()
+    assert (status, body["status"], body["healthy"]) == (200, "degraded", True)
+    assert body["reasons"] == [
+        "lab (3d): lost in the last minute: 872 messages of 436 frames (skipped while behind)",
+        "lab to memory: lost in the last minute: 1 message (not open)",
+    ]
+    skipped, unsent = body["losses"]
+    assert skipped.pop("age_s") >= 0
+    assert skipped.pop("text").startswith("frames arrive late and are skipped")
+    expected: dict[str, Any] = {
+        "source": "lab",
+        "stream": "3d",
+        "output": None,
+        "cause": "skipped while behind",
+    }
+    expected |= {"messages": 872, "frames": 436, "messages_last_minute": 872, "frames_last_minute": 436}
+    assert skipped == expected
+    expected = {"source": "lab", "stream": None, "output": "memory", "cause": "not open"}
+    assert unsent.items() >= (expected | {"messages": 1, "frames": 0}).items()
+
+
+async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:
+    lab = lab_with(StreamState.STREAMING, 0.01)
+    now_s = 1000.0
+    lab.statuses[0].losses = Losses(logging.getLogger("tests"), "lab", lambda: now_s)
+    lab.statuses[0].frame_skipped(1)
+    now_s += 61
+    status, body = lab.health()
+    assert (status, body["status"], body["reasons"]) == (200, "healthy", [])
+    [loss] = body["losses"]
+    assert (loss["frames"], loss["frames_last_minute"], loss["age_s"]) == (1, 0, 61.0)
+
+
+async def test_a_problem_is_unhealthy_even_if_something_is_lost_and_comes_first() -> None:
+    lab = lab_with(StreamState.WAITING, None)
+    lab.statuses[0].frame_skipped(1)
+    status, body = lab.health()
+    assert (status, body["status"], body["healthy"]) == (503, "unhealthy", False)
+    assert [reason.partition(": ")[2][:8] for reason in body["reasons"]] == ["no frame", "lost in "]
+
+
+@pytest.mark.parametrize("age_s", [None, STALL_TIMEOUT_S + 1])
+async def test_frames_that_are_all_rejected_are_named(age_s: float | None) -> None:
+    lab = lab_with(StreamState.IDLE, age_s)
+    lab.statuses[0].frame_rejected("3d component of 40 bytes announces 4 items", 1)
+    text = "frames come, and all are rejected: 3d component of 40 bytes announces 4 items"
+    assert lab.problem() == text
+    assert lab.line().startswith(f"lab: {text}, lost in the last minute: 1 message of 1 frame")
+
+
+async def test_a_frame_that_is_rejected_among_others_is_only_loss() -> None:
+    lab = lab_with(StreamState.STREAMING, 0.01)
+    lab.statuses[0].frame_rejected("too short", 1)
+    assert lab.problem() == ""
+    assert lab.line() == (
+        "lab: streaming 0.0 Hz, lost in the last minute: 1 message of 1 frame (frame rejected)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("since_s", "is_problem"), [(STALL_TIMEOUT_S - 1, False), (STALL_TIMEOUT_S + 1, True)]
+)
+async def test_frames_without_a_component_of_the_stream_are_named(since_s: float, is_problem: bool) -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    [status] = lab.statuses
+    set_state(status, StreamState.STREAMING, since_s)
+    status.components_received("6d analog")
+    set_state(status, StreamState.STREAMING, 0.01)
+    status.components_received("6d analog")
+    text = (
+        "frames come, and none has a component of this stream (3d); the newest has 6d analog: "
+        "check the server's real-time output, and sources.streams"
+    )
+    assert lab.problem() == (text if is_problem else "")
+    assert lab.line() == f"lab: {text if is_problem else 'streaming 0.0 Hz'}"
+    status.components_received("")
+    assert lab.problem() == ""
+
+
+async def test_a_stream_of_events_needs_none_in_its_frames() -> None:
+    lab = Lab(StreamSettings(components=EVENT))
+    set_state(lab.statuses[0], StreamState.STREAMING, 41.5)
+    lab.statuses[0].components_received("3d")
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    assert lab.problem() == ""
+    assert lab.line() == "lab: streaming 0.0 Hz"
+
+
+# --- the status line
+
+
+LAB = SourceSettings(name="lab", host="192.0.2.9")
+STREAMS = tuple(StreamSettings(components=(each,)) for each in (ComponentType.MARKERS, ComponentType.ANALOG))
+TWO = SourceSettings(name="lab", host="192.0.2.9", streams=STREAMS)
+
+
+SERVER = "192.0.2.9:3020"
+
+
+@pytest.mark.parametrize(
+    ("state", "tries", "line"),
+    [
+        (StreamState.STREAMING, 0, "streaming 200.0 Hz"),
+        (StreamState.WAITING, 0, f"waiting for {SERVER}"),
+        (StreamState.WAITING, 1, f"waiting for {SERVER}, 1 try"),
+        (StreamState.CONNECTING, 12, f"waiting for {SERVER}, 12 tries"),
+        (StreamState.HANDSHAKING, 1, f"connected to {SERVER}, handshake in progress"),
+        (StreamState.IDLE, 0, f"connected to {SERVER}, no frames requested"),
+        (StreamState.NO_MEASUREMENT, 0, f"connected to {SERVER}, no measurement running"),
+        (StreamState.STALLED, 0, f"no frames from {SERVER}"),
+    ],
+)
+def test_every_state_has_a_text_that_streams_share(state: StreamState, tries: int, line: str) -> None:
+    streams = [(StreamStatus(name, state=state, tries=tries), 199.96) for name in ("3d", "analog")]
+    assert source_line(LAB, streams[:1]) == source_line(TWO, streams) == f"lab: {line}"
+
+
+def test_streams_with_different_texts_are_listed_by_components() -> None:
+    rates = {"3d": 200.0, "analog": 2000.0}
+    streams = [(StreamStatus(name, state=StreamState.STREAMING), rate_hz) for name, rate_hz in rates.items()]
+    assert source_line(TWO, streams) == "lab: 3d streaming 200.0 Hz, analog streaming 2000.0 Hz"
+
+
+def test_only_outputs_that_cannot_send_or_lose_something_have_a_line() -> None:
+    health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True, "was away")}
+    assert output_lines(health.items()) == ["zenoh: no router"]
+    losses = Losses(logging.getLogger("tests"), "lab to zenoh")
+    losses.lost("no router", "start it", messages=5)
+    lines = loss_lines({"lab to zenoh": losses.report(), "lab to lcm": []}.items())
+    assert lines == ["lab to zenoh: lost in the last minute: 5 messages of 1 frame (no router)"]

@@ -1,0 +1,321 @@
+"""The rules of §5.3.4 and §5.3.5 for recorded frames."""
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.packets import Packet, PacketType
+from gateway.rtc3d.parameters import AnalogChannel, Marker, Parameters, Parameters3D, ParametersAnalog
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from gateway.simulator.take_frames import RecordedFrames, TakePass
+from gateway.simulator.take_moments import Moment, RecordedParameters
+from gateway.takes.files.reader import TakeReader
+from tests.takes import START_UTIME, Message, description, markers, parameters, write_take
+from tests.unit.rtc3d_server.wire import WireComponent, components_in
+
+FIRST = b"<RT_Parameters><General><Name>first</Name></General></RT_Parameters>"
+SECOND = b"<RT_Parameters><General><Name>second</Name></General></RT_Parameters>"
+DEFAULT = RecordedParameters(b"<RT_Parameters/>")
+
+
+def read(
+    path: Path, messages: list[Message], first_utime: int | None = None, end_utime: int | None = None
+) -> tuple[list[Moment], TakePass]:
+    found = TakePass(TakeReader(write_take(path, messages)), "lab", first_utime, end_utime, DEFAULT)
+    return list(found.moments()), found
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "take.lcmlog"
+
+
+def test_moments_have_the_content_of_the_messages_from_byte_40_on(path: Path) -> None:
+    messages = [description(), *(markers(3, number) for number in range(5))]
+    moments, _ = read(path, messages)
+    assert [moment.contents[ComponentType.MARKERS] for moment in moments] == [
+        message[40:] for _, message in messages[1:]
+    ]
+    assert [moment.due_us for moment in moments] == [0, 10_000, 20_000, 30_000, 40_000]
+
+
+def test_only_the_chosen_source_and_range_are_read(path: Path) -> None:
+    """A range begins anywhere, and its end is not included."""
+    others = [description("other"), markers(3, 30, source="other")]
+    messages = [*others, *(markers(3, number) for number in range(100))]
+    moments, _ = read(path, messages, START_UTIME + 200_000, START_UTIME + 500_000)
+    assert [moment.timestamp_us for moment in moments] == list(range(200_000, 500_000, 10_000))
+    assert moments[0].due_us == 0
+
+
+def test_each_frame_has_the_parameters_that_were_valid(path: Path) -> None:
+    messages = [
+        markers(3, 0, version=0),
+        parameters(FIRST, 1),
+        markers(3, 1, version=1),
+        parameters(SECOND, 2),
+        markers(3, 2, version=1),  # arrived before the change
+        markers(3, 3, version=2),
+        parameters(SECOND, 2),  # repeated every few seconds
+        markers(3, 4, version=3),  # whose parameters are missing
+        parameters(b"", 4),  # void
+        markers(3, 5, version=4),
+    ]
+    moments, found = read(path, messages)
+    expected = [DEFAULT.xml, FIRST, FIRST, SECOND, SECOND, DEFAULT.xml]
+    assert [moment.parameters.xml for moment in moments] == expected
+    assert found.first_parameters is not None
+    assert found.first_parameters.xml == FIRST
+
+
+def test_a_thousand_versions_of_the_parameters_are_remembered_at_most(path: Path) -> None:
+    """A faulty server can change them all the time; the newest ones are kept."""
+    changes = [parameters(FIRST if number % 2 else SECOND, number) for number in range(1, 1600)]
+    moments, found = read(path, [*changes, markers(3, 0, version=1599), markers(3, 1, version=1)])
+    assert 500 <= len(found._versions) <= 1000
+    assert [moment.parameters.xml for moment in moments] == [FIRST, FIRST]
+    assert (min(found._versions), max(found._versions)) == (1001, 1599)
+
+
+@pytest.mark.parametrize("encoding", ["ISO-8859-1", "latin1", "UTF-8"])
+def test_xml_keeps_the_encoding_that_it_declares(path: Path, encoding: str) -> None:
+    xml = f'<?xml version="1.0" encoding="{encoding}"?><RT_Parameters><Größe/></RT_Parameters>'
+    messages = [parameters(xml.encode(), 1), markers(3, 0, version=1)]
+    [moment], _ = read(path, messages)
+    assert moment.parameters.xml == xml.encode(encoding)
+
+
+def test_malformed_messages_are_left_out_and_counted(path: Path) -> None:
+    channel, message = markers(3, 1)
+    parameters_channel, parameters_message = parameters(FIRST)
+    malformed = (message[:-1], message + b"\0", message[:52] + b"\xff" * 4 + message[56:], message[:20])
+    others = [(channel, each) for each in malformed] + [(parameters_channel, parameters_message[:-5])]
+    moments, found = read(path, [markers(3, 0), *others, markers(3, 2)])
+    assert ([moment.timestamp_us for moment in moments], found.num_malformed) == ([0, 20_000], 5)
+
+
+def test_a_capture_time_that_cannot_be_true_is_not_used(path: Path) -> None:
+    broken = [
+        (channel, message[:16] + bytes(8) + message[24:])
+        for channel, message in (markers(3, number, timestamp_us=0) for number in range(5))
+    ]
+    moments, _ = read(path, broken)
+    assert [moment.due_us for moment in moments] == [0, 10_000, 20_000, 30_000, 40_000]
+
+
+def test_a_thousand_layouts_are_read_as_they_are(path: Path) -> None:
+    messages = [markers(number % 1000, number) for number in range(2000)]
+    moments, found = read(path, messages)
+    assert [moment.contents[ComponentType.MARKERS] for moment in moments] == [
+        each[1][40:] for each in messages
+    ]
+    assert found.num_malformed == 0
+
+
+NONE = RecordedParameters(b"")
+_MARKERS = Parameters3D(100.0, markers=(Marker("1", "m"),))
+_ANALOG = ParametersAnalog((AnalogChannel("1", "a", frequency_hz=1000.0),))
+ANNOUNCED = RecordedParameters(encode_parameters(Parameters(markers=_MARKERS, analog=_ANALOG)))
+MEASURED = {ComponentType.MARKERS: 100.0, ComponentType.TOOLS: 100.0, ComponentType.ANALOG: 1000.0}
+SECOND_US = 1_000_000
+
+
+def moment(due_us: int, numbers: Mapping[str, int], parameters: RecordedParameters = NONE) -> Moment:
+    """Return a moment with components without items and with different frame numbers."""
+    contents = {}
+    for key, number in numbers.items():
+        content = struct.pack(">iqi", number, 7_000_000 + due_us, int(key == "event"))
+        event = struct.pack(">iqiii", number, due_us, -1, -1, -1) if key == "event" else b""
+        contents[COMPONENTS_BY_KEY[key]] = content + event
+    return Moment(due_us, 7_000_000 + due_us, parameters, contents)
+
+
+def lab(
+    seconds: float = 1.0, parameters: RecordedParameters = NONE, *, pause: tuple[float, float] = (0, 0)
+) -> list[Moment]:
+    """Return markers and tools at 100 Hz, analog at 1000 Hz; markers and tools pause from … to … (s)."""
+    moments = []
+    for number in range(round(seconds * 1000)):
+        numbers = {"analog": number + 1}
+        if number % 10 == 0 and not pause[0] <= number / 1000 < pause[1]:
+            numbers |= {"3d": number // 10 + 1, "6d": number // 10 + 1}
+        if number % 100 == 30:
+            numbers["event"] = number // 100 + 1
+        moments.append(moment(number * 1000, numbers, parameters))
+    return moments
+
+
+class Client:
+    """A client's session on recorded frames; the test sets the time."""
+
+    def __init__(self, moments: Iterable[Moment], *, is_end: bool = True, event_bytes: int = 24) -> None:
+        self.moments = list(moments)
+        self.event_bytes = event_bytes
+        self.elapsed_us = -SECOND_US
+        self.sources: list[RecordedFrames] = []
+        self._is_end = is_end
+        self.session = ClientSession(SessionCallbacks(self._frames, lambda _: b"", lambda: self.elapsed_us))
+
+    def _frames(self, components: Sequence[ComponentType]) -> RecordedFrames:
+        frames = RecordedFrames(components, self.event_bytes, MEASURED)
+        frames.add(self.moments, is_end=self._is_end)
+        self.sources.append(frames)
+        return frames
+
+    def send(self, text: str) -> None:
+        self.session.answer(Packet(PacketType.COMMAND, text.encode()))
+
+    def frames_until(self, seconds: float, byte_order: str = "big") -> list[list[WireComponent]]:
+        found = []
+        while self.elapsed_us < round(seconds * SECOND_US):
+            self.elapsed_us = min(self.elapsed_us + 500_000, round(seconds * SECOND_US))
+            for each in self.session.due_frames(self.elapsed_us):
+                body = each.packet[8:]
+                found.append(components_in(body, byte_order, event_bytes=self.event_bytes))  # type: ignore[arg-type]
+        return found
+
+
+def numbers(frames: list[list[WireComponent]]) -> list[dict[str, int]]:
+    """Return the frame number of each component in each frame."""
+    return [{ComponentType(each.type).key: each.frame_number for each in frame} for frame in frames]
+
+
+def only(key: str, frames: list[list[WireComponent]]) -> list[int]:
+    return [found[key] for found in numbers(frames) if key in found]
+
+
+def streamed(moments: Iterable[Moment], request: str, seconds: float = 1.0) -> list[list[WireComponent]]:
+    """Return the frames of a client that streams from the beginning."""
+    found = Client(moments)
+    found.send(f"StreamFrames {request}")
+    return found.frames_until(seconds)
+
+
+# Rates (§5.3.5) -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("parameters", [NONE, ANNOUNCED])
+def test_a_stream_has_the_rate_of_the_slowest_component(parameters: RecordedParameters) -> None:
+    frames = streamed(lab(1, parameters), "3D Analog")
+    assert numbers(frames) == [{"3d": k + 1, "analog": 10 * k + 1} for k in range(100)]
+
+
+def test_contents_are_sent_as_recorded() -> None:
+    event = WireComponent(5, 1, 7_030_000, [(1, 30_000, -1, -1, -1)])
+    others = [WireComponent(kind, number, 7_030_000, []) for kind, number in ((1, 4), (4, 4), (2, 31))]
+    assert streamed(lab(0.05), "All")[3] == [*others, event]
+
+
+def test_a_component_that_is_missing_in_some_frames_costs_the_others_nothing() -> None:
+    moments = [moment(k * 10_000, {"3d": k} if k % 3 else {"3d": k, "6d": k}, ANNOUNCED) for k in range(90)]
+    frames = streamed(moments, "3D 6D", 2)
+    assert (only("3d", frames), only("6d", frames)) == (list(range(90)), list(range(0, 90, 3)))
+
+
+def test_while_the_slowest_component_pauses_or_has_not_begun_the_next_one_sets_the_rate() -> None:
+    frames = streamed(lab(1, pause=(0.3, 0.7)), "3D 6D Analog", 2)
+    assert only("3d", frames) == [*range(1, 31), *range(71, 101)]
+    assert [each for each in only("analog", frames) if 300 < each <= 700] == list(range(316, 677))
+    frames = streamed(lab(1, pause=(0, 0.5)), "All")
+    assert only("3d", frames) == list(range(51, 101))
+    assert only("analog", frames)[:400] == list(range(1, 401))
+
+
+@pytest.mark.parametrize("batch", [1, 7, 200])
+def test_the_frames_do_not_depend_on_how_much_is_read_at_once(batch: int) -> None:
+    moments = lab(1, pause=(0.3, 0.7))
+    pieces = Client([], is_end=False)
+    pieces.send("StreamFrames All")
+    for start in range(0, len(moments), batch):
+        pieces.sources[0].add(moments[start : start + batch], is_end=start + batch >= len(moments))
+    assert pieces.frames_until(2) == streamed(moments, "All", 2)
+
+
+def test_a_pass_is_played_to_its_end_and_not_into_the_next_one() -> None:
+    client = Client(lab(0.1))
+    client.send("StreamFrames 3D Analog")
+    client.sources[0].add([moment(100_000, {"3d": 1})], is_end=True)
+    assert numbers(client.frames_until(1))[-1] == {"3d": 1}
+    # Nothing follows that could set the rate, so the last samples must not wait for it.
+    assert only("analog", streamed(lab(0.1, pause=(0.05, 0.1)), "3D Analog"))[-30:] == list(range(71, 101))
+
+
+def test_a_frequency_counts_from_the_rate_that_was_recorded_not_the_announced_one() -> None:
+    moments = [moment(k * 20_000, {"3d": k}, ANNOUNCED) for k in range(50)]
+    assert only("3d", streamed(moments, "Frequency:25 3D")) == list(range(0, 50, 2))
+
+
+def test_frames_become_due_as_they_become_known() -> None:
+    moments = lab(2)
+    client = Client(moments[:500], is_end=False)
+    client.send("StreamFrames 3D Events")
+    frames = client.frames_until(1)
+    assert {client.session.due_us} == {None}
+    client.sources[0].add(moments[500:], is_end=True)
+    assert client.session.due_us == 500_000
+    assert only("3d", frames + client.frames_until(2)) == list(range(1, 201))
+
+
+def test_frames_that_nobody_takes_for_three_seconds_are_dropped_but_not_their_events() -> None:
+    client = Client(lab(10))
+    client.send("StreamFrames 3D Events")
+    client.elapsed_us = 9_500_000
+    frames = client.frames_until(10)
+    assert (only("3d", frames)[0], client.session.frames_dropped) == (702, 701)
+    assert [event[0] for event in frames[0][1].items] == list(range(1, 71))
+    # Only some seconds of a take are in memory, and a client that sleeps longer is told its loss.
+    client = Client(lab(20))
+    client.send("StreamFrames Analog")
+    client.sources[0].forget(10 * SECOND_US)
+    client.elapsed_us = 10 * SECOND_US + 500_000
+    assert only("analog", client.frames_until(11))[0] == 10_001
+    assert client.session.frames_dropped == 10_000
+
+
+# Events and SendCurrentFrame (§5.3.4) -------------------------------------------------------
+
+
+def test_old_events_are_forgotten_except_for_some_thousands() -> None:
+    """They are kept for clients that are late, but a take may have millions."""
+    client = Client([moment(k * 1000, {"event": k}) for k in range(5000)])
+    client.send("StreamFrames")
+    [source] = client.sources
+    source.forget(3 * SECOND_US)
+    assert len(source._events) == 5000
+    source.forget(5 * SECOND_US)
+    assert len(source._events) == len(source._event_times_us) == 4096
+    assert source._event_times_us[0] == 904_000
+
+
+@pytest.mark.parametrize("requested", ["All", "Frequency:7 3D Events", "FrequencyDivisor:33 Events"])
+def test_each_event_is_sent_once_with_a_frame(requested: str) -> None:
+    frames = streamed(lab(10), requested, 10)
+    sent = [event[0] for frame in frames for each in frame if each.type == 5 for event in each.items]
+    assert sent == list(range(1, len(sent) + 1))
+    assert len(sent) >= 95
+
+
+def test_events_after_the_last_frame_are_sent_too_and_a_take_may_have_nothing_else() -> None:
+    assert numbers(streamed([*lab(0.1), moment(105_000, {"event": 9})], "3D Events"))[-1] == {"event": 9}
+    moments = [moment(k * 500_000, {"event": k}) for k in range(5)]
+    assert numbers(streamed(moments, "", 3)) == [{"event": k} for k in range(5)]
+
+
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+def test_events_can_have_16_bytes(byte_order: str) -> None:
+    client = Client(lab(0.1), event_bytes=16)
+    client.send(f"SetByteOrder {byte_order}Endian")
+    client.send("StreamFrames Events")
+    assert client.frames_until(1, byte_order) == [[WireComponent(5, 1, 7_030_000, [(1, -1, -1, -1)])]]
+
+
+def test_the_current_frame_of_what_the_take_lacks_is_empty() -> None:
+    """A request must not wait for ever; the tests of the session prove everything else about requests."""
+    client = Client(lab(1))
+    client.elapsed_us = 123_456
+    client.send("SendCurrentFrame Force")
+    assert client.frames_until(0.5) == [[]]

@@ -1,0 +1,113 @@
+"""What is the same in all formats: files, sources, times, and takes without anything to export."""
+
+import csv
+import re
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from gateway.errors import TakeError
+from gateway.rtc3d.components import ComponentType
+from gateway.takes.export.extensions import EXTENSIONS
+from gateway.takes.export.formats import FORMATS
+from tests.recorded_scenes import scene_messages
+from tests.takes import START_UTIME, Message, description, frame, markers, parameters
+from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled
+from tests.unit.takes.export.test_trc import read_trc
+
+ANALOG = frame(ComponentType.ANALOG, [1, 2])
+EVENT = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
+
+
+def test_every_extension_has_a_format() -> None:
+    """The command line lists what the module of formats, which is slow to import, can do."""
+    assert tuple(FORMATS) == EXTENSIONS
+
+
+@pytest.mark.parametrize("end", [".c3d", ".trc", "-3d.csv"])
+def test_each_source_is_a_file_unless_one_is_chosen(tmp_path: Path, end: str) -> None:
+    extension = end.removeprefix("-3d")
+    messages = [description("left"), description("right")]
+    messages += [markers(2, number, source=source) for number in range(5) for source in ("left", "right")]
+    job = export_messages(tmp_path, messages, f"walk{extension}")
+    assert [path.name for path in job.files.paths] == [f"walk-left{end}", f"walk-right{end}"]
+    job = export_messages(tmp_path, messages, f"one{extension}", source="right")
+    assert [path.name for path in job.files.paths] == [f"one{end}"]
+
+
+@pytest.mark.parametrize(
+    ("extension", "messages", "options", "problem"),
+    [
+        (".c3d", [EVENT], {}, r"has no markers, analog channels or forces, and \.c3d holds nothing"),
+        (".trc", [ANALOG], {}, r"take\.lcmlog has no markers, and \.trc holds nothing else"),
+        (".trc", [markers(1)], {"from_s": 5.0}, "has no markers between --from and --to"),
+        (".csv", [description(), labelled("a")], {}, "has no frames"),
+        (
+            ".csv",
+            [description(), markers(1)],
+            {"source": "studio"},
+            "no source 'studio'; its sources are: lab",
+        ),
+        (".mcap", [description(), labelled("a")], {}, "has no frames"),
+        (".mcap", [description(), labelled("a")], {"from_s": 0.0, "to_s": 1.0}, "has no frames"),
+    ],
+)
+def test_a_take_without_anything_to_export_is_an_error(
+    tmp_path: Path, extension: str, messages: list[tuple[str, bytes]], options: dict[str, float], problem: str
+) -> None:
+    with pytest.raises(TakeError, match=problem):
+        export_messages(tmp_path, messages, f"walk{extension}", **options)
+    assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
+
+
+BEGIN = "2023-11-14T22:13:20"  # START_UTIME
+OFFSET_S = 2.5
+"""From the beginning of the take to the first frame, with the 3 ms that a frame takes to arrive."""
+
+
+def messages() -> list[Message]:
+    """Return a take whose frames begin 2.5 s after its first message; the first has a time 40 ms too late.
+
+    Analog begins 0.5 s later, so a C3D file does.
+    """
+
+    def keep(component: ComponentType, sample: int) -> bool:
+        return component is ComponentType.MARKERS or (component is ComponentType.ANALOG and sample >= 500)
+
+    first, *others = scene_messages(SCENE, 300, start_us=2_499_000, keep=keep)
+    late = (int.from_bytes(first[1][16:24], "big") + 40_000).to_bytes(8, "big")
+    return [
+        description(),
+        parameters(SCENE.parameters),
+        (first[0], first[1][:16] + late + first[1][24:]),
+        *others,
+    ]
+
+
+def test_trc_and_csv_count_from_the_beginning_of_the_take(tmp_path: Path) -> None:
+    export_messages(tmp_path, messages(), "walk.trc")
+    export_messages(tmp_path, messages(), "walk.csv")
+    with (tmp_path / "walk-3d.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    expected_s = [float(row["time_s"]) for row in rows]
+    found_s = read_trc(tmp_path / "walk.trc").times_s
+    assert found_s[0] == pytest.approx(OFFSET_S, abs=0.001)
+    assert found_s[1:] == pytest.approx(expected_s[1:], abs=0.001)
+    assert {round(float(row["capture_utime"]) - 1e6 * float(row["time_s"])) for row in rows} == {START_UTIME}
+    head = (tmp_path / "walk.trc").read_text().splitlines()[0].split("\t")
+    assert head[3] == f"walk.trc time_0={BEGIN}.000000Z"
+
+
+@pytest.mark.parametrize(("from_s", "first"), [(None, OFFSET_S + 0.5), (4.0, 4.0)])
+def test_a_c3d_file_counts_from_its_first_frame_and_says_when_that_was(
+    tmp_path: Path, from_s: float | None, first: float
+) -> None:
+    notes = export_messages(tmp_path, messages(), "walk.c3d", from_s=from_s).notes
+    found = C3d(tmp_path / "walk.c3d")
+    assert found("TRIAL", "TIME_OFFSET") == pytest.approx([first], abs=0.01)
+    [text] = found("TRIAL", "DATE_TIME")
+    later = datetime.fromisoformat(text) - datetime.fromisoformat(f"{BEGIN}Z")
+    assert later.total_seconds() == pytest.approx(first, abs=0.01)
+    pattern = rf"walk\.c3d: time 0 is its first frame, {first:.1f}\d\d s after .* \({text}\)"
+    assert sum(bool(re.fullmatch(pattern, note)) for note in notes) == 1

@@ -1,0 +1,93 @@
+"""Files that have their names only when they are complete, all or none of them."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from gateway.errors import TakeError
+from gateway.takes.files.new_file import NewFiles
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_file_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
+    with NewFiles() as files:
+        files.create(tmp_path / "walk.csv").write(b"complete")
+        assert "walk.csv" not in names(tmp_path)
+        assert {Path(name).suffix for name in names(tmp_path)} == {".csv"}
+    assert names(tmp_path) == {"walk.csv"}
+    assert (tmp_path / "walk.csv").read_bytes() == b"complete"
+    assert files.paths == [tmp_path / "walk.csv"]
+
+
+def create(folder: Path, error: BaseException | None = None, *, appears: bool = False) -> None:
+    """Write two files; fail, or let another program create the second one meanwhile."""
+    with NewFiles() as files:
+        for number in (1, 2):
+            files.create(folder / f"walk-{number}.c3d").write(b"x")
+        if error is not None:
+            raise error
+        if appears:
+            (folder / "walk-2.c3d").write_bytes(b"mine")
+
+
+@pytest.mark.parametrize(
+    ("error", "problem"),
+    [
+        (ValueError("defect"), "defect"),
+        (KeyboardInterrupt("stop"), "stop"),
+        (
+            OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+            "walk-2.c3d cannot be written: No space left on device",
+        ),
+    ],
+)
+def test_an_error_leaves_none_of_several_files(tmp_path: Path, error: BaseException, problem: str) -> None:
+    expected = TakeError if isinstance(error, OSError) else type(error)
+    with pytest.raises(expected, match=problem):
+        create(tmp_path, error)
+    assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize("target", ["file", "folder", "dangling link"])
+def test_what_exists_is_not_replaced(tmp_path: Path, target: str) -> None:
+    path = tmp_path / "walk-1.c3d"
+    match target:
+        case "file":
+            path.write_bytes(b"mine")
+        case "folder":
+            path.mkdir()
+        case _:
+            path.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(TakeError, match=r"walk-1.c3d exists already.*nothing is overwritten"):
+        create(tmp_path)
+    assert names(tmp_path) == {"walk-1.c3d"}
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced_and_none_of_the_others_remains(tmp_path: Path) -> None:
+    with pytest.raises(TakeError, match="exists already"):
+        create(tmp_path, appears=True)
+    assert names(tmp_path) == {"walk-2.c3d"}
+    assert (tmp_path / "walk-2.c3d").read_bytes() == b"mine"
+
+
+def test_a_folder_that_is_missing_is_a_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(TakeError, match=r"nowhere/walk-1.c3d cannot be written: No such file"):
+        create(tmp_path / "nowhere")
+
+
+def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_links(*_: object) -> None:
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "link", no_links)
+    (tmp_path / "other").mkdir()
+    create(tmp_path / "other")
+    assert names(tmp_path / "other") == {"walk-1.c3d", "walk-2.c3d"}
+    with pytest.raises(TakeError, match="exists already"):
+        create(tmp_path, appears=True)
+    assert names(tmp_path) == {"other", "walk-2.c3d"}
