@@ -16,7 +16,7 @@ from gateway.errors import ConfigError
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.service.gateway import Gateway
 from gateway.service.monitoring.health import status_lines
-from gateway.service.monitoring.process_limits import ProcessLimits, raise_file_limit
+from gateway.service.monitoring.process_limits import ProcessLimits, limit_arenas, raise_file_limit
 from gateway.service.monitoring.server import MonitoringServer
 from gateway.service.process_end import Signals, named_tasks
 from gateway.workers import WorkerThread
@@ -84,6 +84,7 @@ async def serve(load: Callable[[], Settings], every_second: Callable[[], None] =
     Raises ConfigError if the settings cannot be used at the start.
     """
     raise_file_limit()
+    limit_arenas()
     daemon = Daemon(load, Gateway(load()), every_second)
     in_loop = asyncio.get_running_loop().call_soon_threadsafe
     Signals(lambda: in_loop(daemon.request_stop), lambda: in_loop(daemon.hang_up), daemon.unfinished)

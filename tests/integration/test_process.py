@@ -3,6 +3,7 @@
 tests/systemd runs it under a real systemd.
 """
 
+import itertools
 import json
 import os
 import pty
@@ -89,6 +90,27 @@ def test_sighup_reloads_while_the_terminal_exists_and_stops_the_gateway_when_it_
         os.close(terminal)
         process.send_signal(signal.SIGHUP)  # the kernel sends it to the processes that the terminal controls
         assert process.wait(STOP_S) == 0
+
+
+# Memory --------------------------------------------------------------------------------------
+
+ARENA_BYTES: Final = 64 << 20
+"""The address space that glibc reserves for the arena of a thread, and its alignment."""
+
+
+def num_thread_arenas(pid: int) -> int:
+    """Count the arenas beside the main one: pairs of used and reserved memory of that size."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    ranges = [[int(end, 16) for end in line.split()[0].split("-")] for line in lines]
+    return sum(
+        used[0] % ARENA_BYTES == 0 and used[1] == reserved[0] and reserved[1] - used[0] == ARENA_BYTES
+        for used, reserved in itertools.pairwise(ranges)
+    )
+
+
+def test_all_threads_share_one_arena_beside_the_main_one(site: Site) -> None:
+    with site.running() as process:
+        assert num_thread_arenas(process.pid) == 1
 
 
 # File descriptors ----------------------------------------------------------------------------
