@@ -145,8 +145,11 @@ def follow(document: str, folder: Path, terminals: dict[str, Terminal]) -> int:
     steps = blocks(document)
     num_commands = 0
     for step, block in enumerate(steps):
-        if block.language in {"yaml", "python"} and block.title:
-            (folder / block.title).write_text(block.text)
+        if block.language in {"yaml", "python", "toml"} and block.title:
+            file = folder / block.title
+            assert not file.is_symlink(), f"{block.place} would overwrite a file of the repository"
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(block.text)
         elif block.language == "sh" and block.title:
             command = block.text.strip()
             assert "\n" not in command, "a block must hold one command, because its output follows"

@@ -8,6 +8,7 @@ found and what is expected. ``gateway.config.loading`` adds file, line and colum
 import os
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
@@ -21,6 +22,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.json_schema import SkipJsonSchema
 
 from gateway.config.section import Effective, Section, expects, validation_error
 from gateway.config.transform import TransformSettings
@@ -398,10 +400,22 @@ class Settings(Section):
         return self
 
 
-def settings_model(outputs: Mapping[str, type[OutputSettings]]) -> type[Settings]:
-    """Return the model of the whole configuration with these outputs, by the name of their section."""
+def settings_model(
+    outputs: Mapping[str, type[OutputSettings]], unusable: Mapping[str, str] | None = None
+) -> type[Settings]:
+    """Return the model of the whole configuration with these outputs, by the name of their section.
+
+    A section with one of the names in ``unusable`` is refused with the text there.
+    """
     sections: dict[str, Any] = {
         name: (section, Field(default=section(), description=f"The output {name}."))
         for name, section in outputs.items()
     }
+    for name, text in (unusable or {}).items():
+        refuse = PlainValidator(partial(_refuse, text))
+        sections[name] = (Annotated[SkipJsonSchema[None], refuse], Field(default=None, exclude=True))  # type: ignore[misc]
     return create_model("Settings", __base__=Settings, __doc__="The whole configuration.", **sections)
+
+
+def _refuse(text: str, _section: object) -> None:
+    raise validation_error(text)

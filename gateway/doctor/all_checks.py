@@ -13,7 +13,7 @@ from gateway.doctor.source_checks import CHECKS, SourceChecks
 from gateway.errors import ConfigError
 from gateway.outputs.findings import NO_CONFIGURATION, Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.kind import OPENS, OutputKind
-from gateway.outputs.registry import OUTPUTS
+from gateway.outputs.registry import OUTPUTS, UNUSABLE
 from gateway.workers import WorkerThread
 
 _POLL_S: Final = 0.05
@@ -96,6 +96,9 @@ async def run_checks(
         check = partial(check_output, OUTPUTS[name], section, names, loads, seconds)
         for finding in await WorkerThread(name).run(check):
             yield finding
+    for name, text in UNUSABLE.items():
+        found, _, remedy = text.rpartition("; ")
+        yield Subject(name).warning("package", found, as_sentence(remedy))
     leaving = [name for name in enabled if OUTPUTS[name].leaves_host(settings.outputs[name])]
     yield check_clock(leaving)
 

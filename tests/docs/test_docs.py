@@ -88,8 +88,9 @@ def test_relative_links_point_to_files(document: str) -> None:
     assert [link for link in relative if not (path.parent / link).exists()] == []
 
 
-@of(all_blocks("yaml"))
+@of([block for block in all_blocks("yaml") if block.document != "docs/how-to/write-an-output.md"])
 def test_yaml_is_what_a_program_takes(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file for an output of another package is in use in test_how_to."""
     for name, value in variables_behind(block):
         monkeypatch.setenv(name, value)
     content = yaml.safe_load(block.text)

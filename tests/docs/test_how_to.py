@@ -1,7 +1,10 @@
 """Type the commands of the tutorial and of each how-to that needs no server, and compare the output."""
 
+import shutil
 import socket
 import struct
+import sysconfig
+import venv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -11,6 +14,7 @@ import zenoh
 
 from gateway.takes.files.reader import TakeReader
 from tests.documents import ROOT
+from tests.fresh_clones import pip_environment
 from tests.terminals import Terminal, folder, follow, terminals
 from tests.unit.takes.export.exported import read_ezc3d
 from tests.unit.takes.export.read_mcap import read_mcap
@@ -86,6 +90,23 @@ def test_every_command_of_use_takes_prints_the_output_on_the_page(
     assert {"/lab/markers", "/lab/tools", "/lab/forces"} < read_mcap(folder / "walk.mcap").topics.keys()
     components = sorted(path.name for path in folder.glob("walk-*.csv"))
     assert components == [f"walk-{key}.csv" for key in ("3d", "6d", "analog", "event", "force")]
+
+
+@pytest.mark.wheelhouse
+def test_the_output_of_a_package_of_ones_own_works_as_on_the_page(
+    folder: Path, terminals: dict[str, Terminal], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The package goes to a virtual environment that sees the gateway and what it needs."""
+    for name, value in pip_environment().items():
+        monkeypatch.setenv(name, value)
+    shutil.rmtree(folder / ".venv")
+    venv.create(folder / ".venv", symlinks=True, with_pip=True)
+    [packages] = (folder / ".venv").glob("lib/python*/site-packages")
+    (packages / "gateway.pth").write_text(f"{ROOT}\n{ROOT / 'lcm_types'}\n{sysconfig.get_path('purelib')}\n")
+    program = folder / ".venv/bin/rtc3d-gateway"
+    program.write_text(f"#!{folder}/.venv/bin/python\nfrom gateway.__main__ import main\nmain()\n")
+    program.chmod(0o755)
+    assert follow("docs/how-to/write-an-output.md", folder, terminals) == 6
 
 
 FRAME_12: Final = "frame 12: 23 of 24 markers in view\nframe 13: 24 of 24 markers in view\n"

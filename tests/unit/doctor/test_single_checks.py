@@ -13,6 +13,7 @@ from gateway.doctor.computer_checks import check_receive_buffer
 from gateway.doctor.gateway_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.observation import ObservedStream
 from gateway.outputs.findings import Finding, Result, Subject
+from gateway.outputs.kind import OPENS
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
@@ -207,6 +208,7 @@ def test_the_guide_lists_every_check_in_order() -> None:
         *gateway_checks.CHECKS,
         *source_checks.CHECKS,
         *(check for kind in OUTPUTS.values() for check in kind.checks),
+        OPENS,
         "clock",
     ]
     assert [check for check in checks if check != "check"] == expected
