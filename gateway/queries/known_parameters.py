@@ -108,31 +108,43 @@ Publishes them, and then marks the frames that follow with the version.
 """
 
 
+class QueryHistory:
+    """What queries about a source continue when the source is built again, after a reload or a defect.
+
+    See KnownParameters and Recordings.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.events = EventLog(logger, source)
+        self.newest: ServerAnswer | None = None
+        self.version = 0
+        self.is_named_recording = False
+        self.end_of_recording: asyncio.Task[None] | None = None
+
+
 class KnownParameters:
     """The newest parameters of one source's server.
 
     ``xml_thread`` parses them. The version grows by one whenever they mean something else than before, when
     they become void, and when another frame of poses goes with them.
-    ``former`` are those of the source before a reload, which are continued.
     """
 
-    def __init__(
-        self,
-        source: str,
-        xml_thread: XmlThread,
-        announce: Announce,
-        former: "KnownParameters | None" = None,
-    ) -> None:
-        self._events: EventLog = EventLog(logger, source)
-        if former is not None:
-            self._events = former._events  # noqa: SLF001 - of the same class
+    def __init__(self, history: QueryHistory, xml_thread: XmlThread, announce: Announce) -> None:
+        self._history = history
+        self._events = history.events
         self._xml_thread = xml_thread
         self._announce = announce
         self._lock = asyncio.Lock()  # for one change at a time
-        self.newest: ServerAnswer | None = None if former is None else former.newest
+
+    @property
+    def newest(self) -> ServerAnswer | None:
         """The newest answer for all sections; None before the first, and while the former ones are void."""
-        self.version: int = 0 if former is None else former.version
+        return self._history.newest
+
+    @property
+    def version(self) -> int:
         """The version of ``newest``; 0 before the first."""
+        return self._history.version
 
     @property
     def is_void(self) -> bool:
@@ -148,9 +160,9 @@ class KnownParameters:
             before = self.newest
             reading = await self._xml_thread.process(xml, lambda xml: _read(xml, before))
             if reading.is_changed:
-                self.version += 1
+                self._history.version += 1
                 self._log_change(reading, is_first=before is None)
-            self.newest = answer = ServerAnswer((), xml, reading.parsed, session, self.version)
+            self._history.newest = answer = ServerAnswer((), xml, reading.parsed, session, self.version)
             if reading.is_changed or announce_always:
                 await self._announce(answer, self.version)
             return answer
@@ -159,15 +171,15 @@ class KnownParameters:
         """Announce the newest parameters again, for a new connection to the same server."""
         async with self._lock:
             if self.newest is not None:
-                self.newest = replace(self.newest, session=session)
+                self._history.newest = replace(self.newest, session=session)
                 await self._announce(self.newest, self.version)
 
     async def begin_version(self) -> None:
         """Announce the parameters as another version, because they go with another frame of poses now."""
         async with self._lock:
-            self.version += 1
+            self._history.version += 1
             if self.newest is not None:
-                self.newest = replace(self.newest, version=self.version)
+                self._history.newest = replace(self.newest, version=self.version)
             await self._announce(self.newest, self.version)
 
     async def make_void(self, reason: str) -> None:
@@ -175,8 +187,8 @@ class KnownParameters:
         async with self._lock:
             if self.newest is None:
                 return
-            self.newest = None
-            self.version += 1
+            self._history.newest = None
+            self._history.version += 1
             self._events.log(
                 logging.WARNING,
                 f"the server gives no parameters any more: {reason}; the former names and units are void "

@@ -25,6 +25,7 @@ from gateway.logs.failures import DefectLog, FailureLog
 from gateway.queries.known_parameters import (
     Announce,
     KnownParameters,
+    QueryHistory,
     Sections,
     ServerAnswer,
     now_s,
@@ -117,7 +118,6 @@ class ParameterCache:
     """The answers to SendParameters. ``known`` has the newest for all sections; ``announce`` gets changes.
 
     ``xml_thread`` processes all XML of the source.
-    ``former`` is the cache of the source before a reload.
     """
 
     def __init__(
@@ -125,14 +125,12 @@ class ParameterCache:
         settings: SourceSettings,
         requests: ServerRequests,
         announce: Announce,
-        former: "ParameterCache | None" = None,
+        history: QueryHistory,
     ) -> None:
         self._settings = settings
         self._requests = requests
         self.xml_thread: XmlThread = XmlThread(settings.name)
-        self.known: KnownParameters = KnownParameters(
-            settings.name, self.xml_thread, announce, None if former is None else former.known
-        )
+        self.known: KnownParameters = KnownParameters(history, self.xml_thread, announce)
         # On one of these, the server gave the newest parameters. The others share them.
         self._connections: list[Connection] = []
         self._refusing: Connection | None = None  # one of these, on which the server refused them later on

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 from gateway.config.settings import SourceSettings
 from gateway.errors import CommandError, GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
 from gateway.logs.failures import DefectLog
+from gateway.queries.known_parameters import QueryHistory
 from gateway.rtc3d.commands import Command, ControlRecording, recording_duration_s, recording_options
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
@@ -169,8 +170,6 @@ class Recordings:
     (field note 16), and with commands that can (field notes 18 and 26). Without a name, the packet is sent,
     which gets no reply. With a name, the command is sent, and the packet if the server does not accept the
     command. With options, only the command is sent: without them, it would be another recording.
-
-    ``before`` are the recordings of the source that this one replaces after a reload.
     """
 
     def __init__(
@@ -178,14 +177,13 @@ class Recordings:
         source: str,
         requests: ServerRequests,
         access: RecordingAccess,
-        before: "Recordings | None" = None,
+        history: QueryHistory,
     ) -> None:
         self._source = source
         self._requests = requests
         self._access = access
-        # Whether the command started the recording, and what waits for the end of its duration.
-        self._is_named: bool = False if before is None else before._is_named  # noqa: SLF001 - the same class
-        self._ending: asyncio.Task[None] | None = None if before is None else before._ending  # noqa: SLF001
+        self._history = history
+        """Has whether the command started the recording, and what waits for the end of its duration."""
         self._lock = asyncio.Lock()
 
     async def start(self, name: str, options: str = "") -> Done:
@@ -204,10 +202,12 @@ class Recordings:
         async with self._lock:
             self._check_connected()
             self._forget_duration()
-            reply = await self._ask(ControlRecording(start=False)) if self._is_named else None
+            reply = (
+                await self._ask(ControlRecording(start=False)) if self._history.is_named_recording else None
+            )
             if reply is None:
                 self._send(start=False)
-            self._is_named = False
+            self._history.is_named_recording = False
             content = {"source": self._source, "sent": "stop", **await self._access.follow(False, "")}
             return content, reply or ""
 
@@ -219,7 +219,7 @@ class Recordings:
             reply = None
             if options:
                 reply = await self._ask(ControlRecording(start=True, options=options), must=needs_command)
-            self._is_named = reply is not None
+            self._history.is_named_recording = reply is not None
             if reply is None:
                 self._send(start=True)
         except QueryError:
@@ -229,7 +229,7 @@ class Recordings:
         if reply is not None:
             name = recording_options(reply).get("file") or name  # the server may use another one
             self._limit_following(options)
-        named = {"name": name, "is_named": self._is_named} if name else {}
+        named = {"name": name, "is_named": self._history.is_named_recording} if name else {}
         return {"source": self._source, "sent": "start", **named, **await following}, reply or ""
 
     async def _ask(self, command: ControlRecording, *, must: bool = False) -> str | None:
@@ -243,7 +243,7 @@ class Recordings:
             _, packet = await self._requests.send(command)
         except QueryError as error:
             # A command without an answer may have been carried out. If so, a command has to stop it.
-            self._is_named = self._is_named or error.code == "timeout"
+            self._history.is_named_recording = self._history.is_named_recording or error.code == "timeout"
             if must or error.code not in _NOT_ACCEPTED:
                 raise
             return None
@@ -262,16 +262,18 @@ class Recordings:
         with contextlib.suppress(CommandError):  # the server may know more units
             duration_s = recording_duration_s(options)
             if duration_s is not None:
-                self._ending = asyncio.create_task(self._end_following(duration_s + _FOLLOW_S))
+                self._history.end_of_recording = asyncio.create_task(
+                    self._end_following(duration_s + _FOLLOW_S)
+                )
 
     async def _end_following(self, after_s: float) -> None:
         await asyncio.sleep(after_s)
         await self._access.follow(False, "")
 
     def _forget_duration(self) -> None:
-        if self._ending is not None:
-            self._ending.cancel()
-            self._ending = None
+        if self._history.end_of_recording is not None:
+            self._history.end_of_recording.cancel()
+            self._history.end_of_recording = None
 
 
 def _start_options(name: str, options: str) -> str:

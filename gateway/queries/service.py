@@ -18,7 +18,7 @@ from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
 from gateway.queries.answers import JsonPayload, NewestJson, message_answer, schema_answer
-from gateway.queries.known_parameters import Announce
+from gateway.queries.known_parameters import Announce, QueryHistory
 from gateway.queries.parameter_cache import ParameterCache
 from gateway.queries.questions import (
     RECORDING,
@@ -47,8 +47,7 @@ class SourceQueries:
 
     ``newest_message`` returns the newest message of a component as the output of a name numbers it.
     ``last_c3d`` raises QueryError if there is no file. ``announce_parameters`` takes the server's parameters
-    when they change. ``before`` are the queries of the source that this one replaces after a reload; its
-    parameters continue.
+    when they change.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class SourceQueries:
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
         recording: RecordingAccess,
         announce_parameters: Announce,
-        before: "SourceQueries | None" = None,
+        history: QueryHistory,
     ) -> None:
         self.settings = settings
         """A reload can replace them by others that differ only in the frame of poses."""
@@ -69,14 +68,11 @@ class SourceQueries:
         self._status_message = status_message
         self._last_c3d = last_c3d
         self._requests = ServerRequests(settings, streams)
-        self._recordings: Recordings = Recordings(
-            *(settings.name, self._requests, recording),
-            None if before is None else before._recordings,  # noqa: SLF001 - the same class
-        )
+        self._recordings = Recordings(settings.name, self._requests, recording, history)
         self._newest_json = NewestJson()
         self._controls = TokenBucket(CONTROLS_PER_S)
         self.parameters: ParameterCache = ParameterCache(
-            settings, self._requests, announce_parameters, None if before is None else before.parameters
+            settings, self._requests, announce_parameters, history
         )
 
     @property

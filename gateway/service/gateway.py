@@ -12,11 +12,10 @@ from gateway.messages.host_time import host_clock
 from gateway.outputs.contract import Answer, Command, Output, ServerFile, ServerParameters
 from gateway.outputs.guard import GuardedOutput
 from gateway.outputs.registry import build_outputs
-from gateway.publish.fan_out import FanOut
 from gateway.publish.routes import OPENING_S
 from gateway.queries.answers import FRAME_KEY, frame_answer
 from gateway.queries.service import SourceQueries, SourceQueryService
-from gateway.service.source import Source
+from gateway.service.source import Source, SourceHistory
 from gateway.stream.tcp import Backoff
 from gateway.workers import WorkerThread
 
@@ -40,7 +39,7 @@ class Gateway:
         self._outputs = self._build_outputs(settings)
         self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
-        self._removed_sources: dict[str, Source] = {}  # their numbers continue if a reload adds them again
+        self._histories: dict[str, SourceHistory] = {}  # also of removed sources: a reload may add them again
         self._source_tasks: dict[str, asyncio.Task[None]] = {}
         self._tasks = asyncio.TaskGroup()
         self._reload_lock = asyncio.Lock()
@@ -125,13 +124,13 @@ class Gateway:
                 began_s = loop.time()
                 defect = await _run_to_defect(source)
                 text = f"{defect_text(defect)}; the source is started again; report this with the log"
-                source.defects.log(defect, text)
+                source.history.defects.log(defect, text)
                 pause_s = backoff.delay_after(loop.time() - began_s, had_data=True)
                 try:
-                    self._add_source(source.settings, source)
+                    self._add_source(source.settings)
                     self._sources[name].show_restart(text)
                 except Exception as defect:  # noqa: BLE001 - the former one fails at once, and this is repeated
-                    source.defects.log(defect)
+                    source.history.defects.log(defect)
                 await asyncio.sleep(pause_s)
 
     async def _run_every_second(self) -> None:
@@ -225,12 +224,11 @@ class Gateway:
         await asyncio.gather(*map(self._stop_source, stopped))
         for name in stopped:
             if name not in wanted:
-                self._removed_sources[name] = source = self._sources.pop(name)
-                source.fan_out.close()
+                self._sources.pop(name).fan_out.close()
         defects = []
         for name in new:
             try:
-                self._add_source(wanted[name], self._sources.get(name) or self._reopened(name))
+                self._add_source(wanted[name])
                 self._start_source(name)
             except Exception as defect:  # noqa: BLE001 - raised below
                 defects.append(defect)
@@ -239,29 +237,26 @@ class Gateway:
             raise defects[0]
         return changes + _changes("source", stopped, new)
 
-    def _reopened(self, name: str) -> Source | None:
-        """Return the source of this name that was removed earlier, with the present outputs; None if new."""
-        source = self._removed_sources.pop(name, None)
-        if source is not None:
-            source.fan_out.set_outputs(self._outputs)
-        return source
-
     async def _stop_source(self, name: str) -> None:
         task = self._source_tasks.pop(name, None)
         if task is not None:
             task.cancel()
             await asyncio.wait([task])
 
-    def _add_source(self, settings: SourceSettings, before: Source | None = None) -> None:
-        fan_out = before.fan_out if before else FanOut(settings.name, self._outputs)
+    def _add_source(self, settings: SourceSettings) -> None:
+        """Build a source, anew if there is or was one of this name."""
+        history = self._histories.get(settings.name)
+        if history is None:
+            history = self._histories[settings.name] = SourceHistory(settings, self._outputs)
+        elif settings.name not in self._sources:
+            history.fan_out.set_outputs(self._outputs)
         self._sources[settings.name] = Source(
             settings,
-            fan_out,
+            history,
             self._spool,
             self._publish_parameters,
             self._announce_file,
             self._follow_recording,
-            before,
         )
 
     async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
@@ -293,7 +288,7 @@ async def _run_to_defect(source: Source) -> BaseException:
         task.cancel()
         await asyncio.wait([task])
         if not task.cancelled() and (defect := task.exception()) is not None:
-            source.defects.log(defect)
+            source.history.defects.log(defect)
         raise
     end = None if task.cancelled() else task.exception()
     return end or RuntimeError("the source has ended, and nobody stopped it")

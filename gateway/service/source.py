@@ -15,11 +15,11 @@ from gateway.logs.failures import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.decode import C3D
 from gateway.messages.encode import NOT_PUBLISHED
 from gateway.messages.texts import encode_within_limits
-from gateway.outputs.contract import Answer, ServerFile, ServerParameters
+from gateway.outputs.contract import Answer, Output, ServerFile, ServerParameters
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.answers import FilePayload
-from gateway.queries.known_parameters import ServerAnswer
+from gateway.queries.known_parameters import QueryHistory, ServerAnswer
 from gateway.queries.parameter_cache import ParameterRefresh
 from gateway.queries.server_requests import RecordingAccess, StreamAccess
 from gateway.queries.service import SourceQueries
@@ -36,41 +36,57 @@ from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component
 logger = logging.getLogger(__name__)
 
 
+class SourceHistory:
+    """What a source continues when it is built again, after a reload or a defect."""
+
+    def __init__(self, settings: SourceSettings, outputs: Sequence[Output]) -> None:
+        self.settings = settings
+        self.fan_out = FanOut(settings.name, outputs)
+        self.defects: DefectLog = DefectLog(logger, settings.name)
+        """The log of defects in handling this source."""
+        self.sessions = SessionNumbers()
+        """The numbers of the connections."""
+        self.parameters_version = 0
+        """The version of the server's parameters in published frames; 0 before the first."""
+        self.sequence: int = NOT_PUBLISHED
+        """The sequence number of the newest status and clock messages."""
+        self.queries = QueryHistory(settings.name)
+
+
 class Source:
     """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries.
 
     ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
     they change, and returns when they have been sent; ``announce_file`` with the name and every C3D file
-    that was stored. ``before`` is the source that this one replaces after a reload; its
-    session and sequence numbers and its parameters continue.
+    that was stored.
     """
 
     def __init__(
         self,
         settings: SourceSettings,
-        fan_out: FanOut,
+        history: SourceHistory,
         spool: Spool,
         publish_parameters: Callable[[str, ServerParameters], Awaitable[None]],
         announce_file: Callable[[str, ServerFile], None],
         follow_recording: Callable[[str, bool, str], Awaitable[Mapping[str, Any]]],
-        before: "Source | None" = None,
     ) -> None:
-        self.settings = settings
+        # The names and units of the former server do not apply to another one, not even until its handshake.
+        former = history.settings
+        self._has_new_server = (former.host, former.port) != (settings.host, settings.port)
+        self._has_new_frame = not former.has_frame_of(settings)
+        self._has_new_components = former.components != settings.components
+        history.settings = settings
+        self.history = history
         self._warnings = SourceWarnings(settings.name)
-        self.defects: DefectLog = DefectLog(logger, settings.name, None if before is None else before.defects)
-        """The log of defects in handling this source."""
+        self._publish_parameters = publish_parameters
+        self._announce_file = announce_file
+        self._follow_recording = follow_recording
         self.spool = spool
-        self.fan_out = fan_out
-        self._refresh = ParameterRefresh(
-            settings,
-            lambda: self.queries.parameters.refresh(),  # noqa: PLW0108 - assigned below
-            lambda: self.queries.parameters.last_read_s,
-        )
+        self.fan_out = history.fan_out
+        self.queries = self._new_queries()
+        parameters = self.queries.parameters
+        self._refresh = ParameterRefresh(settings, parameters.refresh, lambda: parameters.last_read_s)
         self.fan_out.on_items_changed = self._refresh.request
-        self.sessions: SessionNumbers = SessionNumbers() if before is None else before.sessions
-        """The numbers of the connections."""
-        self.parameters_version: int = 0 if before is None else before.parameters_version
-        """The version of the server's parameters; 0 before the first."""
         self._files = SourceFiles(settings.name, lambda: self.spool, self._on_stored)
         self._spool_problems = FailureLog(logger, settings.name, HOLD_S)
         self._streams: ConfiguredStreams | AutomaticStreams = (
@@ -78,22 +94,10 @@ class Source:
             if settings.streams == "auto"
             else ConfiguredStreams(settings.streams, self._new_stream)
         )
-        self._follow_recording = follow_recording
-        self.queries = self._new_queries(before)
-        self._publish_parameters = publish_parameters
-        self._announce_file = announce_file
         self._failure: asyncio.Future[None] | None = None  # ends ``run``
-        # The names and units of the former server do not apply to another one, not even until its handshake.
-        self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
-            *(settings.host, settings.port),
-        )
-        self._has_new_frame = before is not None and not before.settings.has_frame_of(settings)
-        self._has_new_components = before is not None and before.settings.components != settings.components
-        self.sequence: int = NOT_PUBLISHED if before is None else before.sequence
-        """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
 
-    def _new_queries(self, before: "Source | None") -> SourceQueries:
+    def _new_queries(self) -> SourceQueries:
         return SourceQueries(
             self.settings,
             lambda: [
@@ -105,8 +109,13 @@ class Source:
             last_c3d=self._last_c3d,
             recording=RecordingAccess(self._record, partial(self._follow_recording, self.settings.name)),
             announce_parameters=self._announce_parameters,
-            before=None if before is None else before.queries,
+            history=self.history.queries,
         )
+
+    @property
+    def settings(self) -> SourceSettings:
+        """The settings; ``change_frame`` replaces them."""
+        return self.history.settings
 
     @property
     def name(self) -> str:
@@ -156,7 +165,7 @@ class Source:
 
     async def change_frame(self, settings: SourceSettings) -> None:
         """Use ``settings``, which differ only in the frame of poses, and tell outputs. Streams continue."""
-        self.settings = self.queries.settings = settings
+        self.history.settings = self.queries.settings = settings
         if self.known_parameters.version:
             await self.queries.parameters.begin_version()
         else:
@@ -181,7 +190,7 @@ class Source:
         A defect in checking the streams ends ``run``. One in publishing does not: the data is what matters.
         """
         with log_fields(source=self.name):
-            self.sequence += 1
+            self.history.sequence += 1
             try:
                 self._streams.check()
             except Exception as defect:  # noqa: BLE001 - ``run`` raises it
@@ -195,7 +204,7 @@ class Source:
                 try:
                     work()
                 except Exception as defect:  # noqa: BLE001 - the next status may succeed
-                    self.defects.log(defect)
+                    self.history.defects.log(defect)
 
     def _check_logs(self) -> None:
         for stream in self._streams.known:
@@ -211,14 +220,14 @@ class Source:
     def _publish_clock(self) -> None:
         # One server has one clock: publish the best estimate of all streams.
         best = min(self.statuses, key=_uncertainty_us)
-        clock = clock_message(self.queries.session, self.sequence, best)
+        clock = clock_message(self.queries.session, self.history.sequence, best)
         self.fan_out.publish_clock(encode_within_limits(clock))
 
     def _encoded_status(self) -> bytes:
         message = status_message(
             source=self.name,
             server=f"{self.settings.host}:{self.settings.port}",
-            sequence=self.sequence,
+            sequence=self.history.sequence,
             streams=self.rated_statuses,
             outputs=[
                 (status, output.health(), (output.query_results or {}).get(self.name, {}))
@@ -234,10 +243,10 @@ class Source:
             component_keys(stream.components),
             name=stream_name(self.settings, stream.components),
             on_state=lambda former: self._on_state(status, former),
-            session=self.sessions.newest,
-            sessions=self.sessions,
-            parameters_version=self.parameters_version,
-            known_defects=self.defects,
+            session=self.history.sessions.newest,
+            sessions=self.history.sessions,
+            parameters_version=self.history.parameters_version,
+            known_defects=self.history.defects,
             warnings=self._warnings,
         )
         return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
@@ -290,8 +299,8 @@ class Source:
         try:
             await self._publish_parameters(self.name, self.known_parameters)
         finally:
-            if version != self.parameters_version:
-                self.parameters_version = version
+            if version != self.history.parameters_version:
+                self.history.parameters_version = version
                 for stream in self._streams.known:
                     stream.status.parameters_changed(version)
                     if answer is not None:
@@ -305,7 +314,7 @@ class Source:
         try:
             self._report_stored(stored)
         except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
-            self.defects.log(defect)
+            self.history.defects.log(defect)
 
     def _report_stored(self, stored: StoredFile) -> None:
         """Log and announce a file. It is there, even if old ones could not be deleted."""

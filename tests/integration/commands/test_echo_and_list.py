@@ -140,7 +140,7 @@ async def test_values_have_the_units_of_the_parameters_which_are_asked_for_once(
         run_gateway(simulator.port, listen=place.endpoint, lcm_url=place.url) as gateway,
     ):
         await wait_until_cached(gateway)
-        await wait_until_async(lambda: gateway.sources[0].parameters_version)
+        await wait_until_async(lambda: gateway.sources[0].history.parameters_version)
         for component, end in (("3d", ") mm"), ("analog", " mV"), ("force", ") N")):
             for done in await place.run("echo", "--component", component, "--count", "20"):
                 assert (done.status, done.stderr) == (0, "")

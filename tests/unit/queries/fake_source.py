@@ -10,7 +10,7 @@ import rtc3d
 from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
 from gateway.outputs.contract import Answer
-from gateway.queries.known_parameters import ServerAnswer
+from gateway.queries.known_parameters import QueryHistory, ServerAnswer
 from gateway.queries.questions import Question
 from gateway.queries.server_requests import RecordingAccess, StreamAccess
 from gateway.queries.service import SourceQueries
@@ -101,6 +101,7 @@ class FakeSource:
         self.connection = FakeConnection(self.server)
         self.second_connection: FakeConnection | None = None
         self._has_two_streams = two_streams
+        self.history = QueryHistory("lab")
         self.queries = SourceQueries(
             source_settings,
             lambda: self.streams,
@@ -109,6 +110,7 @@ class FakeSource:
             self._last_c3d,
             RecordingAccess(self._record, self._follow_recording),
             self._announce,
+            self.history,
         )
         self.status.connected("the server")
 

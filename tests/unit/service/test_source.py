@@ -17,10 +17,9 @@ from gateway.logs.failures import current_log_fields
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
-from gateway.publish.fan_out import FanOut
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
-from gateway.service.source import Source
+from gateway.service.source import Source, SourceHistory
 from gateway.workers import WorkerThread
 from tests.servers import c3d_file, packet
 from tests.toy_output import ToyOutput, ToyPublisher
@@ -43,7 +42,7 @@ class Lab:
         self,
         servers: Servers,
         spool: Spool,
-        before: Source | None = None,
+        history: SourceHistory | None = None,
         *,
         output: ToyOutput | None = None,
         **settings: Any,
@@ -53,15 +52,19 @@ class Lab:
         self.parameters: list[tuple[str, ServerParameters]] = []
         self.files: list[tuple[str, ServerFile]] = []
         self.followed: list[tuple[str, bool, str]] = []
+        # An interval of 0 cannot be configured. Here, a refresh always reaches the server.
+        of_source = SourceSettings(name="lab", host=HOST, **settings).model_copy(
+            update={"fresh_interval_s": 0.0}
+        )
+        history = history or SourceHistory(of_source, ())
+        history.fan_out.set_outputs([self.output])
         self.source = Source(
-            # An interval of 0 cannot be configured. Here, a refresh always reaches the server.
-            SourceSettings(name="lab", host=HOST, **settings).model_copy(update={"fresh_interval_s": 0.0}),
-            FanOut("lab", [self.output]),
+            of_source,
+            history,
             spool,
             self._publish_parameters,
             lambda *each: self.files.append(each),
             self._follow_recording,
-            before,
         )
 
     async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
@@ -92,8 +95,8 @@ NewLab = Callable[..., Lab]
 def new_lab(servers: Servers, tmp_path: Path) -> NewLab:
     """Return a function that makes a source of the server, with its own spool or another one."""
 
-    def make(before: Source | None = None, *, spool: Spool | None = None, **settings: Any) -> Lab:
-        return Lab(servers, spool or Spool(tmp_path, max_files=10, max_bytes=1000), before, **settings)
+    def make(history: SourceHistory | None = None, *, spool: Spool | None = None, **settings: Any) -> Lab:
+        return Lab(servers, spool or Spool(tmp_path, max_files=10, max_bytes=1000), history, **settings)
 
     return make
 
@@ -198,10 +201,10 @@ async def test_the_source_shows_streaming_while_any_stream_has_frames(new_lab: N
 
 async def test_a_source_that_replaces_another_continues_its_numbers(new_lab: NewLab) -> None:
     before = new_lab(streams=TWO_STREAMS)
-    before.source.sessions.newest = 5
-    before.source.parameters_version = 7
+    before.source.history.sessions.newest = 5
+    before.source.history.parameters_version = 7
     before.source.publish_status()
-    after = new_lab(before.source)
+    after = new_lab(before.source.history)
     assert [(each.session, each.parameters_version) for each in after.source.statuses] == [(5, 7)]
     after.source.publish_status()
     assert [message.sequence for message in after.messages("status")] == [1]

@@ -169,12 +169,12 @@ async def test_a_reload_continues_the_version_and_the_parameters_of_another_serv
         lab.server.answer = sending(OTHER_XML)
         lab.source.fan_out.on_items_changed()
         await settle()
-    after = new_lab(lab.source, query_timeout_s=3.0)
+    after = new_lab(lab.source.history, query_timeout_s=3.0)
     assert after.source.statuses[0].parameters_version == 2
     async with running(after):
         assert published(after) == [(OTHER_XML[8:], 2, 2)]
     after.server.refuses = True
-    other = new_lab(after.source, port=3021)
+    other = new_lab(after.source.history, port=3021)
     async with running(other, sessions=0):
         await settle()
         assert published(other) == [(b"", 2, 3)]
