@@ -30,7 +30,7 @@ def description(number: int, message_type: int, name: str) -> bytes:
 
 
 class VrpnClient:
-    """Reads everything that a server sends, from ``connect`` or ``knock`` on."""
+    """Reads everything that a server sends, from ``connect`` or ``request_callback`` on."""
 
     def __init__(self) -> None:
         self.cookie = b""
@@ -53,7 +53,7 @@ class VrpnClient:
         return client
 
     @classmethod
-    async def knock(cls, port: int, host_in_message: str = "127.0.0.1") -> Self:
+    async def request_callback(cls, port: int, host_in_message: str = "127.0.0.1") -> Self:
         """Ask by UDP, once, and wait to be called back."""
         client = cls()
         called: asyncio.Future[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = (

@@ -1,8 +1,8 @@
 """Remote questions about a source, answered from caches where possible; never on the path of the data.
 
 A question reaches ``service`` from an output, which has already checked the peer's rate
-(``outputs.admission``). It takes one question in a turn of the event loop, finds the source that it concerns,
-and returns an answer, a command for the server, or an error for the peer.
+(``outputs.query_admission``). It takes one question in a turn of the event loop, finds the source that it
+concerns, and returns an answer, a command for the server, or an error for the peer.
 
 - ``questions``: what is asked, parsed from keys and options.
 - ``answers``: answers that need no server. What takes long to make is made by the thread that sends it, once

@@ -22,7 +22,7 @@ def _garbage() -> bytes:
     return os.urandom(2000) if os.urandom(1)[0] % 2 else COOKIE + os.urandom(2000)
 
 
-async def _knocks(port: int) -> None:
+async def _callback_requests(port: int) -> None:
     """Ask by UDP for connections to many ports, open, closed and impossible, and send anything."""
     with contextlib.ExitStack() as stack:
         listeners = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(20)]
@@ -47,5 +47,5 @@ ATTACKS: Final[dict[str, Attack]] = {
     "endless cookie": endless(b"vrpn: ver. 07.", b"7" * 65536),
     "HTTP": endless(b"", b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 1000),
     "garbage": short(_garbage),
-    "requests by UDP": _knocks,
+    "requests by UDP": _callback_requests,
 }

@@ -7,9 +7,9 @@ from gateway.outputs.vrpn.protocol import (
     MAX_BODY_BYTES,
     MAX_NAME_BYTES,
     ClientReader,
+    callback_port,
     describe_tracker,
     encode_pose,
-    knock_port,
 )
 from gateway.outputs.vrpn.trackers import MAX_TRACKERS, TrackerNames, Trackers
 from tests.strategies import damaged, pieces_of
@@ -111,8 +111,8 @@ def test_any_time_and_number_can_be_encoded(utime: int, number: int) -> None:
 
 
 @given(st.binary(max_size=300))
-def test_knock_port_is_none_or_a_user_port(datagram: bytes) -> None:
-    port = knock_port(datagram)
+def test_callback_port_is_none_or_a_user_port(datagram: bytes) -> None:
+    port = callback_port(datagram)
     assert port is None or 1024 <= port <= 65535
 
 

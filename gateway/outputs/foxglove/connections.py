@@ -175,7 +175,7 @@ _SLOW: Final = "Send buffer limit reached"
 logger = logging.getLogger(__name__)
 
 
-class Admission:
+class ViewerAdmission:
     """Decides which connections may stay open, and logs why others end."""
 
     def __init__(self, host: str, origins: Collection[str]) -> None:
@@ -231,7 +231,7 @@ class Admission:
 class Connection(ServerConnection):
     """A connection that is closed if the peer sends more than a viewer does."""
 
-    def __init__(self, admission: Admission, *args: Any, **options: Any) -> None:
+    def __init__(self, admission: ViewerAdmission, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._admission = admission
         self._received = TokenBucket(_RECEIVED_BYTES_PER_S, _RECEIVED_BURST_BYTES)
@@ -281,7 +281,7 @@ def _address(connection: ServerConnection) -> str:
 class Viewer:
     """A connected viewer."""
 
-    def __init__(self, connection: ServerConnection, admission: Admission) -> None:
+    def __init__(self, connection: ServerConnection, admission: ViewerAdmission) -> None:
         self.subscriptions: dict[int, int] = {}
         """The numbers of channels by those of subscriptions."""
         self._connection = connection

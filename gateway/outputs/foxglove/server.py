@@ -22,9 +22,9 @@ from gateway.outputs.foxglove import connections
 from gateway.outputs.foxglove.connections import (
     HANDSHAKE_TIMEOUT_S,
     MAX_REQUEST_BYTES,
-    Admission,
     Connection,
     Viewer,
+    ViewerAdmission,
 )
 
 SERVER_NAME: Final = "rtc3d-gateway"
@@ -68,7 +68,7 @@ class FoxgloveServer:
         self._channels: dict[int, Channel] = {}
         self._last_number = 0
         self._viewers: set[Viewer] = set()
-        self._admission = Admission(host, origins)
+        self._admission = ViewerAdmission(host, origins)
         self._server: Server | None = None
         self._opening = asyncio.Lock()
         self._is_closed = False

@@ -161,7 +161,7 @@ class LcmQueries:
 
     @property
     def results(self) -> Mapping[str, Mapping[str, int]]:
-        """See Admission."""
+        """See QueryAdmission."""
         return self._requests.results
 
     def start(self) -> None:

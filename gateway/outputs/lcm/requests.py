@@ -20,9 +20,9 @@ from gateway.logs.losses import Losses
 from gateway.logs.safe_text import quoted
 from gateway.messages.decode import JSON
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.admission import Admission, QueryDefects, QueryLimits, Refusal
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.query_admission import QueryAdmission, QueryDefects, QueryLimits, Refusal
 from gateway.outputs.threads import SendThread
 
 MAX_PENDING: Final = 64
@@ -79,7 +79,7 @@ class LcmRequests:
         self._kinds = kinds
         self._send = send
         self._long_sender = long_sender
-        self._admission = Admission(
+        self._admission = QueryAdmission(
             QueryLimits(
                 output="lcm",
                 key_setting="max_queries_per_source_per_s",
@@ -96,7 +96,7 @@ class LcmRequests:
 
     @property
     def results(self) -> Mapping[str, Mapping[str, int]]:
-        """See Admission."""
+        """See QueryAdmission."""
         return self._admission.results
 
     def channels(self, source: str) -> dict[str, Callable[[bytes], None]]:

@@ -51,7 +51,7 @@ _PONG_TYPE: Final = 1
 _PING_NAME: Final = b"vrpn_Base ping_message"
 _TYPE_NAMES: Final = {_POSE_TYPE: b"vrpn_Tracker Pos_Quat", _PONG_TYPE: b"vrpn_Base pong_message"}
 
-_KNOCK: Final = re.compile(rb"[^\s\0]{1,255} ([0-9]{1,5})\0*")
+_CALLBACK_REQUEST: Final = re.compile(rb"[^\s\0]{1,255} ([0-9]{1,5})\0*")
 _FIRST_USER_PORT: Final = 1024
 _MAX_PORT: Final = 65535
 
@@ -186,13 +186,13 @@ def encode_pose(number: int, utime: int, pose: tuple[float, ...]) -> bytes:
     return _POSE.pack(_POSE_BYTES, *_timeval(utime), number, _POSE_TYPE, 0, *pose[:7])
 
 
-def knock_port(datagram: bytes) -> int | None:
+def callback_port(datagram: bytes) -> int | None:
     """Return the TCP port at which a client wants to be called back; None if this is no such request.
 
     The client sends its address and the port as text. The address is not used: a client can be wrong about
     it, or lie. Ports of system services are not accepted, because VRPN clients listen on free ports.
     """
-    match = _KNOCK.fullmatch(datagram)
+    match = _CALLBACK_REQUEST.fullmatch(datagram)
     if match is None:
         return None
     port = int(match[1])

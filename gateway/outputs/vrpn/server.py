@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from gateway.logs.failures import DefectLog, EventLog, FailureLog, defect_text
 from gateway.outputs.vrpn.client import Client
-from gateway.outputs.vrpn.protocol import knock_port
+from gateway.outputs.vrpn.protocol import callback_port
 from gateway.outputs.vrpn.trackers import TrackerNames, Trackers
 from gateway.token_bucket import TokenBucket
 
@@ -62,7 +62,7 @@ CallBack = Callable[[str, int], Awaitable[None]]
 """Connects to a client's address and TCP port. Raises OSError."""
 
 
-class Knocks:
+class CallbackRequests:
     """Reads requests from a UDP socket and calls back those who sent them.
 
     ``own_port`` is the server's own port, to which it must not connect. ``call_failed`` is called with an
@@ -111,7 +111,7 @@ class Knocks:
         self._pause = self._loop.call_later(_PAUSE_S, self._read_on)
 
     def _receive(self, datagram: bytes, host: str) -> None:
-        port = knock_port(datagram)
+        port = callback_port(datagram)
         if port is None or port == self._own_port or (host, port) in self._in_progress:
             return
         num_of_host = sum(other == host for other, _ in self._in_progress)
@@ -218,8 +218,8 @@ class VrpnServer:
         """Accept clients. Raises OSError if a socket cannot be bound."""
         tcp = sockets.enter_context(await self._bind(socket.SOCK_STREAM))
         udp = sockets.enter_context(await self._bind(socket.SOCK_DGRAM))
-        knocks = Knocks(udp, self._call_back, self._call_failed, self._port)
-        sockets.callback(knocks.close)
+        requests = CallbackRequests(udp, self._call_back, self._call_failed, self._port)
+        sockets.callback(requests.close)
         self.problem = ""
         self._failures.succeeded(f"trackers are served on {self._host}, port {self._port}")
         while True:

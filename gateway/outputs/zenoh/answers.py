@@ -29,8 +29,8 @@ from gateway.logs.losses import Losses
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.admission import NO_REPLY, Admission, QueryDefects, Refusal
 from gateway.outputs.contract import Answer, KeyPath, QueryService
+from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, Refusal
 from gateway.outputs.threads import SendThread
 
 MAX_PENDING: Final = 4096
@@ -95,7 +95,7 @@ class ZenohAnswers:
         prefix: str,
         service: QueryService,
         loop: asyncio.AbstractEventLoop,
-        admission: Admission,
+        admission: QueryAdmission,
         sender: SendThread,
         losses: defaultdict[str, Losses],
     ) -> None:

@@ -13,9 +13,9 @@ from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerFile, ServerParameters
 from gateway.outputs.zenoh.config import zenoh_config
-from gateway.outputs.zenoh.json_keys import JsonKeys
+from gateway.outputs.zenoh.declarations import SourceDeclarations
+from gateway.outputs.zenoh.json_publishing import JsonConverter
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
-from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.workers import WorkerThread
@@ -50,14 +50,14 @@ class ZenohOutput(Output):
         self.config = zenoh_config(settings.config) if config is None else config
         self._holder = SessionHolder(_TEXTS, self.config, self._declare_all, self._update_link)
         self._link = ZenohLink(lambda: self._holder.refusal)
-        self._json = JsonKeys(settings.json_max_rate_hz)
+        self._json = JsonConverter(settings.json_max_rate_hz)
         # The lock of the session protects what the opening thread shares: publishers, tokens and queries.
         self._lock = self._holder.lock
         self._publishers: list[ZenohPublisher] = []
         # By the source's name; None while the session is not open.
         self._alive: dict[str, zenoh.LivelinessToken | None] = {}
         self._streaming: dict[str, zenoh.LivelinessToken | None] = {}
-        self._queries: ZenohQueries | None = None
+        self._declarations: SourceDeclarations | None = None
         self._declarer = WorkerThread("zenoh-declare")
         self._defects = DefectLog(logger, self.name)
 
@@ -81,8 +81,8 @@ class ZenohOutput(Output):
         for tokens, name in ((self._alive, "alive"), (self._streaming, "server")):
             for source in tokens:
                 tokens[source] = self._token(session, source, name)
-        if self._queries is not None:
-            self._queries.open(session, list(self._alive))  # the parameters, before the first frame
+        if self._declarations is not None:
+            self._declarations.open(session, list(self._alive))  # the parameters, before the first frame
 
     def _update_link(self) -> None:
         self._link.is_cut_off = self._holder.is_cut_off
@@ -147,8 +147,8 @@ class ZenohOutput(Output):
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` refused queries about ``source``, and what else is not published of it."""
         self._json.count_losses(source, losses)
-        if self._queries is not None:
-            self._queries.count_losses(source, losses)
+        if self._declarations is not None:
+            self._declarations.count_losses(source, losses)
 
     def announce(self, source: str) -> None:
         """Declare the liveliness token PREFIX/SOURCE/alive, and answer queries about ``source``."""
@@ -159,8 +159,8 @@ class ZenohOutput(Output):
         """Undeclare the liveliness token PREFIX/SOURCE/alive, and stop answering queries about ``source``."""
         self._show(self._alive, source, "alive", False)
         with self._lock:
-            if self._queries is not None:
-                self._queries.remove(source)
+            if self._declarations is not None:
+                self._declarations.remove(source)
 
     def show_streaming(self, source: str, is_streaming: bool) -> None:
         """Declare the liveliness token PREFIX/SOURCE/server while frames arrive, undeclare it otherwise."""
@@ -179,32 +179,34 @@ class ZenohOutput(Output):
 
     def _serve_source(self, source: str) -> None:
         with self._lock:
-            if self._queries is not None and self.session is not None:
-                self._queries.add(source)
+            if self._declarations is not None and self.session is not None:
+                self._declarations.add(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
         self._json.set_parameters(source, parameters)
-        return None if self._queries is None else self._queries.publish_parameters(source, parameters)
+        return (
+            None if self._declarations is None else self._declarations.publish_parameters(source, parameters)
+        )
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Publish the description of a C3D file on PREFIX/SOURCE/c3d, the key that returns it."""
-        if self._queries is not None:
-            self._queries.announce_file(source, file.description)
+        if self._declarations is not None:
+            self._declarations.announce_file(source, file.description)
 
     def serve_queries(self, service: QueryService) -> None:
         """Answer queries below PREFIX/SOURCE/ for every announced source."""
-        self._queries = ZenohQueries(self.settings, service, asyncio.get_running_loop())
+        self._declarations = SourceDeclarations(self.settings, service, asyncio.get_running_loop())
 
     async def stop_queries(self) -> None:
         """Drop the pending queries. Their peers see at once that no reply follows."""
-        if self._queries is not None:
-            await self._queries.close()
+        if self._declarations is not None:
+            await self._declarations.close()
 
     @property
     def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
         """By source, the number of queries by result; None before ``serve_queries``."""
-        return None if self._queries is None else self._queries.results
+        return None if self._declarations is None else self._declarations.results
 
     def close(self) -> None:
         """Close the session. Otherwise a process with Zenoh callbacks never ends."""

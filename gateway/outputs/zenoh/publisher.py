@@ -10,7 +10,7 @@ import zenoh
 from gateway.errors import OutputError
 from gateway.messages.decode import LCM
 from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
-from gateway.outputs.zenoh.json_keys import JsonPublisher
+from gateway.outputs.zenoh.json_publishing import JsonPublisher
 
 BURST_BYTES: Final = 128 * 1024
 BURST_S: Final = 0.002

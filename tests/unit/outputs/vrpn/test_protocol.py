@@ -7,10 +7,10 @@ from gateway.outputs.vrpn.protocol import (
     COOKIE,
     TYPE_DESCRIPTIONS,
     ClientReader,
+    callback_port,
     describe_tracker,
     encode_pong,
     encode_pose,
-    knock_port,
 )
 
 CLIENT_COOKIE = b"vrpn: ver. 07.38  0\0\0\0\0\0"
@@ -131,5 +131,5 @@ def test_what_breaks_the_protocol_is_refused(begin: bytes, text: str) -> None:
         (b"\xff" * 500, None),
     ],
 )
-def test_knock_port(datagram: bytes, port: int | None) -> None:
-    assert knock_port(datagram) == port
+def test_callback_port(datagram: bytes, port: int | None) -> None:
+    assert callback_port(datagram) == port

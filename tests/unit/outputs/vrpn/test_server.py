@@ -17,7 +17,7 @@ from gateway.outputs.vrpn.server import (
     MAX_CALLS_PER_HOST,
     MAX_CLIENTS,
     MAX_HANDSHAKES,
-    Knocks,
+    CallbackRequests,
     VrpnServer,
     bind,
 )
@@ -70,34 +70,34 @@ async def test_calls_are_bounded_for_each_host_and_in_all() -> None:
         called.append((host, port))
         await may_end.wait()
 
-    async def knock(host: str, port: object) -> None:
-        knocks._receive(f"{host} {port}".encode() + b"\0", host)
+    async def request_callback(host: str, port: object) -> None:
+        requests._receive(f"{host} {port}".encode() + b"\0", host)
         await asyncio.sleep(0)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.setblocking(False)
-        knocks = Knocks(udp, call, lambda *_: None, OWN_PORT)
+        requests = CallbackRequests(udp, call, lambda *_: None, OWN_PORT)
         for port in (OWN_PORT, "HTTP"):
-            await knock("192.0.2.1", port)
+            await request_callback("192.0.2.1", port)
         for number in range(5000, 5000 + MAX_CALLS_PER_HOST + 1):
             for _ in range(2):  # a repeated request is none
-                await knock("192.0.2.1", number)
+                await request_callback("192.0.2.1", number)
         assert called == [("192.0.2.1", 5000 + number) for number in range(MAX_CALLS_PER_HOST)]
         for number in range(MAX_CALLS):
-            await knock(f"192.0.2.{100 + number}", 5000)
+            await request_callback(f"192.0.2.{100 + number}", 5000)
         assert len(called) == MAX_CALLS
         may_end.set()
         await asyncio.sleep(0)
         await asyncio.sleep(0)
-        await knock("192.0.2.1", 5000)  # there is room again
+        await request_callback("192.0.2.1", 5000)  # there is room again
         assert called[MAX_CALLS:] == [("192.0.2.1", 5000)]
-        knocks.close()
+        requests.close()
 
 
 async def test_client_is_called_back_at_its_own_address(running: Running) -> None:
     server, port = running
     # libvrpn may send a wrong address, for example that of another network card.
-    async with await VrpnClient.knock(port, host_in_message="192.0.2.1") as client:
+    async with await VrpnClient.request_callback(port, host_in_message="192.0.2.1") as client:
         await wait_until_async(lambda: client.trackers)
         assert client.cookie == COOKIE
         server.send(ONE)
@@ -122,7 +122,7 @@ async def test_only_the_address_that_asks_is_called_back(running: Running) -> No
 async def test_refused_calls_are_logged_few_times(running: Running, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(20):
         send_datagram(f"127.0.0.1 {free_port()}\0".encode(), running[1])
-    async with await VrpnClient.knock(running[1]) as client:
+    async with await VrpnClient.request_callback(running[1]) as client:
         await wait_until_async(lambda: client.trackers)
     refused = [text for text in caplog.messages if "asked by UDP" in text]
     assert 1 <= len(refused) <= 5
@@ -131,7 +131,7 @@ async def test_refused_calls_are_logged_few_times(running: Running, caplog: pyte
 
 async def test_flood_of_udp_calls_is_read_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
-    monkeypatch.setattr("gateway.outputs.vrpn.server.knock_port", read.append)
+    monkeypatch.setattr("gateway.outputs.vrpn.server.callback_port", read.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         for _ in range(3000):
             udp.sendto(b"127.0.0.1 5000\0", ("127.0.0.1", running[1]))

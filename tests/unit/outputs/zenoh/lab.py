@@ -14,8 +14,8 @@ from gateway.errors import QueryError
 from gateway.logs.failures import current_log_fields
 from gateway.logs.losses import Losses
 from gateway.outputs.contract import Answer, KeyPath
+from gateway.outputs.zenoh.declarations import SourceDeclarations
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.losses import amounts
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
@@ -120,9 +120,9 @@ class QueriedLab(Lab):
         self.output.announce("lab")
 
     @property
-    def queries(self) -> ZenohQueries:
-        assert self.output._queries is not None
-        return self.output._queries
+    def declarations(self) -> SourceDeclarations:
+        assert self.output._declarations is not None
+        return self.output._declarations
 
     async def query(self, selector: str) -> Reply:
         return await query(self.peer, selector)

@@ -11,10 +11,10 @@ import pytest
 from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.zenoh import queries as queries_module
-from gateway.outputs.zenoh.json_keys import JsonKeys
+from gateway.outputs.zenoh import declarations as declarations_module
+from gateway.outputs.zenoh.declarations import SourceDeclarations
+from gateway.outputs.zenoh.json_publishing import JsonConverter
 from gateway.outputs.zenoh.publisher import BURST_BYTES, BURST_S, ZenohLink
-from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.settable_clock import Clock
 from tests.virtual_time import run_in_virtual_time
@@ -58,20 +58,20 @@ def test_a_burst_begins_two_milliseconds_after_the_one_before_it(clock: WaitingC
 
 def test_the_thread_for_json_rests_four_times_as_long_as_a_conversion_took(clock: WaitingClock) -> None:
     """So a web page costs the gateway a fifth of a core at most."""
-    keys = JsonKeys(100)
+    keys = JsonConverter(100)
     keys._closing = SimpleNamespace(wait=clock.wait)  # type: ignore[assignment]  # a threading.Event
     keys._waiting["lab"].calls.append((lambda: clock.wait(0.01), 1))
     keys._convert_next()
     assert clock.waits_s == pytest.approx([0.01, 0.04])
 
 
-class Queries(ZenohQueries):
+class Queries(SourceDeclarations):
     """Publishes the parameters of "lab" in a list instead of on Zenoh, with the time."""
 
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
         super().__init__(ZenohSettings(), None, loop)  # type: ignore[arg-type]  # nobody asks
-        self.count_losses("lab", Losses(queries_module.logger, "lab to zenoh"))
+        self.count_losses("lab", Losses(declarations_module.logger, "lab to zenoh"))
         self._parameters["lab"] = PARAMETERS
         self.published_s: list[float] = []
 
@@ -89,15 +89,15 @@ def test_parameters_are_published_for_new_subscribers_at_most_twice_a_second(
 
     async def appear() -> list[float]:
         loop = asyncio.get_running_loop()
-        monkeypatch.setattr(queries_module, "time", SimpleNamespace(monotonic=loop.time))
-        queries = Queries()
+        monkeypatch.setattr(declarations_module, "time", SimpleNamespace(monotonic=loop.time))
+        declarations = Queries()
         for _ in range(12):
             for _ in range(3):
-                queries._publish_soon("lab")
+                declarations._publish_soon("lab")
             await asyncio.sleep(0.1)
         await asyncio.sleep(10)
-        await queries.close()
-        return queries.published_s
+        await declarations.close()
+        return declarations.published_s
 
     published_s = run_in_virtual_time(appear())
     assert published_s == [0, 0.5, 1.0, 1.5]
@@ -107,13 +107,13 @@ def test_parameters_have_arrived_when_nothing_can_overtake_them() -> None:
     """Messages of streams have a higher priority: for 50 ms, they may be delivered first."""
 
     async def publish() -> float:
-        queries = Queries()
+        declarations = Queries()
         loop = asyncio.get_running_loop()
         began_s = loop.time()
-        arrived = queries.publish_parameters("lab", PARAMETERS)
+        arrived = declarations.publish_parameters("lab", PARAMETERS)
         assert arrived is not None
         await arrived
-        await queries.close()
+        await declarations.close()
         return loop.time() - began_s
 
     assert run_in_virtual_time(publish()) == pytest.approx(0.05)

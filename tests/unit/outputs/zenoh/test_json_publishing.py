@@ -15,7 +15,7 @@ from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.zenoh.json_keys import MAX_DESCRIPTION_CHARACTERS, JsonKeys
+from gateway.outputs.zenoh.json_publishing import MAX_DESCRIPTION_CHARACTERS, JsonConverter
 from gateway.outputs.zenoh.publisher import ZenohPublisher
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
@@ -268,9 +268,9 @@ def wait_for(event: threading.Event) -> None:
 
 def test_sources_that_wait_share_the_time_of_the_thread_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
-    monkeypatch.setattr("gateway.outputs.zenoh.json_keys.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("gateway.outputs.zenoh.json_publishing.time.monotonic", lambda: now_s)
     converted: list[str] = []
-    keys, can_begin = JsonKeys(1.0), threading.Event()
+    keys, can_begin = JsonConverter(1.0), threading.Event()
 
     def convert(source: str, duration_s: float) -> None:
         nonlocal now_s
@@ -288,7 +288,7 @@ def test_sources_that_wait_share_the_time_of_the_thread_evenly(monkeypatch: pyte
 
 
 def test_what_waits_of_one_source_is_bounded_and_leaves_room_for_the_others() -> None:
-    keys, can_begin = JsonKeys(1.0), threading.Event()
+    keys, can_begin = JsonConverter(1.0), threading.Event()
     assert keys.offer("crowd", functools.partial(wait_for, can_begin), 1)
     for source in ("crowd", "lab"):
         while keys.offer(source, lambda: None, 0):

@@ -47,7 +47,7 @@ _CAPTURE_UTIME: Final = slice(16, 24)
 logger = logging.getLogger(__name__)
 
 
-class JsonKeys:
+class JsonConverter:
     """The JSON of one Zenoh session: the thread that converts and sends, and what it needs to know."""
 
     def __init__(self, max_rate_hz: float) -> None:
@@ -165,7 +165,12 @@ class JsonPublisher:
     """
 
     def __init__(
-        self, keys: JsonKeys, topic: Topic, key: str, pace: JsonPace | None, on_wanted: Callable[[], None]
+        self,
+        keys: JsonConverter,
+        topic: Topic,
+        key: str,
+        pace: JsonPace | None,
+        on_wanted: Callable[[], None],
     ) -> None:
         self.wanted = False
         """Whether a subscriber matches the key now."""

@@ -17,8 +17,8 @@ import zenoh
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.admission import Admission, QueryLimits
 from gateway.outputs.contract import Answer, QueryService, ServerParameters
+from gateway.outputs.query_admission import QueryAdmission, QueryLimits
 from gateway.outputs.threads import SendThread
 from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
 from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
@@ -49,7 +49,7 @@ class _Declared(NamedTuple):
     history_token: zenoh.LivelinessToken
 
 
-class ZenohQueries:
+class SourceDeclarations:
     """Answers queries below PREFIX/SOURCE/ with ``service``, and publishes parameters and files.
 
     There is one queryable for each source.
@@ -74,7 +74,7 @@ class ZenohQueries:
         self._published_s: dict[str, float] = {}  # when that was done last
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
         self._sender = SendThread("zenoh-send")
-        self._admission = Admission(
+        self._admission = QueryAdmission(
             QueryLimits(
                 output="zenoh",
                 key_setting="max_queries_per_key_per_s",
@@ -91,7 +91,7 @@ class ZenohQueries:
 
     @property
     def results(self) -> Mapping[str, Mapping[str, int]]:
-        """See Admission."""
+        """See QueryAdmission."""
         return self._admission.results
 
     def open(self, session: zenoh.Session, sources: Sequence[str]) -> None:

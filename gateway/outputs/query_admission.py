@@ -50,7 +50,7 @@ class Refusal(NamedTuple):
     is_sent: bool
 
 
-class Admission:
+class QueryAdmission:
     """Admits or refuses questions, and counts them by result. Any thread may call the methods."""
 
     def __init__(self, limits: QueryLimits, monotonic: Callable[[], float] = time.monotonic) -> None:

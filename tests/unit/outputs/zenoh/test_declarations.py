@@ -14,7 +14,7 @@ from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
-from gateway.outputs.zenoh import queries as queries_module
+from gateway.outputs.zenoh import declarations as declarations_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.losses import amounts
@@ -119,7 +119,10 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
 ) -> None:
     monkeypatch.setattr(answers_module, "LONG_ANSWER_BYTES", 8)
     used: list[str] = []
-    for name, sender in (("short", lab.queries._sender), ("long", lab.queries._answers._long_sender)):
+    for name, sender in (
+        ("short", lab.declarations._sender),
+        ("long", lab.declarations._answers._long_sender),
+    ):
         offer = sender.offer
 
         def record(call: Any, num_bytes: int = 0, name: str = name, offer: Any = offer) -> Any:
@@ -214,9 +217,9 @@ async def test_an_output_without_queries_has_no_results() -> None:
 async def test_an_event_loop_that_has_ended_is_no_error(lab: QueriedLab) -> None:
     loop = asyncio.new_event_loop()
     loop.close()
-    queries = queries_module.ZenohQueries(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
-    queries.open(lab.peer, [])
-    await queries.close()
+    declarations = declarations_module.SourceDeclarations(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
+    declarations.open(lab.peer, [])
+    await declarations.close()
 
 
 async def test_what_zenoh_does_not_publish_is_counted_and_logged(
@@ -224,16 +227,16 @@ async def test_what_zenoh_does_not_publish_is_counted_and_logged(
 ) -> None:
     session = open_zenoh("client", connect=lab.endpoint)
     loop = asyncio.get_running_loop()
-    queries = queries_module.ZenohQueries(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
+    declarations = declarations_module.SourceDeclarations(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
     losses = Losses(logging.getLogger("test"), "lab, zenoh")
-    queries.count_losses("lab", losses)
-    queries.open(session, ["lab"])
+    declarations.count_losses("lab", losses)
+    declarations.open(session, ["lab"])
     await asyncio.sleep(0)  # the event loop publishes what was there before: nothing
     session.close()
     caplog.clear()
-    queries.publish_parameters("lab", ServerParameters(XML, 1, 1))
-    queries.announce_file("lab", {"name": "late.c3d"})
+    declarations.publish_parameters("lab", ServerParameters(XML, 1, 1))
+    declarations.announce_file("lab", {"name": "late.c3d"})
     await wait_until_async(lambda: amounts(losses.report()) == {"put failed": (2, 0)})
-    await queries.close()
+    await declarations.close()
     text = "lab, zenoh: Zenoh did not take parameters or an announcement: session closed"
     assert caplog.messages == [text]

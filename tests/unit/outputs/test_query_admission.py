@@ -5,8 +5,8 @@ from collections import Counter
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs import admission as admission_module
-from gateway.outputs.admission import MAX_KEYS, NO_REPLY, Admission, QueryLimits
+from gateway.outputs import query_admission as admission_module
+from gateway.outputs.query_admission import MAX_KEYS, NO_REPLY, QueryAdmission, QueryLimits
 from tests.settable_clock import Clock
 
 LIMITS = QueryLimits("zenoh", "max_queries_per_key_per_s", 100.0, 10.0, 1000.0, 40)
@@ -17,7 +17,7 @@ def clock() -> Clock:
     return Clock()
 
 
-def asked(admission: Admission, key: str, times: int) -> Counter[str]:
+def asked(admission: QueryAdmission, key: str, times: int) -> Counter[str]:
     """Ask ``times`` times; return the codes of the refusals; ok is for what was admitted."""
     results: Counter[str] = Counter()
     for _ in range(times):
@@ -29,25 +29,25 @@ def asked(admission: Admission, key: str, times: int) -> Counter[str]:
 
 
 def test_each_key_has_its_rate_and_all_together_have_one(clock: Clock) -> None:
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     assert asked(admission, "lab/3d", 30) == {"ok": 10, "rate": 20}
     assert asked(admission, "lab/6d", 10) == {"ok": 10}
     clock.now_s += 0.5
     assert asked(admission, "lab/3d", 30) == {"ok": 5, "rate": 25}
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     together = sum((asked(admission, f"lab/{number}", 2) for number in range(200)), Counter())
     assert together == {"ok": 100, "rate": 300}
 
 
 def test_an_admitted_question_with_many_answers_counts_as_many(clock: Clock) -> None:
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     assert asked(admission, "lab/**", 1) == {"ok": 1}
     admission.count(99)
     assert asked(admission, "lab/3d", 1) == {"rate": 1}
 
 
 def test_a_refusal_says_which_limit_and_its_setting(clock: Clock) -> None:
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     asked(admission, "lab/3d", 10)
     refusal = admission.admit("lab", "lab/3d")
     assert refusal
@@ -64,7 +64,7 @@ def test_a_refusal_says_which_limit_and_its_setting(clock: Clock) -> None:
 
 
 def test_questions_in_progress_are_limited(clock: Clock) -> None:
-    admission = Admission(LIMITS._replace(pending=3), clock)
+    admission = QueryAdmission(LIMITS._replace(pending=3), clock)
     assert [admission.admit("lab", "a") for _ in range(3)] == [None] * 3
     refusal = admission.admit("lab", "b")
     assert refusal is not None
@@ -78,13 +78,13 @@ def test_refusals_are_limited_and_everything_is_counted(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(admission_module, "REFUSALS_PER_S", 5.0)
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     assert asked(admission, "lab/3d", 30) == {"ok": 10, "rate": 20}
     assert admission.results == {"lab": {"ok": 10, "rate": 5, NO_REPLY: 15}}
 
 
 def test_the_number_of_known_keys_is_limited(clock: Clock) -> None:
-    admission = Admission(LIMITS._replace(per_s=1e6), clock)
+    admission = QueryAdmission(LIMITS._replace(per_s=1e6), clock)
     asked(admission, "lab/3d", 10)
     for number in range(MAX_KEYS - 1):
         asked(admission, f"hostile/{number}", 1)
@@ -95,7 +95,7 @@ def test_the_number_of_known_keys_is_limited(clock: Clock) -> None:
 
 
 def test_the_bytes_of_replies_have_a_rate_and_long_replies_their_own(clock: Clock) -> None:
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     admission.check_reply(999)
     admission.check_reply(999)
     with pytest.raises(QueryError, match=r"zenoh\.max_reply_bytes_per_s") as caught:
@@ -107,7 +107,7 @@ def test_the_bytes_of_replies_have_a_rate_and_long_replies_their_own(clock: Cloc
 
 
 def test_results_are_counted_for_each_source_except_empty_ones(clock: Clock) -> None:
-    admission = Admission(LIMITS, clock)
+    admission = QueryAdmission(LIMITS, clock)
     for source, result in (("lab", "ok"), ("hall", "nothing-yet"), ("lab", "ok"), ("lab", "")):
         admission.admit(source, f"{source}/3d")
         admission.finished(source, result)
