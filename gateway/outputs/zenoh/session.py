@@ -25,6 +25,14 @@ _CLOSE_S: Final = 0.5
 A peer that does not read delays closing by 10 s; a thread then continues without the gateway.
 """
 
+_MAX_CLOSING: Final = 4
+"""How many sessions may be closing when another one is opened.
+
+After hundreds of routers had connected and vanished, closing took 100 s. Until then, a session holds 15 MiB.
+"""
+
+_closers: Final[set[threading.Thread]] = set()  # of all outputs
+
 _HEALTHY: Final = OutputHealth(True)
 
 logger = logging.getLogger(__name__)
@@ -93,7 +101,11 @@ class SessionHolder:
         prepare_threads()
         while not self._closing.is_set():
             try:
+                _check_closing()
                 self._open()
+            except OutputError as error:
+                self._problem = str(error)
+                self._failures.failed(self._problem)
             except zenoh.ZError as error:
                 texts = self._texts
                 self._problem = f"{texts.cannot_open}: {zenoh_reason(error)}; {texts.remedy}"
@@ -178,8 +190,20 @@ class SessionHolder:
 def close_session(session: zenoh.Session, output: str) -> None:
     """Close the session of an output; return when it is closed, or after _CLOSE_S."""
     closer = threading.Thread(target=_close, args=(session, output), name=f"{output}-close", daemon=True)
+    _closers.add(closer)
     thread_starts.start(closer)
     closer.join(_CLOSE_S)
+
+
+def _check_closing() -> None:
+    """Raise OutputError while too many sessions are closing."""
+    num_closing = sum(closer.is_alive() for closer in tuple(_closers))
+    if num_closing >= _MAX_CLOSING:
+        raise OutputError(
+            f"{num_closing} former Zenoh sessions are still closing, because programs connected to them do "
+            "not read; the next one opens after them",
+            cause="not open",
+        )
 
 
 def _close(session: zenoh.Session, output: str) -> None:
@@ -187,3 +211,5 @@ def _close(session: zenoh.Session, output: str) -> None:
         session.close()
     except zenoh.ZError as error:
         logger.debug("%s: closing the session: %s", output, zenoh_reason(error))
+    finally:
+        _closers.discard(threading.current_thread())

@@ -1,6 +1,7 @@
 """The session of an output: opening, everything declared on it, its router, and closing, without Zenoh."""
 
 import logging
+import threading
 from collections.abc import Callable
 from unittest.mock import Mock
 
@@ -34,6 +35,7 @@ class Lab:
         self.before_open: Callable[[], None] = lambda: None
         monkeypatch.setattr(zenoh, "open", self._open)
         monkeypatch.setattr(session_module, "close_session", lambda session, _: self.closed.append(session))
+        monkeypatch.setattr(session_module, "_closers", set())
         config = zenoh_config(zenoh_keys(mode, connect="tcp/192.0.2.9:7447"))
         self.holder = SessionHolder(TEXTS, config, self._declare)
         monkeypatch.setattr(self.holder._closing, "wait", self.waits_s.append)
@@ -134,6 +136,30 @@ def test_closing_ends_the_session_and_the_tries(monkeypatch: pytest.MonkeyPatch)
     assert (late.declared, late.session.close.call_count, late.closed) == ([], 1, [])
     late.open()
     assert len(late.waits_s) == 2
+
+
+def test_only_some_sessions_may_be_closing_when_another_one_opens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Peers that do not read delay closing; reloads must not fill the memory meanwhile."""
+    close_session = session_module.close_session
+    lab, can_close = Lab(monkeypatch, mode="peer"), threading.Event()
+    monkeypatch.setattr(session_module, "_CLOSE_S", 0.0)
+    for _ in range(4):
+        close_session(Mock(close=can_close.wait), "zenoh")
+    closers = list(session_module._closers)
+    problems: list[str] = []
+
+    def wait(_: float) -> None:
+        problems.append(lab.holder.health.problem)
+        can_close.set()
+        closers[0].join()
+
+    monkeypatch.setattr(lab.holder._closing, "wait", wait)
+    lab.open()
+    text = "4 former Zenoh sessions are still closing, because programs connected to them do not read"
+    assert problems == [f"{text}; the next one opens after them"]
+    assert lab.holder.health.connected
+    for closer in closers:
+        closer.join()
 
 
 def test_what_cannot_be_declared_is_declared_on_the_next_session(
