@@ -30,8 +30,8 @@ _LOGGED_CLASSES: Final = {
 _KEYWORDS: Final = {"limitation", "not_open", "cannot_open", "no_router"}
 """The keywords of calls whose values are logged."""
 
-_PRINTING_PACKAGES: Final = {"cli", "demo", "doctor"}
-"""Commands that print their errors instead of logging them."""
+_PRINTING_PACKAGES: Final = {"cli", "client", "doctor"}
+"""Commands that print their errors instead of logging them, and what raises them."""
 
 _PRINTING_MODULES: Final = {"checks.py", "subscriber.py"}
 """The modules of outputs that only commands use."""

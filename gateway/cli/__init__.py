@@ -5,10 +5,10 @@ completion must be quick. The module of a command therefore has its options and 
 it needs to do its work within the function; ``options`` has the options that several commands share.
 
 - Running: ``run``, ``simulate``, ``demo`` (with ``demo_lab``), ``doctor``, ``config``.
-- Listening: ``list_gateways``, ``echo``, ``top``, ``view``, ``params``. ``found_sources`` finds gateways,
-  ``gateway_clients`` asks them questions on Zenoh and LCM.
-- Takes: ``record``, ``replay``, ``export``, ``take``. ``take_gateway`` asks gateways to start and stop takes,
-  ``take_report`` prints what is in one.
+- Listening: ``list_gateways``, ``echo``, ``top``, ``view``, ``params``.
+- Takes: ``record``, ``replay``, ``export``, ``take``. ``take_report`` prints what is in one.
+
+Everything that is asked of running gateways goes through ``gateway.client``.
 
 Modules named after a command (``echo_rates``, ``params_output``, ``record_output``, ``replay_run``) do its
 work. The exit statuses are in docs/reference/commands.md.

@@ -50,7 +50,7 @@ def echo(
 
     from gateway.cli.echo_messages import Limits, print_messages
     from gateway.cli.echo_sources import Silence, Units
-    from gateway.cli.gateway_queries import exit_with
+    from gateway.cli.main import exit_with
     from gateway.errors import QueryError
     from gateway.outputs.kind import SubscriptionRequest
 

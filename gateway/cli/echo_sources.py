@@ -8,8 +8,8 @@ import time
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-from gateway.cli.found_sources import FoundSource, FoundSources, find_sources
-from gateway.cli.params_queries import Replies, query_lcm, query_zenoh
+from gateway.client.client import GatewayAddress, GatewayClient
+from gateway.client.found_sources import FoundSource, FoundSources
 from gateway.config.words import join_or
 from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError
@@ -17,9 +17,8 @@ from gateway.logs.safe_text import quoted, safe_lines, safe_text
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import SubscriptionRequest
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
-from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
@@ -40,27 +39,12 @@ OUTPUTS: Final = ("zenoh", "lcm")
 _COMPONENTS: Final = {message_type: component for component, message_type in MESSAGE_TYPES.items()}
 
 
-def query_parameters(
-    output: str, request: SubscriptionRequest, source: str | None, sections: tuple[str, ...]
-) -> Replies:
-    """Query parameters on the output where ``echo`` subscribes: zenoh or lcm. Raises OutputError."""
-    if output == "lcm":
-        return query_lcm(
-            request.prefix or DEFAULT_LCM_PREFIX,
-            source,
-            sections,
-            fresh=False,
-            url=effective_lcm_url(request.address),
-            timeout_s=QUERY_S,
-        )
-    return query_zenoh(
-        request.prefix or DEFAULT_ZENOH_PREFIX,
-        source,
-        sections,
-        fresh=False,
-        open_session=lambda: open_zenoh(request.address, request.config),
-        timeout_s=QUERY_S,
+def gateway_client(output: str, request: SubscriptionRequest) -> GatewayClient:
+    """Return a client on the output where ``echo`` subscribes: zenoh or lcm."""
+    address = GatewayAddress(
+        output == "lcm", request.address, request.config, request.address, request.prefix
     )
+    return GatewayClient(address, QUERY_S)
 
 
 class _Known(NamedTuple):
@@ -110,10 +94,13 @@ class Units:
         now_s = time.monotonic()
         if now_s - self._failed_s.get(source, -math.inf) < RETRY_S or len(self._failed_s) >= _MAX_FAILED:
             return None
-        with contextlib.suppress(OutputError, ParametersError):
-            for reply in query_parameters(self._output, self._request, source, ()).received:
+        with (
+            contextlib.suppress(OutputError, ParametersError),
+            gateway_client(self._output, self._request) as client,
+        ):
+            for reply in client.parameters(source).received:
                 if reply.source == source and reply.version == version:
-                    known = _Known(version, parse_parameters(reply.xml).parameters, {})
+                    known = _Known(version, parse_parameters(reply.content).parameters, {})
                     self._known[source] = known
                     return known
         self._failed_s[source] = now_s
@@ -163,11 +150,12 @@ class Silence:
     def _look(self) -> None:
         """Find out what exists, in the thread."""
         try:
-            found, absence = find_sources(self._output, self._request)
-            if absence and found.heard:
-                self._error = QueryError(absence, code="no-gateway")
-            else:
-                self._reason = absence or self._why_silent(found)
+            with gateway_client(self._output, self._request) as client:
+                found = client.sources(self._request.source)
+                if found.absence and found.heard:
+                    self._error = QueryError(found.absence, code="no-gateway")
+                else:
+                    self._reason = found.absence or self._why_silent(found, client)
         except QueryError as error:
             self._error = error
         except OutputError as error:
@@ -175,7 +163,7 @@ class Silence:
         except Exception as error:  # noqa: BLE001 - what comes later is printed, whatever this is
             self._reason = f"nothing heard, and the search for gateways failed: {error}"
 
-    def _why_silent(self, found: FoundSources) -> str:
+    def _why_silent(self, found: FoundSources, client: GatewayClient) -> str:
         """Return what the sources do; raise QueryError if they do not have the component."""
         component = self._request.component or ""
         key, _, label = component.partition("/")
@@ -183,14 +171,14 @@ class Silence:
             _check_component(key, found.sources)
         tool_poses = ""
         if label:
-            self._check_tool(label)
+            self._check_tool(label, client)
             tool_poses = f"; poses of single tools need {self._output}.tool_poses: true in the configuration"
         what = f" of {safe_text(component)}" if component else ""
         shown = ", ".join(f"{source.name}: {_state(source)}" for source in found.sources[:_MAX_NAMED])
         return f"nothing heard{what} although a gateway runs ({shown}){tool_poses}"
 
-    def _check_tool(self, label: str) -> None:
-        labels = self._tool_labels()
+    def _check_tool(self, label: str, client: GatewayClient) -> None:
+        labels = self._tool_labels(client)
         if not labels or label == "*" or any(self._is_same(label, each) for each in labels):
             return
         shown = ", ".join(map(safe_text, labels[:_MAX_NAMED])) + (", …" if len(labels) > _MAX_NAMED else "")
@@ -201,12 +189,12 @@ class Silence:
             self._output == "lcm" and lcm_channel("", "", label) == lcm_channel("", "", other)
         )
 
-    def _tool_labels(self) -> list[str]:
+    def _tool_labels(self, client: GatewayClient) -> list[str]:
         """Return the labels of the tools of the sources, each once; [] if they are not known."""
         labels: dict[str, None] = {}
-        for reply in query_parameters(self._output, self._request, self._request.source, ("6d",)).received:
+        for reply in client.parameters(self._request.source, ("6d",)).received:
             try:
-                parameters = parse_parameters(reply.xml).parameters
+                parameters = parse_parameters(reply.content).parameters
             except ParametersError:
                 return []
             num_tools = 0 if parameters.tools is None else len(parameters.tools.tools)

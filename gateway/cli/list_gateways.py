@@ -35,18 +35,17 @@ def list_gateways(
 
     from rich.console import Console
 
-    from gateway.cli.found_sources import find_sources
-    from gateway.cli.gateway_queries import exit_with
     from gateway.cli.list_output import notes, sources_json, write_sources
+    from gateway.cli.main import exit_with
+    from gateway.client.client import GatewayAddress, GatewayClient
     from gateway.errors import QueryError
-    from gateway.outputs.kind import SubscriptionRequest
 
-    request = SubscriptionRequest(source, None, prefix, url if lcm else connect, zenoh_config)
-    found, absence = find_sources("lcm" if lcm else "zenoh", request)
+    with GatewayClient(GatewayAddress(lcm, connect, zenoh_config, url, prefix)) as client:
+        found = client.sources(source)
     if as_json:
         print(sources_json(found))
     elif found.sources:
         write_sources(found, Console())
     for note in notes(found):
         print(f"note: {note}", file=sys.stderr)
-    exit_with([QueryError(absence, code="no-gateway")] if absence else [])
+    exit_with([QueryError(found.absence, code="no-gateway")] if found.absence else [])

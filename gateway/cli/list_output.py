@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
+from gateway.client.found_sources import FoundSource, FoundSources, FoundStream
 from gateway.display.terminal.lists import list_table, write_records
 from gateway.logs.safe_text import safe_json
 from gateway.stream.status_text import Level, source_text, stream_level

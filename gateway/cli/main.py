@@ -1,7 +1,7 @@
 """The command line ``rtc3d-gateway``.
 
 Exit status: 0 success, 1 failure, 2 wrong command line or configuration, 130 Ctrl-C or SIGTERM.
-Commands that ask gateways have three more.
+Commands that ask gateways have three more: EXIT_STATUSES.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
 from types import FrameType
 from typing import Annotated, Any, Final, NoReturn
@@ -21,7 +21,7 @@ import typer.core
 
 from gateway import version_text
 from gateway.cli.completion import is_completion
-from gateway.errors import ConfigError, GatewayError, SelectionError
+from gateway.errors import ConfigError, GatewayError, QueryError, SelectionError
 from gateway.logs.safe_text import safe_lines
 from gateway.service.process_end import end_process
 
@@ -49,6 +49,18 @@ complete a line do not wait. So a function imports what it needs when it runs. A
 
 ALIASES: Final = {"check": "gateway.cli.config:check"}
 """Other names of commands, which are not listed: ``check`` is ``config check``."""
+
+
+EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}
+"""Exit status by the code of the first problem with gateways; 1 for every other code."""
+
+
+def exit_with(problems: Sequence[QueryError]) -> None:
+    """Print problems, each once, and end with the status of the first one; without any, return."""
+    for text in dict.fromkeys(str(problem) for problem in problems):
+        print(safe_lines(text), file=sys.stderr)
+    if problems:
+        raise typer.Exit(EXIT_STATUSES.get(problems[0].code, 1))
 
 
 class LazyGroup(typer.core.TyperGroup):

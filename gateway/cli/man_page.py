@@ -11,8 +11,7 @@ from typing import Any, Final
 import typer
 import typer.core
 
-from gateway.cli.gateway_queries import EXIT_STATUSES
-from gateway.cli.main import app
+from gateway.cli.main import EXIT_STATUSES, app
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 

@@ -58,30 +58,12 @@ def params(
     if unknown := set(wanted) - set(SECTIONS):
         raise typer.BadParameter(f"unknown section {min(unknown)!r}; known sections: {', '.join(SECTIONS)}")
 
-    from gateway.cli.gateway_queries import exit_with
+    from gateway.cli.main import exit_with
     from gateway.cli.params_output import write_replies
-    from gateway.cli.params_queries import query_lcm, query_zenoh
-    from gateway.outputs.lcm.settings import effective_lcm_url
-    from gateway.outputs.zenoh.subscriber import open_zenoh
+    from gateway.client.client import GatewayAddress, GatewayClient
 
-    if lcm:
-        replies, problems = query_lcm(
-            prefix or "MOCAP",
-            source,
-            wanted,
-            fresh=fresh,
-            url=effective_lcm_url(url),
-            queries_url=queries_url,
-            timeout_s=timeout,
-        )
-    else:
-        replies, problems = query_zenoh(
-            prefix or "mocap",
-            source,
-            wanted,
-            fresh=fresh,
-            open_session=lambda: open_zenoh(connect, zenoh_config),
-            timeout_s=timeout,
-        )
+    address = GatewayAddress(lcm, connect, zenoh_config, url, prefix, queries_url)
+    with GatewayClient(address, timeout) as client:
+        replies, problems = client.parameters(source, wanted, fresh=fresh)
     problems += write_replies(replies, "json" if as_json else "xml" if as_xml else "table", sys.stdout)
     exit_with(problems)

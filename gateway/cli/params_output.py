@@ -8,7 +8,7 @@ from typing import Any, BinaryIO, Final, Literal, NamedTuple, TextIO
 from rich.console import Console
 from rich.text import Text
 
-from gateway.cli.params_queries import ParametersReply
+from gateway.client.transport import Reply
 from gateway.display.terminal.lists import print_list, write_records
 from gateway.errors import ParametersError, QueryError
 from gateway.logs.safe_text import safe_json, safe_text
@@ -173,9 +173,7 @@ class _SourceParameters(NamedTuple):
     age_s: float | None
 
 
-def write_replies(
-    replies: Sequence[ParametersReply], output_format: OutputFormat, out: TextIO
-) -> list[QueryError]:
+def write_replies(replies: Sequence[Reply], output_format: OutputFormat, out: TextIO) -> list[QueryError]:
     """Write the parameters of all sources to ``out``; return the problems in them.
 
     "table" means one list per section, "json" one object with the sources as keys, and "xml" the XML
@@ -198,11 +196,11 @@ def write_replies(
     return problems
 
 
-def _merge(parameters: Parameters, reply: ParametersReply, problems: list[QueryError]) -> Parameters:
+def _merge(parameters: Parameters, reply: Reply, problems: list[QueryError]) -> Parameters:
     """Return ``parameters`` with the sections of ``reply``; append problems to ``problems``."""
     name = f"source {reply.source!r}"
     try:
-        parsed = parse_parameters(reply.xml).parameters
+        parsed = parse_parameters(reply.content).parameters
     except ParametersError as error:
         problems.append(QueryError(f"{name}: {error}; use --xml to see it", code="unreadable"))
         return parameters
@@ -214,11 +212,11 @@ def _merge(parameters: Parameters, reply: ParametersReply, problems: list[QueryE
     return replace(parameters, **fields)
 
 
-def _write_xml(replies: Sequence[ParametersReply], out: BinaryIO) -> None:
+def _write_xml(replies: Sequence[Reply], out: BinaryIO) -> None:
     for reply in replies:
         if len(replies) > 1:
             out.write(f"<!-- {reply.source} {' '.join(reply.sections)} -->\n".encode())
-        out.write(reply.xml.rstrip(b"\0\r\n") + b"\n")
+        out.write(reply.content.rstrip(b"\0\r\n") + b"\n")
 
 
 def _write_json(by_source: dict[str, _SourceParameters], out: BinaryIO) -> None:

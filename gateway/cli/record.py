@@ -26,7 +26,7 @@ from gateway.cli.run import StopSignals
 
 if TYPE_CHECKING:
     from gateway.cli.record_output import RecordProgress
-    from gateway.subscriber.subscribe import GatewaySubscriber
+    from gateway.client.transport import GatewaySubscriber
     from gateway.takes.recorder.take_recording import TakeRecording
 
 _TICK_S: Final = 0.1
@@ -65,8 +65,9 @@ def record(
     check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
     details = checked_details(subject, session, note)
     from gateway.cli.record_output import RecordProgress, print_summary
-    from gateway.subscriber.lcm_subscriber import START_S
-    from gateway.subscriber.subscribe import Transport, close_in_time, subscribe_all
+    from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.client.lcm_subscriber import START_S
+    from gateway.client.transport import close_in_time
     from gateway.takes.recorder.take_recording import TakeRecording
     from gateway.takes.recorder.target import FileSink, Target
 
@@ -77,8 +78,8 @@ def record(
     )
     sources = list(dict.fromkeys(source or ()))
     try:
-        transport = Transport(lcm, connect, zenoh_config, url, prefix)
-        subscriber = subscribe_all(transport, sources, component, recording)
+        client = GatewayClient(GatewayAddress(lcm, connect, zenoh_config, url, prefix))
+        subscriber = client.subscribe(sources, component, recording)
         progress = RecordProgress(recording, subscriber, sources, quiet=quiet)
         try:
             _run(recording, subscriber, progress, stop, seconds)

@@ -12,10 +12,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from gateway.client.reception import MAX_SERIES, MAX_SOURCES
+from gateway.client.series import POSE
+from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
-from gateway.subscriber.reception import MAX_SERIES, MAX_SOURCES
-from gateway.subscriber.series import POSE
-from gateway.subscriber.subscribe import GatewaySubscriber
 from gateway.takes.recorder.take_recording import RecordedSeries, RecordedSource, TakeRecording
 from gateway.takes.recorder.target import FileSink
 

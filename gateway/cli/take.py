@@ -2,8 +2,9 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,10 +19,16 @@ from gateway.cli.options import (
     SubjectOption,
     UrlOption,
     ZenohConfigOption,
+    check_transport,
     checked_details,
     checked_take_name,
 )
-from gateway.logs.safe_text import safe_json
+from gateway.logs.safe_text import safe_json, safe_text
+
+if TYPE_CHECKING:
+    from gateway.cli.take_report import ListedTake
+    from gateway.client.client import GatewayClient
+    from gateway.client.transport import Replies
 
 _NameArgument = Annotated[
     str | None,
@@ -55,10 +62,10 @@ def start(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    from gateway.cli.take_gateway import gateway_address, start_take
-
-    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    start_take(address, name, checked_details(subject, session, note), as_json=as_json)
+    details = checked_details(subject, session, note)
+    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
+        replies = client.start_take(name, details, source=source)
+    _print_replies(replies, lambda take: f"take {take.name!r} is running", as_json=as_json)
 
 
 def stop(
@@ -76,10 +83,9 @@ def stop(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else, also a take that lacks messages.
     """
-    from gateway.cli.take_gateway import gateway_address, stop_take
-
-    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    stop_take(address, as_json=as_json)
+    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
+        replies = client.stop_take(source=source)
+    _print_replies(replies, lambda take: f"take {take.name!r} is stopped: {take.facts}", as_json=as_json)
 
 
 def save(
@@ -108,10 +114,13 @@ def save(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    from gateway.cli.take_gateway import gateway_address, save_take
-
-    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    save_take(address, name, last, after, checked_details(subject, session, note), as_json=as_json)
+    details = checked_details(subject, session, note)
+    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
+        replies = client.save_take(name, details, last_s=last, after_s=after, source=source)
+    goes_on = f", and goes on for {after:g} s" if after else ""
+    _print_replies(
+        replies, lambda take: f"take {take.name!r} is saved: {take.facts}{goes_on}", as_json=as_json
+    )
 
 
 def list_(
@@ -129,10 +138,18 @@ def list_(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    from gateway.cli.take_gateway import gateway_address, list_takes
+    from rich.console import Console
 
-    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    list_takes(address, as_json=as_json)
+    from gateway.cli.main import exit_with
+    from gateway.cli.take_report import write_list
+
+    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
+        replies = client.takes(source)
+    if as_json:
+        _print_json(replies.received)
+    else:
+        write_list(replies.received, Console(file=sys.stdout))
+    exit_with(replies.problems)
 
 
 def fetch(
@@ -154,10 +171,67 @@ def fetch(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    from gateway.cli.take_gateway import copy_take, gateway_address
+    from gateway.cli.export_progress import file_progress
+    from gateway.cli.main import exit_with
+    from gateway.cli.take_report import size_text
+    from gateway.errors import QueryError
+    from gateway.takes.files.new_file import NewFiles
+    from gateway.takes.files.reader import SUFFIX
 
-    address = gateway_address(source, False, connect, zenoh_config, None, None, prefix, timeout)
-    copy_take(address, name, file, quiet=quiet)
+    log = f"{name}{SUFFIX}"
+    path = Path(log) if file is None else file / log if file.is_dir() else file
+    try:
+        with NewFiles() as files:
+            copy = files.create(path)  # before a long transfer: the file may exist already
+            with (
+                _client(False, connect, zenoh_config, None, None, prefix, timeout) as client,
+                file_progress(f"fetching {name}", quiet=quiet) as progress,
+            ):
+                fetched = client.fetch_take(name, copy, source=source, progress=progress)
+    except QueryError as error:
+        exit_with([error])
+        return
+    what = f"{size_text(fetched.num_bytes)} of take {name!r} of source {fetched.source!r}"
+    what = what if fetched.is_complete else f"the first {what}, which is still running"
+    print(safe_text(f"{path}: {what}"))
+
+
+def _client(
+    lcm: bool,
+    connect: str | None,
+    zenoh_config: Path | None,
+    url: str | None,
+    queries_url: str | None,
+    prefix: str | None,
+    timeout_s: float,
+) -> "GatewayClient":
+    """Return the client that options choose. Raises BadParameter if they contradict."""
+    from gateway.client.client import GatewayAddress, GatewayClient
+
+    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url, queries_url=queries_url)
+    return GatewayClient(GatewayAddress(lcm, connect, zenoh_config, url, prefix, queries_url), timeout_s)
+
+
+def _print_replies(
+    replies: "Replies[dict[str, dict[str, Any]]]", text: Callable[["ListedTake"], str], *, as_json: bool
+) -> None:
+    """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
+    from gateway.cli.main import exit_with
+    from gateway.cli.take_report import ListedTake
+
+    takes = {source: ListedTake(content) for source, content in replies.received.items()}
+    if as_json:
+        _print_json(replies.received)
+    else:
+        for source, take in takes.items():
+            print(safe_text(f"{source}: {text(take)}"))
+    exit_with(replies.problems)
+    if any(take.problem for take in takes.values()):
+        raise typer.Exit(1)
+
+
+def _print_json(content: Any) -> None:
+    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -194,7 +268,7 @@ def info(
     with file_progress(f"reading {file.name}", quiet=quiet) as progress:
         statistics = take_statistics(file, progress)
     if as_json:
-        print(safe_json(json.dumps(statistics_json(statistics), indent=2, ensure_ascii=False)))
+        _print_json(statistics_json(statistics))
     else:
         write_report(statistics, Console(file=sys.stdout))
     if statistics.was_cut_short:

@@ -38,6 +38,11 @@ class ListedTake:
         return size_text(self.num_bytes)
 
     @property
+    def facts(self) -> str:
+        """The duration, the size and the problem."""
+        return ", ".join(filter(None, (self.duration_text, self.size_text, self.problem)))
+
+    @property
     def duration_text(self) -> str:
         """The duration, such as "12.3 s", "4 min 12.3 s" or "1 h 2 min 3.4 s"."""
         minutes, seconds = divmod(round(self.seconds, 1), 60)

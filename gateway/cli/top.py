@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
-from gateway.cli.gateway_queries import exit_with
+from gateway.cli.main import exit_with
 from gateway.cli.options import (
     ConnectOption,
     PrefixOption,
@@ -26,8 +26,9 @@ from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.logs.safe_text import safe_lines, safe_text
 
 if TYPE_CHECKING:
+    from gateway.client.client import GatewayAddress
+    from gateway.client.transport import GatewaySubscriber
     from gateway.display.live.live_data import LiveData
-    from gateway.subscriber.subscribe import GatewaySubscriber, Transport
 
 _MAX_TITLE: Final = 60
 _MAX_WIDTH: Final = 10_000
@@ -56,15 +57,16 @@ def top(
     With --once, exit status 3 if no gateway is found, or none that serves a source.
     """
     check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
-    from gateway.subscriber.subscribe import Transport
+    from gateway.client.client import GatewayAddress
 
-    transport = Transport(lcm, connect, zenoh_config, url, prefix)
-    _run(transport, list(dict.fromkeys(source or ())), is_once=once, as_json=as_json)
+    address = GatewayAddress(lcm, connect, zenoh_config, url, prefix)
+    _run(address, list(dict.fromkeys(source or ())), is_once=once, as_json=as_json)
 
 
-def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: bool) -> None:
+def _run(address: "GatewayAddress", wanted: list[str], *, is_once: bool, as_json: bool) -> None:
+    from gateway.client.client import GatewayClient
+    from gateway.client.transport import close_in_time
     from gateway.display.live.live_data import LiveData
-    from gateway.subscriber.subscribe import close_in_time, subscribe_all
 
     is_shown = not (is_once or as_json) and has_screen(sys.stdout, os.environ)
     notices: deque[str] = deque(maxlen=1)
@@ -73,10 +75,10 @@ def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: b
     else:
         set_up_log(LogLevel.WARNING)
     live = LiveData()
-    subscriber = subscribe_all(transport, wanted, None, live)
+    subscriber = GatewayClient(address).subscribe(wanted, None, live)
     try:
         if is_shown:
-            _show(live, subscriber, notices, _title(transport))
+            _show(live, subscriber, notices, _title(address))
         else:
             _print(live, subscriber, wanted, is_once=is_once or not as_json, as_json=as_json)
     finally:
@@ -88,8 +90,8 @@ def has_screen(out: TextIO, environ: Mapping[str, str]) -> bool:
     return out.isatty() and environ.get("TERM", "dumb") not in {"", "dumb", "unknown"}
 
 
-def _title(transport: "Transport") -> str:
-    words = ("LCM", transport.url) if transport.is_lcm else ("Zenoh", transport.connect)
+def _title(address: "GatewayAddress") -> str:
+    words = ("LCM", address.url) if address.is_lcm else ("Zenoh", address.connect)
     return safe_text(" ".join(filter(None, words)), _MAX_TITLE)
 
 

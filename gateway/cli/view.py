@@ -25,10 +25,11 @@ from gateway.logs.safe_text import safe_text
 from gateway.outputs.listen_address import is_loopback
 
 if TYPE_CHECKING:
+    from gateway.client.client import GatewayAddress
+    from gateway.client.transport import GatewaySubscriber
     from gateway.display.live.live_data import LiveData
     from gateway.display.view.server import ViewServer
     from gateway.display.view.viewer import Viewer
-    from gateway.subscriber.subscribe import GatewaySubscriber, Transport
 
 VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
@@ -64,14 +65,14 @@ def view(
         raise typer.BadParameter(
             "a take is read from its file; --lcm, --connect and --prefix are for live data"
         )
-    from gateway.subscriber.subscribe import Transport
+    from gateway.client.client import GatewayAddress
 
     stop = StopSignals(lambda _: os._exit(0))
     server = _open_server(host, port)
     try:
         if take is None:
-            transport = Transport(lcm, connect, zenoh_config, url, prefix)
-            show = _live_data(transport, source or (), server)
+            address = GatewayAddress(lcm, connect, zenoh_config, url, prefix)
+            show = _live_data(address, source or (), server)
         else:
             show = _take(take, source or (), server)
         with show as (viewer, tick):
@@ -83,16 +84,17 @@ def view(
 
 @contextmanager
 def _live_data(
-    transport: "Transport", sources: Sequence[str], server: "ViewServer"
+    address: "GatewayAddress", sources: Sequence[str], server: "ViewServer"
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Subscribe, and provide a viewer of what arrives."""
+    from gateway.client.client import GatewayClient
+    from gateway.client.transport import close_in_time
     from gateway.display.live.live_data import LiveData
     from gateway.display.view.server import RunningTakes
     from gateway.display.view.viewer import Viewer
-    from gateway.subscriber.subscribe import close_in_time, subscribe_all
 
     live = LiveData()
-    subscriber = subscribe_all(transport, sources, None, live)
+    subscriber = GatewayClient(address).subscribe(sources, None, live)
     takes = RunningTakes(live, subscriber, server.get_clients)
 
     def tick() -> None:
@@ -160,7 +162,7 @@ def _has_display() -> bool:
 
 def _explain_silence(live: "LiveData", subscriber: "GatewaySubscriber") -> None:
     """Print why nothing has arrived, if that is so. The page goes on waiting."""
-    from gateway.subscriber.subscribe import silence_text
+    from gateway.client.transport import silence_text
 
     if live.first_heard_s is not None:
         return

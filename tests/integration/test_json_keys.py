@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 import pytest
 import zenoh
 
+from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.display.live.live_data import LiveData
-from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.files.event_log import EventLogReader
 from tests.command_process import run_command
 from tests.configurations import write_config
@@ -111,7 +111,8 @@ def test_recordings_have_messages_and_no_json(lab: Lab, tmp_path: Path) -> None:
 
 def test_the_view_receives_messages_and_no_json(lab: Lab) -> None:
     live = LiveData()
-    with contextlib.closing(subscribe_all(Transport(connect=lab.endpoint), ["lab"], None, live)):
+    client = GatewayClient(GatewayAddress(connect=lab.endpoint))
+    with contextlib.closing(client.subscribe(["lab"], None, live)):
         wait_until(lambda: any(series.num_messages > 100 for series in live.all_series))
         wait_until(lambda: len(live.all_series) >= 8)
     assert (live.num_foreign, live.num_beyond) == (0, 0)

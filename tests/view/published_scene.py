@@ -13,10 +13,10 @@ import numpy as np
 import rtc3d
 import zenoh
 
+from gateway.client.series import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from gateway.subscriber.series import FINGERPRINTS
 from tests.networks import free_endpoint, open_zenoh
 from tests.queried_gateway import parameters_xml
 

@@ -7,6 +7,8 @@ from typing import Any, Final, NamedTuple
 
 import rtc3d
 
+from gateway.client.reception import Reception
+from gateway.client.series import Series, Source
 from gateway.descriptions.labels import EventText, event_text
 from gateway.display.live.component import LiveComponent
 from gateway.errors import ParametersError, ProtocolError
@@ -16,8 +18,6 @@ from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.subscriber.reception import Reception
-from gateway.subscriber.series import Series, Source
 
 NUM_EVENTS: Final = 20
 """How many of the newest events of a source are kept."""

@@ -11,13 +11,13 @@ from typing import Any, Final
 
 from rich.cells import cell_len
 
+from gateway.client.transport import GatewaySubscriber, silence_text
 from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.display.terminal.screen import Keyboard, Line, Screen, Style, is_in_front
 from gateway.display.top.pages import PAGES
 from gateway.display.top.table import Order, Table, filtered, laid_out, sorted_by, wrapped
 from gateway.logs.safe_text import safe_text
 from gateway.outputs.discovery import DISCOVERY_S
-from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 
 _MAX_FILTER: Final = 60
 _MAX_NOTICE_LINES: Final = 3

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final, NamedTuple, TypeVar
 
+from gateway.client.series import POSE
 from gateway.descriptions.labels import describe
 from gateway.display.live.component import LiveComponent, Percentiles
 from gateway.display.live.live_data import LiveSource
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.stream.status_text import Level, message_texts, source_text, stream_level
-from gateway.subscriber.series import POSE
 
 _MAX_ENTRIES: Final = 50
 """How many streams, outputs, causes and results of a status are taken, of each kind."""

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TextIO
 
+from gateway.client.transport import GatewaySubscriber, silence_text
 from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.display.terminal.screen import Line, Style, encoded, line_text
 from gateway.display.top.facts import source_facts
@@ -14,7 +15,6 @@ from gateway.logs.safe_text import safe_json
 from gateway.messages.decode import json_text
 from gateway.messages.host_time import now_utime
 from gateway.outputs.discovery import DISCOVERY_S, missing_source
-from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 
 _PICTURE_S: Final = 2.5
 """How long after the first message a picture is complete: rates are over 2 s, statuses come every second."""

@@ -16,12 +16,12 @@ import rich
 import viser
 import websockets.asyncio.server
 
+from gateway.client.transport import GatewaySubscriber
 from gateway.display.live.component import Percentiles
 from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.errors import ViewError
 from gateway.messages.host_time import now_utime
 from gateway.outputs.listen_address import foreign_request
-from gateway.subscriber.subscribe import GatewaySubscriber
 
 _NUM_SAMPLES: Final = 300
 """10 s at 30 pictures per second."""

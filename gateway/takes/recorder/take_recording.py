@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable, Collection
 from typing import Final
 
+from gateway.client.reception import Reception
+from gateway.client.series import Series, Source
 from gateway.messages.host_time import now_utime
 from gateway.outputs.parameters_message import published_again
-from gateway.subscriber.reception import Reception
-from gateway.subscriber.series import Series, Source
 from gateway.takes.files.description import (
     NO_DETAILS,
     TakeDetails,

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.display.live.live_data import LiveData
 from gateway.display.view.server import RunningTakes
 from gateway.outputs.takes.control import MAX_PIECE_BYTES
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway
-from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from tests.networks import free_endpoint, lcm_url
@@ -102,8 +102,8 @@ def markers(path: Path) -> int:
 async def test_the_view_learns_which_take_is_running_while_a_page_is_open(tmp_path: Path, side: str) -> None:
     async with lab(tmp_path / "takes") as at:
         live, pages = LiveData(), [1]
-        transport = Transport(True, url=at.url) if side == "lcm" else Transport(connect=at.endpoint)
-        subscriber = await asyncio.to_thread(subscribe_all, transport, (), None, live)
+        client = GatewayClient(GatewayAddress(side == "lcm", connect=at.endpoint, url=at.url))
+        subscriber = await asyncio.to_thread(client.subscribe, (), None, live)
         takes = RunningTakes(live, subscriber, lambda: pages, period_s=0.05)
 
         def shown() -> str | None:

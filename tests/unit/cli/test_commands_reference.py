@@ -9,8 +9,7 @@ import pytest
 import typer.core
 from typer.core import TyperCommand
 
-from gateway.cli.gateway_queries import EXIT_STATUSES
-from gateway.cli.main import app
+from gateway.cli.main import EXIT_STATUSES, app
 
 REFERENCE = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text(encoding="utf-8")
 

@@ -6,7 +6,8 @@ import pytest
 
 from gateway.cli import echo_sources as silence_module
 from gateway.cli.echo_sources import Silence
-from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
+from gateway.client.client import GatewayClient
+from gateway.client.found_sources import FoundSource, FoundSources, FoundStream
 from gateway.errors import OutputError, QueryError
 from gateway.outputs.kind import SubscriptionRequest
 from tests.waiting import wait_until
@@ -35,12 +36,13 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     """Return a function that returns what is said within the time of many checks, or raises what they do."""
 
     def say(found: FoundSources | Exception, absence: str = "", component: str | None = None) -> str:
-        def find(*_: object) -> tuple[FoundSources, str]:
+        def find(*_: object) -> FoundSources:
             if isinstance(found, Exception):
                 raise found
-            return found, absence
+            found.absence = absence
+            return found
 
-        monkeypatch.setattr(silence_module, "find_sources", find)
+        monkeypatch.setattr(GatewayClient, "sources", find)
         silence = Silence("zenoh", SubscriptionRequest(component=component))
         texts: list[str] = []
 

@@ -7,8 +7,7 @@ import sys
 
 import typer
 
-from gateway.cli.gateway_queries import EXIT_STATUSES
-from gateway.cli.main import app
+from gateway.cli.main import EXIT_STATUSES, app
 from gateway.cli.man_page import man_page
 from tests.unit.cli.test_commands_reference import COMMANDS
 

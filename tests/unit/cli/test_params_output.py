@@ -7,7 +7,7 @@ import re
 import pytest
 
 from gateway.cli.params_output import OutputFormat, write_replies
-from gateway.cli.params_queries import ParametersReply, Sections
+from gateway.client.transport import Reply
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS
 from tests.spec_parameters import ALL, in_root, spec_body, spec_xml
@@ -15,11 +15,11 @@ from tests.spec_parameters import ALL, in_root, spec_body, spec_xml
 EVERYTHING = in_root(*(spec_body(section).decode() for section in ("general", "3d", "6d", "analog")))
 
 
-def reply(source: str, sections: Sections, xml: bytes, age_s: float | None = 0.0) -> ParametersReply:
-    return ParametersReply(source, sections, xml, age_s)
+def reply(source: str, sections: tuple[str, ...], xml: bytes, age_s: float | None = 0.0) -> Reply:
+    return Reply(source, sections, xml, {"age_s": age_s})
 
 
-def written(output_format: OutputFormat, *replies: ParametersReply) -> tuple[str, list[tuple[str, str]]]:
+def written(output_format: OutputFormat, *replies: Reply) -> tuple[str, list[tuple[str, str]]]:
     """Return the text written, and code and text of each problem."""
     buffer = io.BytesIO()
     out = io.TextIOWrapper(buffer, encoding="utf-8", write_through=True)
@@ -85,7 +85,7 @@ def test_each_section_is_a_table(section: str, title: str, rows: list[list[str]]
     ids=["those requested", "all that exist"],
 )
 @pytest.mark.usefixtures("wide_terminal")
-def test_only_requested_sections_are_written(sections: Sections, titles: list[str]) -> None:
+def test_only_requested_sections_are_written(sections: tuple[str, ...], titles: list[str]) -> None:
     text, problems = written("table", reply("lab", sections, EVERYTHING, None))
     found = [line.rstrip() for line in text.splitlines() if line.startswith("lab:")]
     assert (found, problems) == ([f"lab: {title}" for title in titles], [])

@@ -1,4 +1,4 @@
-"""What ``take list`` and ``take info`` print, and the replies of several sources to a command for takes."""
+"""What ``take list`` and ``take info`` print."""
 
 import io
 import json
@@ -10,9 +10,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from gateway.cli.main import app
-from gateway.cli.take_gateway import GatewayAddress, TakeReplies
 from gateway.cli.take_report import ListedTake, size_text, write_list
-from gateway.errors import QueryError, TakeError
+from gateway.errors import TakeError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from tests.takes import description, markers, parameters, write_take
 
@@ -70,33 +69,6 @@ def test_durations_and_sizes() -> None:
     durations = [ListedTake({"seconds": seconds}).duration_text for seconds in (0, 59.96, 3600.04, 7384.5)]
     assert durations == ["0.0 s", "1 min 0.0 s", "1 h 0 min 0.0 s", "2 h 3 min 4.5 s"]
     assert [size_text(each) for each in (0, 999, 1000, 2.5e9)] == ["0 bytes", "999 bytes", "1.0 kB", "2.5 GB"]
-
-
-CODES = ("disabled", "nothing-yet", "refused")
-
-
-@pytest.mark.parametrize(
-    ("source", "received", "action", "codes"),
-    [
-        (None, {"lab": {}}, "stop", CODES[2:]),
-        (None, {"lab": {}}, "start", CODES[1:]),
-        (None, {}, "stop", CODES),
-        ("lab", {"lab": {}}, "stop", CODES),
-    ],
-)
-def test_sources_that_are_not_concerned_are_left_out(
-    monkeypatch: pytest.MonkeyPatch,
-    source: str | None,
-    received: dict[str, Any],
-    action: str,
-    codes: tuple[str, ...],
-) -> None:
-    """Replies of several sources to one command for takes."""
-    problems = [QueryError(code, code=code) for code in CODES]
-    monkeypatch.setattr(GatewayAddress, "_ask_zenoh", lambda *_: TakeReplies(received, problems))
-    replies = GatewayAddress(source, False, None, None, None, None, None, 1.0).ask({"set": action})
-    assert replies.received == received
-    assert tuple(problem.code for problem in replies.problems) == codes
 
 
 PARAMETERS = Parameters(markers=Parameters3D(100.0, "mm", (Marker("1", "head[red]"), Marker("2", "foot"))))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import rtc3d
 
+from gateway.client.series import FINGERPRINTS
 from gateway.display.live import component as live_component
 from gateway.display.live.component import LiveComponent
 from gateway.display.live.live_data import NUM_EVENTS, LiveData, LiveSource
@@ -13,7 +14,6 @@ from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters
 from gateway.rtc3d.components import ITEM_DTYPES, MISSING, ComponentType
-from gateway.subscriber.series import FINGERPRINTS
 
 XML = b"""<Parameters><The_3D><Markers>2</Markers><Frequency>200</Frequency>
 <Marker><Label>LASI</Label></Marker><Marker><Label>RASI</Label></Marker></The_3D></Parameters>"""

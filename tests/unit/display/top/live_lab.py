@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import rtc3d
 
+from gateway.client.series import FINGERPRINTS
 from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.messages.encode import PREFIX
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, MISSING
-from gateway.subscriber.series import FINGERPRINTS
 
 
 class LiveLab:

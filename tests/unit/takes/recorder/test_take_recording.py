@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import pytest
 import rtc3d
 
+from gateway.client import reception
+from gateway.client import series as subscriber_series
+from gateway.client.reception import MAX_SOURCES
+from gateway.client.series import FINGERPRINTS
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
 from gateway.rtc3d.components import ComponentType
-from gateway.subscriber import reception
-from gateway.subscriber import series as subscriber_series
-from gateway.subscriber.reception import MAX_SOURCES
-from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader

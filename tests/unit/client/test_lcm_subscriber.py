@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import rtc3d
 
+from gateway.client.client import GatewayAddress, GatewayClient
+from gateway.client.reception import MAX_SOURCES
+from gateway.client.series import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.subscriber.lcm_subscriber import LcmGatewaySubscriber
-from gateway.subscriber.reception import MAX_SOURCES
-from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.recorder.take_recording import TakeRecording
 from gateway.takes.recorder.target import FileSink, Target
@@ -29,7 +29,8 @@ class Lab:
         self.path = folder / "walk.lcmlog"
         self.lcm = open_lcm(url)
         self.recording = TakeRecording(lambda names: FileSink(target.open(names)))
-        self.subscriber = LcmGatewaySubscriber(url, "MOCAP", sources, None, self.recording)
+        client = GatewayClient(GatewayAddress(is_lcm=True, url=url))
+        self.subscriber = client.subscribe(sources, None, self.recording)
 
     def markers(self, sequence: int) -> bytes:
         return FINGERPRINTS["3d"] + PREFIX.pack(1_000_000, 1_000_000, sequence, 1, 1) + bytes(16)

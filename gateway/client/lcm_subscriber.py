@@ -1,22 +1,25 @@
-"""Receiving what gateways publish on LCM."""
+"""Receiving what gateways publish on LCM, and what they reply to requests."""
 
+import itertools
 import logging
 import re
 import uuid
-from collections.abc import Collection
+from collections import OrderedDict
+from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, Final
 
 import rtc3d
 
-from gateway.errors import OutputError, ProtocolError
+from gateway.client.reception import MAX_SERIES, Reception
+from gateway.client.series import FINGERPRINTS, POSE, Series, Source
+from gateway.client.transport import BUSY_CODES
+from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
-from gateway.subscriber.reception import MAX_SERIES, Reception
-from gateway.subscriber.series import FINGERPRINTS, POSE, Series, Source
 
 START_S: Final = 1.2
 """Each source is heard within this time, because it sends a status once a second."""
@@ -25,13 +28,16 @@ _POSE_MARK: Final = "_6D_"
 
 _KEYS_BY_FINGERPRINT: Final = {fingerprint: key for key, fingerprint in FINGERPRINTS.items()}
 
+_MAX_WAITING: Final = 4096
+"""For how many requests a reply is awaited: a source that never replies must not take up memory."""
+
 logger = logging.getLogger(__name__)
 
 
 class LcmGatewaySubscriber:
-    """Subscribes on an LCM URL, and asks on the URL of requests that belongs to it. Raises OutputError.
+    """Subscribes on an LCM URL, and asks with a ``requester``, which ``close`` closes. Raises OutputError.
 
-    Messages are received in one thread, answers in another.
+    Messages are received in one thread, replies in another.
     """
 
     def __init__(
@@ -41,29 +47,18 @@ class LcmGatewaySubscriber:
         sources: Collection[str],
         components: Collection[str] | None,
         reception: Reception[Any, Any],
+        requester: "LcmRequester",
     ) -> None:
         self._url = url
         self._prefix = prefix
         self._names = {lcm_channel(prefix, name): name for name in sources}
         self._reception = reception
         self._series: dict[str, Series | None] = {}  # by channel; None: left out
-        self._requester = f"rtc3d-gateway {uuid.uuid4()}"
-        self._by_request_id: dict[int, Source] = {}
-        self._take_queries: dict[str, int] = {}
+        self._requester = requester
+        self._take_requests: dict[str, Any] = {}
         """The newest request for the takes of each source, by the beginning of its channels."""
-        self._num_take_queries = 0
-        self._subscribers = [
-            LcmSubscriber(
-                open_lcm(receiving_url(url)), _pattern(prefix, [*self._names], components), self._receive
-            )
-        ]
-        try:
-            self._queries = open_lcm(lcm_queries_url(url))
-        except OutputError:
-            self._subscribers[0].close()
-            raise
-        replies = f"{re.escape(prefix)}_.+_(PARAMETERS|COMMAND)_REPLY"
-        self._subscribers.append(LcmSubscriber(self._queries, replies, self._receive_reply))
+        pattern = _pattern(prefix, [*self._names], components)
+        self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
     # In the threads that receive.
 
@@ -125,19 +120,8 @@ class LcmGatewaySubscriber:
         if lcm_channel(self._prefix, name) == source.channels:
             source.name, source.has_known_name = name, True
 
-    def _receive_reply(self, _channel: str, data: bytes) -> None:
-        try:
-            reply = decode(data)
-        except ProtocolError:
-            return
-        replies = (rtc3d.parameters_reply_t, rtc3d.command_reply_t)
-        if not isinstance(reply, replies) or reply.requester != self._requester:
-            return
-        if isinstance(reply, rtc3d.command_reply_t):
-            self._receive_takes(reply)
-            return
-        source = self._by_request_id.get(reply.request_id)
-        if source is None or reply.error_code in {"busy", "rate"}:
+    def _receive_parameters(self, source: Source, reply: Any) -> None:
+        if reply.error_code in BUSY_CODES:
             return
         parameters = None
         if not reply.error:
@@ -146,10 +130,10 @@ class LcmGatewaySubscriber:
             )
         self._reception.answered(source, parameters)
 
-    def _receive_takes(self, reply: rtc3d.command_reply_t) -> None:
-        for source in self._reception.sources_now:
-            if not reply.error and self._take_queries.get(source.channels) == reply.request_id:
-                self._reception.answered_takes(source, reply.content.encode())
+    def _receive_takes(self, source: Source, reply: Any) -> None:
+        newest = self._take_requests[source.channels].request_id
+        if not reply.error and reply.request_id == newest:
+            self._reception.answered_takes(source, reply.content.encode())
 
     # In the thread of the command.
 
@@ -157,28 +141,22 @@ class LcmGatewaySubscriber:
         """Query the parameters of sources that wait for their description."""
         for source in self._reception.sources_now:
             if source.is_waiting and not source.has_answer and source.begin_query():
-                self._query(source)
-
-    def _query(self, source: Source) -> None:
-        request = rtc3d.parameters_request_t()
-        request.requester = self._requester
-        request.request_id = len(self._by_request_id)
-        self._by_request_id[request.request_id] = source
-        try:
-            self._queries.publish(f"{source.channels}_PARAMETERS_REQUEST", request.encode())
-        except OSError as error:
-            logger.debug("asking for the parameters of %s: %s", source.name, error)
+                receive = partial(self._receive_parameters, source)
+                self._send(source, self._requester.prepare(rtc3d.parameters_request_t(), receive))
 
     def query_takes(self, source: Source) -> None:
         """See GatewaySubscriber."""
         request = rtc3d.command_request_t()
-        request.requester, request.command = self._requester, "take"
-        request.request_id = self._take_queries[source.channels] = self._num_take_queries
-        self._num_take_queries += 1
+        request.command = "take"
+        receive = partial(self._receive_takes, source)
+        self._take_requests[source.channels] = self._requester.prepare(request, receive)
+        self._send(source, request)
+
+    def _send(self, source: Source, request: Any) -> None:
         try:
-            self._queries.publish(f"{source.channels}_COMMAND_REQUEST", request.encode())
+            self._requester.send(source.channels, request)
         except OSError as error:
-            logger.debug("asking for the takes of %s: %s", source.name, error)
+            logger.debug("asking %s: %s", source.name, error)
 
     def silence(self) -> str:
         """See GatewaySubscriber."""
@@ -186,8 +164,8 @@ class LcmGatewaySubscriber:
 
     def close(self) -> None:
         """See GatewaySubscriber."""
-        for subscriber in self._subscribers:
-            subscriber.close()
+        self._subscriber.close()
+        self._requester.close()
 
 
 def _pattern(prefix: str, channels: Collection[str], components: Collection[str] | None) -> str:
@@ -199,3 +177,49 @@ def _pattern(prefix: str, channels: Collection[str], components: Collection[str]
         "6D(_.+)?" if name == "6d" else name.upper() for name in {*components, "status", "parameters"}
     )
     return f"({sources})_({names})"
+
+
+class LcmRequester:
+    """Sends requests on PREFIX_SOURCE_KIND_REQUEST, and receives the replies on PREFIX_SOURCE_KIND_REPLY.
+
+    ``url`` is that of requests. A thread calls the callback of a request with each reply to it. Raises
+    OutputError if LCM does not open.
+    """
+
+    def __init__(self, url: str, prefix: str) -> None:
+        self._lcm = open_lcm(url)
+        self._requester = f"rtc3d-gateway {uuid.uuid4()}"
+        self._numbers = itertools.count()
+        self._callbacks: OrderedDict[int, Callable[[Any], object]] = OrderedDict()
+        replies = f"{re.escape(prefix)}_.+_(PARAMETERS|COMMAND)_REPLY"
+        self._subscriber = LcmSubscriber(self._lcm, replies, self._receive)
+
+    def prepare(self, request: Any, on_reply: Callable[[Any], object]) -> Any:
+        """Return the request with a number of its own, with which ``send`` may send and repeat it."""
+        request.requester, request.request_id = self._requester, next(self._numbers)
+        self._callbacks[request.request_id] = on_reply
+        if len(self._callbacks) > _MAX_WAITING:
+            self._callbacks.popitem(last=False)
+        return request
+
+    def send(self, channels: str, request: Any) -> None:
+        """Send a prepared request to the source whose channels begin with ``channels``. Raises OSError."""
+        kind = "COMMAND" if isinstance(request, rtc3d.command_request_t) else "PARAMETERS"
+        self._lcm.publish(f"{channels}_{kind}_REQUEST", request.encode())
+
+    def close(self) -> None:
+        """Stop receiving."""
+        self._subscriber.close()
+
+    def _receive(self, _channel: str, data: bytes) -> None:
+        try:
+            reply = decode(data)
+        except ProtocolError:
+            return
+        if (
+            isinstance(reply, rtc3d.parameters_reply_t | rtc3d.command_reply_t)
+            and reply.requester == self._requester
+        ):
+            on_reply = self._callbacks.get(reply.request_id)
+            if on_reply is not None:
+                on_reply(reply)

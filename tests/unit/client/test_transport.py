@@ -4,9 +4,9 @@ from unittest.mock import Mock
 
 import pytest
 
+from gateway.client.series import Source
+from gateway.client.transport import silence_text
 from gateway.display.live.live_data import LiveData
-from gateway.subscriber.series import Source
-from gateway.subscriber.subscribe import silence_text
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ def test_silence_has_a_reason_also_if_a_gateway_is_found(reason: str, sources: l
 
 def test_queries_without_a_reply_become_rarer(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 1000.0
-    monkeypatch.setattr("gateway.subscriber.series.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("gateway.client.series.time.monotonic", lambda: now_s)
     source = Source("lab", "MOCAP_LAB")
     due_s = []
     for tick in range(36_000):  # an hour

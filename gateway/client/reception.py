@@ -4,14 +4,15 @@ import json
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
+from gateway.client.series import Series, Source
 from gateway.messages.encode import VERSION_OFFSET
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters
-from gateway.subscriber.series import Series, Source
 
 MAX_SOURCES: Final = 64
 MAX_SERIES: Final = 4096
@@ -192,3 +193,26 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
     def _take_answer(self, source: SourceT, parameters: bytes) -> None:
         """Take the answer to the query for the parameters, before any were published."""
         source.parameters = parameters
+
+
+class Messages(Reception[Source, Series]):
+    """Passes each message on, once at a time, to a function that takes the source, the key and the message.
+
+    The key is that on Zenoh, below the source, such as "3d", "6d/Tool 1" or "parameters".
+    """
+
+    def __init__(self, receive: Callable[[str, str, bytes], object]) -> None:
+        super().__init__()
+        self._receive = receive
+
+    def _new_source(self, name: str, channels: str) -> Source:
+        return Source(name, channels)
+
+    def _new_series(self, source: Source, key: str, channel: str) -> Series:
+        return Series(source, key, channel)
+
+    def _take(self, series: Series, message: bytes) -> None:
+        self._receive(series.source.name, series.key, message)
+
+    def _take_parameters(self, series: Series, message: bytes, *, is_first: bool, is_made: bool) -> None:  # noqa: ARG002 - overrides
+        self._receive(series.source.name, series.key, message)

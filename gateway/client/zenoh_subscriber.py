@@ -8,12 +8,14 @@ from urllib.parse import unquote
 
 import zenoh
 
+from gateway.client.reception import MAX_SERIES, MAX_XML_BYTES, Reception
+from gateway.client.series import POSE, Series, Source
+from gateway.client.transport import BUSY_CODES
+from gateway.messages.decode import TEXT
 from gateway.messages.topics import is_json_key, lcm_channel, zenoh_key
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.subscriber.reception import MAX_SERIES, MAX_XML_BYTES, Reception
-from gateway.subscriber.series import POSE, Series, Source
 
 _QUERY_S: Final = 1.0
 
@@ -112,7 +114,7 @@ class ZenohGatewaySubscriber:
         )
 
     def _parameters_message(self, source: Source, sample: zenoh.Sample) -> bytes:
-        facts = _facts(sample)
+        facts = attached_facts(sample)
         return self._reception.parameters_message(
             source,
             sample.payload.to_bytes(),
@@ -125,7 +127,7 @@ class ZenohGatewaySubscriber:
         if reply.ok is not None:
             if len(reply.ok.payload) <= MAX_XML_BYTES:
                 self._reception.answered(source, self._parameters_message(source, reply.ok))
-        elif reply.err is not None and str(reply.err.encoding).partition(";")[2] not in {"", "busy", "rate"}:
+        elif reply.err is not None and error_code(reply.err) not in {"", *BUSY_CODES}:
             self._reception.answered(source, None)
 
     def _answered_status(self, source: Source, reply: zenoh.Reply) -> None:
@@ -171,13 +173,19 @@ class ZenohGatewaySubscriber:
         self._session.close()
 
 
-def _facts(sample: zenoh.Sample) -> dict[str, Any]:
+def attached_facts(sample: zenoh.Sample) -> dict[str, Any]:
     """Return the attachment of a sample; {} if it is no JSON object."""
     try:
         facts = json.loads(b"{}" if sample.attachment is None else sample.attachment.to_bytes())
     except (ValueError, RecursionError):
         return {}
     return facts if isinstance(facts, dict) else {}
+
+
+def error_code(reply: zenoh.ReplyError) -> str:
+    """Return the code of a gateway's error; "" for an error of Zenoh itself."""
+    media_type, _, code = str(reply.encoding).partition(";")
+    return code if media_type == TEXT else ""
 
 
 def _int32(value: Any) -> int | None:

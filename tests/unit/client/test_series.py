@@ -5,8 +5,8 @@ from collections.abc import Iterable
 
 import pytest
 
+from gateway.client.series import SequenceCheck
 from gateway.messages.encode import NOT_PUBLISHED, PREFIX
-from gateway.subscriber.series import SequenceCheck
 
 SESSION = 3
 

@@ -1,0 +1,38 @@
+"""A client of running gateways, on Zenoh or LCM, for commands and for other programs.
+
+::
+
+    from gateway.client import GatewayAddress, GatewayClient, Messages
+
+    with GatewayClient(GatewayAddress(connect="tcp/192.0.2.5:7447")) as client:
+        for source in client.sources().sources:
+            print(source.name, source.server)
+        [parameters] = client.parameters("lab").received
+        print(parameters.content.decode())
+        client.start_take("walk", source="lab")
+        subscriber = client.subscribe(["lab"], ["3d"], Messages(lambda source, key, message: ...))
+
+- ``client`` is the beginning: where gateways are, and everything that can be asked.
+- ``transport`` is what ``zenoh_transport`` and ``lcm_transport`` have in common: they find sources, ask
+  until there is a reply, and subscribe.
+- ``found_sources`` reads what gateways report about their sources; ``take_transfer`` copies takes.
+- ``zenoh_subscriber`` and ``lcm_subscriber`` sort what arrives by source and key, for a ``reception``, which
+  keeps it in bounds. ``series`` counts what is missing.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.client.reception import Messages
+
+__all__ = ["GatewayAddress", "GatewayClient", "Messages"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the client when it is used: what reads takes does not need Zenoh and LCM."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from gateway.client import client, reception  # noqa: PLC0415 - see above
+
+    return getattr(client, name, None) or getattr(reception, name)

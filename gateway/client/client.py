@@ -1,0 +1,220 @@
+"""A client of running gateways, the same on Zenoh and on LCM."""
+
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import IO, Any, Final, NamedTuple, Self
+
+from gateway.client.found_sources import FoundSources
+from gateway.client.lcm_transport import LcmTransport
+from gateway.client.reception import Reception
+from gateway.client.take_transfer import FetchedTake, Progress, TakeTransfer
+from gateway.client.transport import GatewaySubscriber, Query, Replies, Reply, Transport
+from gateway.client.zenoh_transport import ZenohTransport
+from gateway.errors import OutputError, QueryError
+from gateway.outputs.contract import CONTROL_OPTION
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url, lcm_queries_url
+from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
+from gateway.outputs.zenoh.subscriber import open_zenoh
+from gateway.takes.files.description import NO_DETAILS, TakeDetails
+
+DEFAULT_TIMEOUT_S: Final = 5.0
+
+
+class GatewayAddress(NamedTuple):
+    """Where to find gateways: on LCM if ``is_lcm``, otherwise on Zenoh. None means the default.
+
+    ``connect`` is an endpoint of Zenoh, such as tcp/192.0.2.5:7447. ``url`` is that of LCM's messages, and
+    ``queries_url`` that of requests, if it is not the one derived from ``url``.
+    """
+
+    is_lcm: bool = False
+    connect: str | None = None
+    zenoh_config: Path | None = None
+    url: str | None = None
+    prefix: str | None = None
+    queries_url: str | None = None
+
+
+class GatewayClient:
+    """Finds gateways, asks them, and subscribes to what they publish.
+
+    It connects when it is first used. All methods block; a gateway has ``timeout_s`` to reply. They raise
+    OutputError if LCM does not open or send, and ConfigError if Zenoh rejects its configuration file. Other
+    problems are part of what they return, or raise QueryError.
+    """
+
+    def __init__(self, address: GatewayAddress, timeout_s: float = DEFAULT_TIMEOUT_S) -> None:
+        self._address = address
+        self._timeout_s = timeout_s
+        self._opened: Transport | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+    # What there is.
+
+    def sources(self, wanted: str | None = None) -> FoundSources:
+        """Return the sources of all gateways that are found, or only the ``wanted`` one."""
+        try:
+            return self._transport().find(wanted)
+        except QueryError as error:
+            found = FoundSources()
+            found.absence = str(error)
+            return found
+
+    def parameters(
+        self, source: str | None = None, sections: tuple[str, ...] = (), *, fresh: bool = False
+    ) -> Replies[list[Reply]]:
+        """Return the parameters of a source, or of all that are found, as XML.
+
+        ``sections`` are keys of SECTIONS (gateway.rtc3d.parameters), such as "3d"; () means all. ``fresh``
+        makes the gateway ask its server now.
+        """
+        options = {"fresh": "true"} if fresh else {}
+        return self._ask(Query("parameters", "the parameters", sections, options), source)
+
+    # Takes.
+
+    def takes(self, source: str | None = None) -> Replies[dict[str, dict[str, Any]]]:
+        """Return the takes of a source, or of all that are found, by source.
+
+        The content is described in docs/reference/queries.md, as that of the following methods.
+        """
+        return self._ask_takes({}, source)
+
+    def start_take(
+        self, name: str | None = None, details: TakeDetails = NO_DETAILS, *, source: str | None = None
+    ) -> Replies[dict[str, dict[str, Any]]]:
+        """Start a take."""
+        return self._ask_takes({CONTROL_OPTION: "start"} | _described(name, details), source)
+
+    def stop_take(self, *, source: str | None = None) -> Replies[dict[str, dict[str, Any]]]:
+        """Stop the running take."""
+        return self._ask_takes({CONTROL_OPTION: "stop"}, source)
+
+    def save_take(
+        self,
+        name: str | None = None,
+        details: TakeDetails = NO_DETAILS,
+        *,
+        last_s: float | None = None,
+        after_s: float = 0.0,
+        source: str | None = None,
+    ) -> Replies[dict[str, dict[str, Any]]]:
+        """Keep the last seconds as a take: all that are kept, or ``last_s``, and ``after_s`` more."""
+        options = {CONTROL_OPTION: "save"}
+        if last_s is not None:
+            options["last"] = _decimal(last_s)
+        if after_s:
+            options["after"] = _decimal(after_s)
+        return self._ask_takes(options | _described(name, details), source)
+
+    def fetch_take(
+        self,
+        name: str,
+        file: IO[bytes],
+        *,
+        source: str | None = None,
+        progress: Progress = lambda _done, _total: None,
+    ) -> FetchedTake:
+        """Copy a take to ``file``, over Zenoh only. Raises QueryError."""
+        transport = self._transport()
+        return TakeTransfer(transport, name, source, self._timeout_s).copy_to(file, progress)
+
+    # What gateways publish.
+
+    def subscribe(
+        self,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+    ) -> GatewaySubscriber:
+        """Subscribe to these sources (all, if empty) and components (None: all).
+
+        The subscriber has a connection of its own. Raises QueryError if Zenoh does not open.
+        """
+        transport = _open(self._address)
+        try:
+            return transport.subscribe(sources, components, reception)
+        except Exception:
+            transport.close()
+            raise
+
+    # The details.
+
+    def _transport(self) -> Transport:
+        """Return the connection. Raises QueryError if Zenoh does not open, OutputError if LCM does not."""
+        if self._opened is None:
+            self._opened = _open(self._address)
+        return self._opened
+
+    def _ask(self, query: Query, source: str | None) -> Replies[list[Reply]]:
+        try:
+            return self._transport().ask(query, source, self._timeout_s)
+        except QueryError as error:
+            return Replies([], [error])
+
+    def _ask_takes(
+        self, options: Mapping[str, str], source: str | None
+    ) -> Replies[dict[str, dict[str, Any]]]:
+        """Ask a source, or all that are found, with these options.
+
+        If all sources are asked and one replies as wanted, those are left out whose gateway records no takes
+        and, if takes are to be stopped, those without a running take.
+        """
+        replies = self._ask(Query("take", "takes", options=options), source)
+        received: dict[str, dict[str, Any]] = {}
+        problems = replies.problems
+        for reply in replies.received:
+            try:
+                received[reply.source] = _content(reply)
+            except QueryError as error:
+                problems.append(error)
+        if source is None and received:
+            expected = {"disabled", "nothing-yet"} if options.get(CONTROL_OPTION) == "stop" else {"disabled"}
+            problems = [problem for problem in problems if problem.code not in expected]
+        return Replies(received, problems)
+
+
+def _open(address: GatewayAddress) -> Transport:
+    if address.is_lcm:
+        url = effective_lcm_url(address.url)
+        queries_url = address.queries_url or lcm_queries_url(url)
+        return LcmTransport(url, queries_url, address.prefix or DEFAULT_LCM_PREFIX)
+    try:
+        session = open_zenoh(address.connect, address.zenoh_config)
+    except OutputError as error:
+        raise QueryError(str(error), code="no-gateway") from error
+    return ZenohTransport(session, address.prefix or DEFAULT_ZENOH_PREFIX)
+
+
+def _content(reply: Reply) -> dict[str, Any]:
+    try:
+        content = json.loads(reply.content)
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict):
+        raise QueryError(f"source {reply.source!r}: the reply about takes cannot be read", code="unreadable")
+    return content
+
+
+def _described(name: str | None, details: TakeDetails) -> dict[str, str]:
+    """Return the options that say what a take is about. A semicolon would end an option."""
+    texts = details._asdict().items()
+    options = {key: text.replace("%", "%25").replace(";", "%3B") for key, text in texts if text}
+    return options if name is None else {"name": name} | options
+
+
+def _decimal(seconds: float) -> str:
+    """Return a number of seconds without an exponent."""
+    return f"{seconds:.3f}".rstrip("0").rstrip(".")

@@ -1,1 +1,0 @@
-"""Receiving what gateways publish on Zenoh or LCM, sorted by source and key."""
