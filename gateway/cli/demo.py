@@ -6,16 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gateway.cli.options import (
-    AnalogOption,
-    AnalogRateOption,
-    C3dOption,
-    MarkersOption,
-    PlatesOption,
-    RateOption,
-    ToolsOption,
-    check_exists,
-)
+from gateway.cli.options import SceneOptions, check_exists, with_options
 from gateway.logs.log_format import LogLevel, set_up_log
 
 if TYPE_CHECKING:
@@ -23,7 +14,9 @@ if TYPE_CHECKING:
     from gateway.rtc3d_server.scene import Scene
 
 
+@with_options
 def demo(
+    *,
     seconds: Annotated[
         float | None,
         typer.Option(min=0.1, help="How many seconds to run; 10 by default, with --view until Ctrl-C."),
@@ -37,19 +30,13 @@ def demo(
     udpm: Annotated[
         bool, typer.Option("--udpm", help="Use real multicast for LCM instead of LCM in memory.")
     ] = False,
-    markers: MarkersOption = 24,
-    tools: ToolsOption = 4,
-    analog: AnalogOption = 16,
-    plates: PlatesOption = 2,
-    rate: RateOption = 200.0,
-    analog_rate: AnalogRateOption = 2000.0,
-    c3d: C3dOption = None,
+    synthetic: SceneOptions,
 ) -> None:
     """Run a self-contained demo: simulator, gateway and two subscribers. Counts lost messages.
 
     If the extra `view` is installed, the demo can be watched in a browser while it runs.
     """
-    check_exists("--c3d", c3d)
+    check_exists("--c3d", synthetic.c3d)
     import uvloop
 
     from gateway.cli.demo_lab import view_is_installed, view_process
@@ -57,18 +44,9 @@ def demo(
     from gateway.simulator.synthetic import SyntheticScene
 
     set_up_log(LogLevel.WARNING)
-    scene: Scene
-    if c3d is not None:
-        scene = C3dScene(c3d)
-    else:
-        scene = SyntheticScene(
-            markers=markers,
-            tools=tools,
-            analog=analog,
-            plates=plates,
-            rate_hz=rate,
-            analog_rate_hz=analog_rate,
-        )
+    scene: Scene = (
+        SyntheticScene(**synthetic.settings()) if synthetic.c3d is None else C3dScene(synthetic.c3d)
+    )
     run_s = seconds if seconds is not None or view else 10.0
     watch = (
         partial(view_process, is_required=view, opens_browser=not no_browser)

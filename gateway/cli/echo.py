@@ -5,20 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gateway.cli.options import (
-    ComponentOption,
-    ConnectOption,
-    PrefixOption,
-    SourceOption,
-    UrlOption,
-    ZenohConfigOption,
-)
+from gateway.cli.options import AddressOptions, ComponentOption, SourceOption, with_options
 
 if TYPE_CHECKING:
     from gateway.cli.echo_messages import Subscribe
 
 
+@with_options
 def echo(
+    *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Subscribe on LCM.")] = False,
     output: Annotated[
@@ -33,10 +28,7 @@ def echo(
     hz: Annotated[
         bool, typer.Option("--hz", help="Print a table of rates every second instead of the messages.")
     ] = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    prefix: PrefixOption = None,
+    where: AddressOptions,
 ) -> None:
     """Print what gateways publish. Exit status 1 if fewer than --count messages arrive in --seconds.
 
@@ -45,7 +37,7 @@ def echo(
     if sum((zenoh, lcm, output is not None)) > 1:
         raise typer.BadParameter("give only one of --zenoh, --lcm and --output")
     name = output or ("lcm" if lcm else "zenoh")
-    if zenoh_config is not None and name != "zenoh":
+    if where.zenoh_config is not None and name != "zenoh":
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
 
     from gateway.cli.echo_messages import Limits, print_messages
@@ -54,7 +46,9 @@ def echo(
     from gateway.errors import QueryError
     from gateway.outputs.kind import SubscriptionRequest
 
-    request = SubscriptionRequest(source, component, prefix, connect or url, zenoh_config)
+    request = SubscriptionRequest(
+        source, component, where.prefix, where.connect or where.url, where.zenoh_config
+    )
     limits = Limits(count, seconds)
     silence = Silence(name, request)
     subscribe = _subscribe_function(name)

@@ -5,25 +5,17 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.options import (
-    ConnectOption,
-    PrefixOption,
-    SourceOption,
-    UrlOption,
-    ZenohConfigOption,
-    check_transport,
-)
+from gateway.cli.options import AddressOptions, SourceOption, with_options
 
 
+@with_options
 def list_gateways(
+    *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Look on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Listen on LCM.")] = False,
     source: SourceOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    prefix: PrefixOption = None,
+    where: AddressOptions,
 ) -> None:
     """List the gateways and sources that can be heard: states, rates, servers, hosts, versions.
 
@@ -31,16 +23,16 @@ def list_gateways(
     """
     if zenoh and lcm:
         raise typer.BadParameter("give either --zenoh or --lcm")
-    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
+    where.check(lcm=lcm)
 
     from rich.console import Console
 
     from gateway.cli.list_output import notes, sources_json, write_sources
     from gateway.cli.main import exit_with
-    from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.client.client import GatewayClient
     from gateway.errors import QueryError
 
-    with GatewayClient(GatewayAddress(lcm, connect, zenoh_config, url, prefix)) as client:
+    with GatewayClient(where.address(lcm=lcm)) as client:
         found = client.sources(source)
     if as_json:
         print(sources_json(found))

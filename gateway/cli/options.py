@@ -1,13 +1,16 @@
-"""Options that several commands share.
+"""Options that several commands share, and objects of options that belong together.
 
 This module imports nothing that takes long, so that ``COMMAND --help`` is quick: the checks of values import
 what they need.
 """
 
+import functools
+import inspect
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 import typer
 
@@ -21,6 +24,7 @@ from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 
 if TYPE_CHECKING:
+    from gateway.client.client import GatewayAddress, GatewayClient
     from gateway.takes.files.description import TakeDetails
 
 _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
@@ -47,39 +51,7 @@ ServerOption = Annotated[
     ),
 ]
 
-LogLevelOption = Annotated[
-    LogLevel,
-    typer.Option(
-        case_sensitive=False, metavar="LEVEL", help="The lowest level to log: debug, info, warning or error."
-    ),
-]
-VerboseOption = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Log everything; short for --log-level debug.")
-]
-QuietOption = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Log problems only; short for --log-level warning.")
-]
 NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress, only problems.")]
-LogFormatOption = Annotated[
-    LogFormat,
-    typer.Option(
-        case_sensitive=False,
-        metavar="FORMAT",
-        help="text, json or journal; auto means journal under systemd, otherwise text.",
-    ),
-]
-
-MarkersOption = Annotated[int, typer.Option(min=0, max=10_000, help="Markers in the synthetic scene.")]
-ToolsOption = Annotated[int, typer.Option(min=0, max=1_000, help="6D tools in the synthetic scene.")]
-AnalogOption = Annotated[int, typer.Option(min=0, max=10_000, help="Analog channels in the synthetic scene.")]
-PlatesOption = Annotated[int, typer.Option(min=0, max=100, help="Force plates in the synthetic scene.")]
-RateOption = Annotated[float, typer.Option(min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")]
-AnalogRateOption = Annotated[
-    float, typer.Option(min=0.1, max=100_000, help="Analog and force samples per second, in Hz.")
-]
-C3dOption = Annotated[
-    Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
-]
 
 
 def _host() -> Any:
@@ -186,10 +158,6 @@ def _checked_endpoint(text: str | None) -> str | None:
     return text
 
 
-SubjectOption = Annotated[str | None, typer.Option(help="Who is recorded, such as S01.")]
-SessionOption = Annotated[str | None, typer.Option(help="The session of the subject, such as baseline.")]
-NoteOption = Annotated[str | None, typer.Option(help="Anything else that belongs to the recording.")]
-
 SourceOption = Annotated[
     str | None,
     typer.Option(
@@ -258,44 +226,166 @@ PrefixOption = Annotated[
         help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.",
     ),
 ]
-QueriesUrlOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="URL",
-        callback=_checked_lcm_url,
-        help="LCM URL of requests and replies: the gateway's lcm.queries_url.",
-    ),
-]
 
 
-def check_transport(
-    *,
-    lcm: bool,
-    connect: str | None,
-    zenoh_config: Path | None,
-    url: str | None,
-    queries_url: str | None = None,
-) -> None:
-    """Raise BadParameter if there are options for Zenoh with ``--lcm``, or options for LCM without it."""
-    if lcm and (connect is not None or zenoh_config is not None):
-        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh, not for --lcm")
-    for name, value in (("--url", url), ("--queries-url", queries_url)):
-        if value is not None and not lcm:
-            raise typer.BadParameter(f"{name} is for LCM; add --lcm")
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command one option for each field of the option objects that it takes.
+
+    An option object is an instance of one of the classes below. Typer has nothing like it.
+    """
+    parameters = inspect.signature(command).parameters
+    objects: dict[str, Any] = {
+        name: each.annotation for name, each in parameters.items() if is_dataclass(each.annotation)
+    }
+    options: list[inspect.Parameter] = []
+    for name, parameter in parameters.items():
+        options += _fields(objects[name]) if name in objects else [parameter]
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        for name, kind in objects.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in _fields(kind)})
+        command(**values)
+
+    keywords = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    return run
 
 
-def checked_details(subject: str | None, session: str | None, note: str | None) -> "TakeDetails":
-    """Return who and what a recording is about. Raises BadParameter."""
-    from gateway.takes.files.description import TakeDetails
-
-    try:
-        return TakeDetails(subject or "", session or "", note or "").checked()
-    except QueryError as error:
-        raise typer.BadParameter(str(error)) from None
+def _fields(kind: Any) -> list[inspect.Parameter]:
+    """Return the fields of an option object that are options."""
+    fields = inspect.signature(kind).parameters.values()
+    return [field for field in fields if get_origin(field.annotation) is Annotated]
 
 
-def chosen_log_level(level: LogLevel, *, verbose: bool, quiet: bool) -> LogLevel:
-    """Return the level to log; raises BadParameter if the three options contradict each other."""
-    if verbose + quiet + (level is not LogLevel.INFO) > 1:
-        raise typer.BadParameter("give only one of --log-level, --verbose and --quiet")
-    return LogLevel.DEBUG if verbose else LogLevel.WARNING if quiet else level
+@dataclass(frozen=True)
+class AddressOptions:
+    """Where to find gateways."""
+
+    connect: ConnectOption = None
+    zenoh_config: ZenohConfigOption = None
+    url: UrlOption = None
+    queries_url: str | None = None
+    """An option of those commands only that ask on LCM."""
+
+    prefix: PrefixOption = None
+
+    def check(self, *, lcm: bool) -> None:
+        """Raise BadParameter if there are options for Zenoh with ``--lcm``, or for LCM without it."""
+        if lcm and (self.connect is not None or self.zenoh_config is not None):
+            raise typer.BadParameter("--connect and --zenoh-config are for Zenoh, not for --lcm")
+        for name, value in (("--url", self.url), ("--queries-url", self.queries_url)):
+            if value is not None and not lcm:
+                raise typer.BadParameter(f"{name} is for LCM; add --lcm")
+
+    def address(self, *, lcm: bool) -> "GatewayAddress":
+        """Return where to find gateways, on LCM or on Zenoh."""
+        from gateway.client.client import GatewayAddress
+
+        return GatewayAddress(lcm, self.connect, self.zenoh_config, self.url, self.prefix, self.queries_url)
+
+
+@dataclass(frozen=True)
+class QueryOptions(AddressOptions):
+    """Where to find gateways, and how long to wait for their replies."""
+
+    queries_url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            callback=_checked_lcm_url,
+            help="LCM URL of requests and replies: the gateway's lcm.queries_url.",
+        ),
+    ] = None
+    timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for replies.")] = 5.0
+
+    def client(self, *, lcm: bool) -> "GatewayClient":
+        """Return a client of these gateways. Raises BadParameter."""
+        from gateway.client.client import GatewayClient
+
+        self.check(lcm=lcm)
+        return GatewayClient(self.address(lcm=lcm), self.timeout)
+
+
+@dataclass(frozen=True)
+class DetailsOptions:
+    """Who and what a recording is about."""
+
+    subject: Annotated[str | None, typer.Option(help="Who is recorded, such as S01.")] = None
+    session: Annotated[str | None, typer.Option(help="The session of the subject, such as baseline.")] = None
+    note: Annotated[str | None, typer.Option(help="Anything else that belongs to the recording.")] = None
+
+    def checked(self) -> "TakeDetails":
+        """Return the details. Raises BadParameter."""
+        from gateway.takes.files.description import TakeDetails
+
+        try:
+            return TakeDetails(self.subject or "", self.session or "", self.note or "").checked()
+        except QueryError as error:
+            raise typer.BadParameter(str(error)) from None
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """What to log, and how."""
+
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log everything; short for --log-level debug.")
+    ] = False
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Log problems only; short for --log-level warning.")
+    ] = False
+    log_level: Annotated[
+        LogLevel,
+        typer.Option(
+            case_sensitive=False,
+            metavar="LEVEL",
+            help="The lowest level to log: debug, info, warning or error.",
+        ),
+    ] = LogLevel.INFO
+    log_format: Annotated[
+        LogFormat,
+        typer.Option(
+            case_sensitive=False,
+            metavar="FORMAT",
+            help="text, json or journal; auto means journal under systemd, otherwise text.",
+        ),
+    ] = LogFormat.AUTO
+
+    def chosen_level(self) -> LogLevel:
+        """Return the level to log; raises BadParameter if the three options contradict each other."""
+        if self.verbose + self.quiet + (self.log_level is not LogLevel.INFO) > 1:
+            raise typer.BadParameter("give only one of --log-level, --verbose and --quiet")
+        return LogLevel.DEBUG if self.verbose else LogLevel.WARNING if self.quiet else self.log_level
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """The scene of a simulated server."""
+
+    markers: Annotated[int, typer.Option(min=0, max=10_000, help="Markers in the synthetic scene.")] = 24
+    tools: Annotated[int, typer.Option(min=0, max=1_000, help="6D tools in the synthetic scene.")] = 4
+    analog: Annotated[
+        int, typer.Option(min=0, max=10_000, help="Analog channels in the synthetic scene.")
+    ] = 16
+    plates: Annotated[int, typer.Option(min=0, max=100, help="Force plates in the synthetic scene.")] = 2
+    rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")] = (
+        200.0
+    )
+    analog_rate: Annotated[
+        float, typer.Option(min=0.1, max=100_000, help="Analog and force samples per second, in Hz.")
+    ] = 2000.0
+    c3d: Annotated[
+        Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
+    ] = None
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of the synthetic scene by their names."""
+        return {
+            "markers": self.markers,
+            "tools": self.tools,
+            "analog": self.analog,
+            "plates": self.plates,
+            "rate_hz": self.rate,
+            "analog_rate_hz": self.analog_rate,
+        }

@@ -6,17 +6,11 @@ from typing import Annotated
 import typer
 
 from gateway.cli.completion import one_of
-from gateway.cli.options import (
-    ConnectOption,
-    PrefixOption,
-    QueriesUrlOption,
-    SourceOption,
-    UrlOption,
-    ZenohConfigOption,
-)
+from gateway.cli.options import QueryOptions, SourceOption, with_options
 from gateway.rtc3d.parameters import SECTIONS
 
 
+@with_options
 def params(
     sections: Annotated[
         list[str] | None,
@@ -26,6 +20,7 @@ def params(
             help=f"Any of {', '.join(SECTIONS)}; the default is all.",
         ),
     ] = None,
+    *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Query on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Query on LCM.")] = False,
     source: SourceOption = None,
@@ -37,12 +32,7 @@ def params(
         bool,
         typer.Option("--fresh", help="Make the gateway query the server now instead of using its cache."),
     ] = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    queries_url: QueriesUrlOption = None,
-    prefix: PrefixOption = None,
-    timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for replies.")] = 5.0,
+    query: QueryOptions,
 ) -> None:
     """Query the parameters of servers through their gateways: markers, tools, channels, plates, events.
 
@@ -50,7 +40,7 @@ def params(
     """
     if zenoh and lcm:
         raise typer.BadParameter("give either --zenoh or --lcm")
-    if zenoh_config is not None and lcm:
+    if query.zenoh_config is not None and lcm:
         raise typer.BadParameter("--zenoh-config is for queries on Zenoh")
     if as_json and as_xml:
         raise typer.BadParameter("give either --json or --xml")
@@ -60,10 +50,9 @@ def params(
 
     from gateway.cli.main import exit_with
     from gateway.cli.params_output import write_replies
-    from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.client.client import GatewayClient
 
-    address = GatewayAddress(lcm, connect, zenoh_config, url, prefix, queries_url)
-    with GatewayClient(address, timeout) as client:
+    with GatewayClient(query.address(lcm=lcm), query.timeout) as client:
         replies, problems = client.parameters(source, wanted, fresh=fresh)
     problems += write_replies(replies, "json" if as_json else "xml" if as_xml else "table", sys.stdout)
     exit_with(problems)

@@ -9,18 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from gateway.cli.options import (
+    AddressOptions,
     ComponentsOption,
-    ConnectOption,
+    DetailsOptions,
     NoProgressOption,
-    NoteOption,
-    PrefixOption,
-    SessionOption,
     SourcesOption,
-    SubjectOption,
-    UrlOption,
-    ZenohConfigOption,
-    check_transport,
-    checked_details,
+    with_options,
 )
 from gateway.cli.run import StopSignals
 
@@ -32,6 +26,7 @@ if TYPE_CHECKING:
 _TICK_S: Final = 0.1
 
 
+@with_options
 def record(
     file: Annotated[
         Path,
@@ -40,6 +35,7 @@ def record(
             help="The new file (.lcmlog), or a folder for SOURCE-DATE-TIME.lcmlog. Nothing is overwritten.",
         ),
     ],
+    *,
     source: SourcesOption = None,
     component: ComponentsOption = None,
     seconds: Annotated[
@@ -48,24 +44,19 @@ def record(
             min=0, help="Stop after this many seconds of messages; the default is to record until Ctrl-C."
         ),
     ] = None,
-    subject: SubjectOption = None,
-    session: SessionOption = None,
-    note: NoteOption = None,
+    details: DetailsOptions,
     lcm: Annotated[bool, typer.Option("--lcm", help="Record from LCM; the default is from Zenoh.")] = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    prefix: PrefixOption = None,
+    where: AddressOptions,
     quiet: NoProgressOption = False,
 ) -> None:
     """Record what gateways publish, until Ctrl-C. The exit status is 0 only if no message is missing.
 
     A second Ctrl-C ends at once, without what waits for the disk.
     """
-    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
-    details = checked_details(subject, session, note)
+    where.check(lcm=lcm)
+    described = details.checked()
     from gateway.cli.record_output import RecordProgress, print_summary
-    from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.client.client import GatewayClient
     from gateway.client.lcm_subscriber import START_S
     from gateway.client.transport import close_in_time
     from gateway.takes.recorder.take_recording import TakeRecording
@@ -74,12 +65,11 @@ def record(
     stop = StopSignals(_end_at_once)
     target = Target(file)
     recording = TakeRecording(
-        lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0, details
+        lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0, described
     )
     sources = list(dict.fromkeys(source or ()))
     try:
-        client = GatewayClient(GatewayAddress(lcm, connect, zenoh_config, url, prefix))
-        subscriber = client.subscribe(sources, component, recording)
+        subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(sources, component, recording)
         progress = RecordProgress(recording, subscriber, sources, quiet=quiet)
         try:
             _run(recording, subscriber, progress, stop, seconds)

@@ -10,16 +10,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Final
 
-from gateway.cli.options import (
-    ConfigOption,
-    LogFormatOption,
-    LogLevelOption,
-    QuietOption,
-    ServerOption,
-    VerboseOption,
-    chosen_log_level,
-)
-from gateway.logs.log_format import LogFormat, LogLevel, set_up_log
+from gateway.cli.options import ConfigOption, LogOptions, ServerOption, with_options
+from gateway.logs.log_format import set_up_log
 from gateway.service.process_end import end_at_once
 
 
@@ -56,18 +48,17 @@ SWITCH_INTERVAL_S: Final = 0.0005
 releases that lock once, so that the default of 5 ms would add up to more than the time between two frames."""
 
 
+@with_options
 def run(
+    *,
     config: ConfigOption = None,
     server: ServerOption = None,
-    verbose: VerboseOption = False,
-    quiet: QuietOption = False,
-    log_level: LogLevelOption = LogLevel.INFO,
-    log_format: LogFormatOption = LogFormat.AUTO,
+    log: LogOptions,
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
     for number in (signal.SIGINT, signal.SIGTERM):  # until the daemon handles them
         signal.signal(number, end_at_once)
-    level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
+    level = log.chosen_level()
     import uvloop
 
     from gateway.cli.configuration import chosen_file, configuration_from_options
@@ -75,7 +66,7 @@ def run(
     from gateway.service.daemon import serve
 
     limit = LogLimit()
-    set_up_log(level, log_format, limit)
+    set_up_log(level, log.log_format, limit)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     # The objects of all modules stay until the end. Without this, each full garbage collection looks through
     # them and stops the event loop for some 20 ms; many tiny packets cause one every second.

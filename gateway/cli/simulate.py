@@ -10,24 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gateway.cli.completion import source_names
-from gateway.cli.options import (
-    AnalogOption,
-    AnalogRateOption,
-    C3dOption,
-    LogFormatOption,
-    LogLevelOption,
-    MarkersOption,
-    PlatesOption,
-    QuietOption,
-    RateOption,
-    ToolsOption,
-    VerboseOption,
-    check_exists,
-    checked_host,
-    chosen_log_level,
-)
+from gateway.cli.options import LogOptions, SceneOptions, check_exists, checked_host, with_options
 from gateway.cli.run import SWITCH_INTERVAL_S
-from gateway.logs.log_format import LogFormat, LogLevel, set_up_log
+from gateway.logs.log_format import set_up_log
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 
 if TYPE_CHECKING:
@@ -42,8 +27,10 @@ def _list_faults(context: typer.Context, wanted: bool) -> None:
         raise typer.Exit
 
 
+@with_options
 def simulate(
     context: typer.Context,
+    *,
     host: Annotated[str, typer.Option(callback=checked_host, help="The address to listen on.")] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port to listen on; 0 picks a free one.")
@@ -52,13 +39,7 @@ def simulate(
         float | None,
         typer.Option(min=0, help="Stop after this many seconds; the default is to run until Ctrl-C."),
     ] = None,
-    markers: MarkersOption = 24,
-    tools: ToolsOption = 4,
-    analog: AnalogOption = 16,
-    plates: PlatesOption = 2,
-    rate: RateOption = 200.0,
-    analog_rate: AnalogRateOption = 2000.0,
-    c3d: C3dOption = None,
+    synthetic: SceneOptions,
     take: Annotated[
         Path | None,
         typer.Option(
@@ -96,23 +77,20 @@ def simulate(
         bool,
         typer.Option("--list-faults", callback=_list_faults, is_eager=True, help="List all faults and exit."),
     ] = False,
-    verbose: VerboseOption = False,
-    quiet: QuietOption = False,
-    log_level: LogLevelOption = LogLevel.INFO,
-    log_format: LogFormatOption = LogFormat.AUTO,
+    log: LogOptions,
 ) -> None:
     """Simulate an RTC3D server that plays a synthetic scene, a C3D file or a take, with faults on request."""
-    if once and c3d is None and take is None:
+    if once and synthetic.c3d is None and take is None:
         raise typer.BadParameter("--once needs --c3d or --take: a synthetic scene has no end")
-    if c3d is not None and take is not None:
+    if synthetic.c3d is not None and take is not None:
         raise typer.BadParameter("give either --c3d or --take")
     if take is None and not (source is None and from_s is None and to_s is None):
         raise typer.BadParameter("--source, --from and --to need --take")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise typer.BadParameter(f"--to {to_s:g} is not after --from {from_s:g}")
-    check_exists("--c3d", c3d)
+    check_exists("--c3d", synthetic.c3d)
     check_exists("--take", take)
-    level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
+    level = log.chosen_level()
     import uvloop
 
     from gateway.rtc3d_server.scene import Scene
@@ -121,19 +99,11 @@ def simulate(
     from gateway.simulator.simulator import Scenario, Simulator, load_scenario
     from gateway.simulator.take_scene import TakeScene
 
-    set_up_log(level, log_format)
-    scene_options: dict[str, float] = {
-        "markers": markers,
-        "tools": tools,
-        "analog": analog,
-        "plates": plates,
-        "rate_hz": rate,
-        "analog_rate_hz": analog_rate,
-    }
+    set_up_log(level, log.log_format)
     # Only options given on the command line override the scenario's scene.
     overrides = {
         name: value
-        for name, value in scene_options.items()
+        for name, value in synthetic.settings().items()
         if _is_on_command_line(context, name.removesuffix("_hz"))
     }
     base = Scenario(faults=()) if scenario is None else load_scenario(scenario)
@@ -141,8 +111,8 @@ def simulate(
     scene: Scene
     if take is not None:
         scene = TakeScene(take, source, from_s=from_s, to_s=to_s)
-    elif c3d is not None:
-        scene = C3dScene(c3d)
+    elif synthetic.c3d is not None:
+        scene = C3dScene(synthetic.c3d)
     else:
         scene = extended.scene.build()
     # A take is read by a thread, while frames are sent.

@@ -10,24 +10,19 @@ import typer
 
 from gateway.cli.options import (
     ConnectOption,
+    DetailsOptions,
     NoProgressOption,
-    NoteOption,
     PrefixOption,
-    QueriesUrlOption,
-    SessionOption,
+    QueryOptions,
     SourceOption,
-    SubjectOption,
-    UrlOption,
     ZenohConfigOption,
-    check_transport,
-    checked_details,
     checked_take_name,
+    with_options,
 )
 from gateway.logs.safe_text import safe_json, safe_text
 
 if TYPE_CHECKING:
     from gateway.cli.take_report import ListedTake
-    from gateway.client.client import GatewayClient
     from gateway.client.transport import Replies
 
 _NameArgument = Annotated[
@@ -40,56 +35,49 @@ _NameArgument = Annotated[
 ]
 _LcmOption = Annotated[bool, typer.Option("--lcm", help="Ask on LCM instead of Zenoh.")]
 _JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")]
-_TimeoutOption = Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for replies.")]
 
 
+@with_options
 def start(
     name: _NameArgument = None,
-    subject: SubjectOption = None,
-    session: SessionOption = None,
-    note: NoteOption = None,
+    *,
+    details: DetailsOptions,
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    queries_url: QueriesUrlOption = None,
-    prefix: PrefixOption = None,
-    timeout: _TimeoutOption = 5.0,
+    query: QueryOptions,
 ) -> None:
     """Start a take in a running gateway. Needs takes.enabled and, for the source, remote_control.
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    details = checked_details(subject, session, note)
-    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
-        replies = client.start_take(name, details, source=source)
+    described = details.checked()
+    with query.client(lcm=lcm) as client:
+        replies = client.start_take(name, described, source=source)
     _print_replies(replies, lambda take: f"take {take.name!r} is running", as_json=as_json)
 
 
+@with_options
 def stop(
+    *,
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    queries_url: QueriesUrlOption = None,
-    prefix: PrefixOption = None,
-    timeout: _TimeoutOption = 5.0,
+    query: QueryOptions,
 ) -> None:
     """Stop the running take.
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else, also a take that lacks messages.
     """
-    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
+    with query.client(lcm=lcm) as client:
         replies = client.stop_take(source=source)
     _print_replies(replies, lambda take: f"take {take.name!r} is stopped: {take.facts}", as_json=as_json)
 
 
+@with_options
 def save(
     name: _NameArgument = None,
+    *,
     last: Annotated[
         float | None,
         typer.Option(
@@ -97,42 +85,32 @@ def save(
         ),
     ] = None,
     after: Annotated[float, typer.Option(min=0.0, max=3600.0, help="For how many seconds to go on.")] = 0.0,
-    subject: SubjectOption = None,
-    session: SessionOption = None,
-    note: NoteOption = None,
+    details: DetailsOptions,
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    queries_url: QueriesUrlOption = None,
-    prefix: PrefixOption = None,
-    timeout: _TimeoutOption = 5.0,
+    query: QueryOptions,
 ) -> None:
     """Keep the last seconds as a take. Needs takes.keep_last_s and, for the source, remote_control.
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    details = checked_details(subject, session, note)
-    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
-        replies = client.save_take(name, details, last_s=last, after_s=after, source=source)
+    described = details.checked()
+    with query.client(lcm=lcm) as client:
+        replies = client.save_take(name, described, last_s=last, after_s=after, source=source)
     goes_on = f", and goes on for {after:g} s" if after else ""
     _print_replies(
         replies, lambda take: f"take {take.name!r} is saved: {take.facts}{goes_on}", as_json=as_json
     )
 
 
+@with_options
 def list_(
+    *,
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    queries_url: QueriesUrlOption = None,
-    prefix: PrefixOption = None,
-    timeout: _TimeoutOption = 5.0,
+    query: QueryOptions,
 ) -> None:
     """List the takes of running gateways.
 
@@ -143,7 +121,7 @@ def list_(
     from gateway.cli.main import exit_with
     from gateway.cli.take_report import write_list
 
-    with _client(lcm, connect, zenoh_config, url, queries_url, prefix, timeout) as client:
+    with query.client(lcm=lcm) as client:
         replies = client.takes(source)
     if as_json:
         _print_json(replies.received)
@@ -174,17 +152,19 @@ def fetch(
     from gateway.cli.export_progress import file_progress
     from gateway.cli.main import exit_with
     from gateway.cli.take_report import size_text
+    from gateway.client.client import GatewayAddress, GatewayClient
     from gateway.errors import QueryError
     from gateway.takes.files.new_file import NewFiles
     from gateway.takes.files.reader import SUFFIX
 
+    address = GatewayAddress(connect=connect, zenoh_config=zenoh_config, prefix=prefix)
     log = f"{name}{SUFFIX}"
     path = Path(log) if file is None else file / log if file.is_dir() else file
     try:
         with NewFiles() as files:
             copy = files.create(path)  # before a long transfer: the file may exist already
             with (
-                _client(False, connect, zenoh_config, None, None, prefix, timeout) as client,
+                GatewayClient(address, timeout) as client,
                 file_progress(f"fetching {name}", quiet=quiet) as progress,
             ):
                 fetched = client.fetch_take(name, copy, source=source, progress=progress)
@@ -194,22 +174,6 @@ def fetch(
     what = f"{size_text(fetched.num_bytes)} of take {name!r} of source {fetched.source!r}"
     what = what if fetched.is_complete else f"the first {what}, which is still running"
     print(safe_text(f"{path}: {what}"))
-
-
-def _client(
-    lcm: bool,
-    connect: str | None,
-    zenoh_config: Path | None,
-    url: str | None,
-    queries_url: str | None,
-    prefix: str | None,
-    timeout_s: float,
-) -> "GatewayClient":
-    """Return the client that options choose. Raises BadParameter if they contradict."""
-    from gateway.client.client import GatewayAddress, GatewayClient
-
-    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url, queries_url=queries_url)
-    return GatewayClient(GatewayAddress(lcm, connect, zenoh_config, url, prefix, queries_url), timeout_s)
 
 
 def _print_replies(

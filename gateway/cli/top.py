@@ -13,14 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from gateway.cli.main import exit_with
-from gateway.cli.options import (
-    ConnectOption,
-    PrefixOption,
-    SourcesOption,
-    UrlOption,
-    ZenohConfigOption,
-    check_transport,
-)
+from gateway.cli.options import AddressOptions, SourcesOption, with_options
 from gateway.errors import QueryError
 from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.logs.safe_text import safe_lines, safe_text
@@ -35,7 +28,9 @@ _MAX_WIDTH: Final = 10_000
 """How wide tables may be in files and pipes."""
 
 
+@with_options
 def top(
+    *,
     source: SourcesOption = None,
     once: Annotated[
         bool, typer.Option("--once", help="Print all tables once, as without a terminal, and end.")
@@ -47,20 +42,14 @@ def top(
         ),
     ] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive on LCM; the default is Zenoh.")] = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    prefix: PrefixOption = None,
+    where: AddressOptions,
 ) -> None:
     """Watch what gateways publish: rates, gaps, latencies, visibility, clocks, drops, outputs, queries.
 
     With --once, exit status 3 if no gateway is found, or none that serves a source.
     """
-    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
-    from gateway.client.client import GatewayAddress
-
-    address = GatewayAddress(lcm, connect, zenoh_config, url, prefix)
-    _run(address, list(dict.fromkeys(source or ())), is_once=once, as_json=as_json)
+    where.check(lcm=lcm)
+    _run(where.address(lcm=lcm), list(dict.fromkeys(source or ())), is_once=once, as_json=as_json)
 
 
 def _run(address: "GatewayAddress", wanted: list[str], *, is_once: bool, as_json: bool) -> None:

@@ -11,15 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from gateway.cli.options import (
-    ConnectOption,
-    PrefixOption,
-    SourcesOption,
-    UrlOption,
-    ZenohConfigOption,
-    check_transport,
-    checked_host,
-)
+from gateway.cli.options import AddressOptions, SourcesOption, checked_host, with_options
 from gateway.cli.run import StopSignals
 from gateway.logs.safe_text import safe_text
 from gateway.outputs.listen_address import is_loopback
@@ -38,6 +30,7 @@ _SILENCE_S: Final = 2.0
 _INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
 
 
+@with_options
 def view(
     take: Annotated[
         Path | None,
@@ -45,12 +38,10 @@ def view(
             metavar="[TAKE]", help="Play this take (.lcmlog, or the folder of one) instead of live data."
         ),
     ] = None,
+    *,
     source: SourcesOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
-    prefix: PrefixOption = None,
+    where: AddressOptions,
     host: Annotated[
         str, typer.Option(callback=checked_host, help="The address where the page is served.")
     ] = "127.0.0.1",
@@ -60,19 +51,16 @@ def view(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open the page.")] = False,
 ) -> None:
     """Show markers, tools and forces in the browser as they arrive, or from a take, until Ctrl-C."""
-    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
-    if take is not None and (lcm or connect is not None or zenoh_config is not None or prefix is not None):
+    where.check(lcm=lcm)
+    if take is not None and (lcm or where != AddressOptions()):
         raise typer.BadParameter(
             "a take is read from its file; --lcm, --connect and --prefix are for live data"
         )
-    from gateway.client.client import GatewayAddress
-
     stop = StopSignals(lambda _: os._exit(0))
     server = _open_server(host, port)
     try:
         if take is None:
-            address = GatewayAddress(lcm, connect, zenoh_config, url, prefix)
-            show = _live_data(address, source or (), server)
+            show = _live_data(where.address(lcm=lcm), source or (), server)
         else:
             show = _take(take, source or (), server)
         with show as (viewer, tick):
