@@ -46,7 +46,7 @@ class Lab(NamedTuple):
         return await asyncio.gather(*(run(*arguments, *self.options(side, *of_lcm)) for side in SIDES))
 
     async def params(self, *arguments: str) -> list[Completed]:
-        # Without --source, the command first waits for status messages on LCM, which takes 2.5 s.
+        # Without --source, the command first waits for status messages on LCM, which takes 1.5 s.
         return await self.run("params", *arguments, of_lcm=("--source", "lab"))
 
 

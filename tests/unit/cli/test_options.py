@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 from gateway.cli import configuration
 from gateway.cli.configuration import configuration_from_options
 from gateway.cli.main import app
+from gateway.cli.options import QueryOptions
+from gateway.client import GatewayAddress
 from gateway.config.loading import Configuration
 from gateway.config.show import schema_text
 from gateway.errors import ConfigError
@@ -118,6 +120,19 @@ def test_options_for_another_transport_end_with_status_2(command: str, options: 
     assert text in result.output
 
 
+def test_all_options_of_an_address_reach_the_client() -> None:
+    """A command that ignored one would ask another gateway than the user named."""
+    options = QueryOptions("tcp/127.0.0.1:1", Path("viewer.json5"), "memq://1", "memq://2", "HALL", 1.0)
+    assert options.address(lcm=True) == GatewayAddress(
+        is_lcm=True,
+        connect="tcp/127.0.0.1:1",
+        zenoh_config=Path("viewer.json5"),
+        url="memq://1",
+        queries_url="memq://2",
+        prefix="HALL",
+    )
+
+
 def test_doctor_reads_the_default_file(default_config: Path) -> None:
     default_config.write_text("sources: [{name: lab, host: a..b}]\n")
     result = CliRunner().invoke(app, ["doctor"])
@@ -176,6 +191,7 @@ def test_check_can_print_json(tmp_path: Path) -> None:
         "simulate --port 0 --take examples/walk.lcmlog --source nosuch",
         "simulate --port 0 --take examples/walk.lcmlog --from 100",
         "record /nowhere/walk.c3d",
+        "view examples/walk.lcmlog --prefix hall",
     ],
 )
 def test_a_wrong_value_of_an_option_has_the_status_2(command: str) -> None:
