@@ -23,7 +23,7 @@ from gateway.logs.safe_text import safe_json, safe_text
 
 if TYPE_CHECKING:
     from gateway.cli.take_report import ListedTake
-    from gateway.client.transport import Replies
+    from gateway.client.client import TakeReplies
 
 _NameArgument = Annotated[
     str | None,
@@ -176,9 +176,7 @@ def fetch(
     print(safe_text(f"{path}: {what}"))
 
 
-def _print_replies(
-    replies: "Replies[dict[str, dict[str, Any]]]", text: Callable[["ListedTake"], str], *, as_json: bool
-) -> None:
+def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], *, as_json: bool) -> None:
     """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
     from gateway.cli.main import exit_with
     from gateway.cli.take_report import ListedTake

@@ -36,6 +36,10 @@ class GatewayAddress(NamedTuple):
     queries_url: str | None = None
 
 
+TakeReplies = Replies[dict[str, dict[str, Any]]]
+"""What gateways say about takes, by source; docs/reference/queries.md describes it."""
+
+
 class GatewayClient:
     """Finds gateways, asks them, and subscribes to what they publish.
 
@@ -85,20 +89,17 @@ class GatewayClient:
 
     # Takes.
 
-    def takes(self, source: str | None = None) -> Replies[dict[str, dict[str, Any]]]:
-        """Return the takes of a source, or of all that are found, by source.
-
-        The content is described in docs/reference/queries.md, as that of the following methods.
-        """
+    def takes(self, source: str | None = None) -> TakeReplies:
+        """Return the takes of a source, or of all that are found."""
         return self._ask_takes({}, source)
 
     def start_take(
         self, name: str | None = None, details: TakeDetails = NO_DETAILS, *, source: str | None = None
-    ) -> Replies[dict[str, dict[str, Any]]]:
+    ) -> TakeReplies:
         """Start a take."""
         return self._ask_takes({CONTROL_OPTION: "start"} | _described(name, details), source)
 
-    def stop_take(self, *, source: str | None = None) -> Replies[dict[str, dict[str, Any]]]:
+    def stop_take(self, *, source: str | None = None) -> TakeReplies:
         """Stop the running take."""
         return self._ask_takes({CONTROL_OPTION: "stop"}, source)
 
@@ -110,7 +111,7 @@ class GatewayClient:
         last_s: float | None = None,
         after_s: float = 0.0,
         source: str | None = None,
-    ) -> Replies[dict[str, dict[str, Any]]]:
+    ) -> TakeReplies:
         """Keep the last seconds as a take: all that are kept, or ``last_s``, and ``after_s`` more."""
         options = {CONTROL_OPTION: "save"}
         if last_s is not None:
@@ -164,9 +165,7 @@ class GatewayClient:
         except QueryError as error:
             return Replies([], [error])
 
-    def _ask_takes(
-        self, options: Mapping[str, str], source: str | None
-    ) -> Replies[dict[str, dict[str, Any]]]:
+    def _ask_takes(self, options: Mapping[str, str], source: str | None) -> TakeReplies:
         """Ask a source, or all that are found, with these options.
 
         If all sources are asked and one replies as wanted, those are left out whose gateway records no takes

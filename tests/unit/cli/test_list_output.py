@@ -79,6 +79,7 @@ def test_on_80_columns_each_stream_that_streams_has_one_line() -> None:
 
 def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
     found = found_of(two_streams(source="b"), status(source="a"))
+    assert found.readable_names == ["a", "b"]
     assert printed(found, columns=10, is_terminal=False).splitlines() == [
         "a\tstreaming 200.0 Hz\t3d 6d\t192.0.2.20:3020\tmocap-pc\t1.2.3",
         "b\t3d 6d streaming 200.0 Hz, analog force waiting for 192.0.2.20:3020, 3 tries\t3d 6d, analog force"
@@ -134,6 +135,7 @@ def test_a_status_that_cannot_be_read_is_said(message: bytes, problem: str) -> N
     [source] = found.sources
     assert (source.name, source.gateway) == ("lab", "abc")
     assert source.problem.startswith(problem)
+    assert found.readable_names == []  # nobody waits for its reply to a query
     assert problem in printed(found, columns=300)
 
 

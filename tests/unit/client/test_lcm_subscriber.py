@@ -1,5 +1,6 @@
 """Receiving from LCM, whatever is sent there."""
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from gateway.client.reception import MAX_SOURCES
 from gateway.client.series import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.recorder.take_recording import TakeRecording
 from gateway.takes.recorder.target import FileSink, Target
@@ -25,7 +28,7 @@ class Lab:
 
     def __init__(self, folder: Path, *sources: str) -> None:
         target = Target(folder / "walk")
-        url = lcm_url()
+        self.url = url = lcm_url()
         self.path = folder / "walk.lcmlog"
         self.lcm = open_lcm(url)
         self.recording = TakeRecording(lambda names: FileSink(target.open(names)))
@@ -100,3 +103,37 @@ def test_only_the_chosen_sources_are_received(tmp_path: Path) -> None:
     assert names(lab) == {"Lab-1"}
     assert lab.channels() == [f"MOCAP_LAB_1_{end}" for end in ("TAKE", "3D", "STATUS", "END")]
     lab.subscriber.close()
+
+
+def test_replies_of_others_and_late_ones_about_takes_are_left_out(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise, a take would seem to be running that has ended, or that of another program's question."""
+    taken: list[bytes] = []
+    monkeypatch.setattr(lab.recording, "answered_takes", lambda _source, content: taken.append(content))
+    requests: list[rtc3d.command_request_t] = []
+    queries = open_lcm(lcm_queries_url(lab.url))
+
+    def reply(number: int, content: str, requester: str = "") -> None:
+        message = rtc3d.command_reply_t()
+        message.request_id, message.content = requests[number].request_id, content
+        message.requester = requester or requests[number].requester
+        queries.publish("MOCAP_LAB_COMMAND_REPLY", message.encode())
+
+    with contextlib.closing(
+        LcmSubscriber(
+            queries,
+            "MOCAP_LAB_COMMAND_REQUEST",
+            lambda _channel, data: requests.append(rtc3d.command_request_t.decode(data)),
+        )
+    ):
+        lab.lcm.publish("MOCAP_LAB_3D", lab.markers(1))
+        wait_until(lambda: names(lab) == {"lab"})
+        for _ in range(2):
+            lab.subscriber.query_takes(lab.recording.sources_now[0])
+        wait_until(lambda: len(requests) == 2)
+        reply(0, "late")
+        reply(1, "of another program", "other")
+        reply(1, "newest")
+        wait_until(lambda: taken)
+    assert taken == [b"newest"]
