@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from gateway.cli.take_report import ListedTake
     from gateway.client.client import TakeReplies
 
+app = typer.Typer(
+    no_args_is_help=True, help="Inspect recordings (takes), and control those of running gateways."
+)
+
 _NameArgument = Annotated[
     str | None,
     typer.Argument(
@@ -37,6 +41,7 @@ _LcmOption = Annotated[bool, typer.Option("--lcm", help="Ask on LCM instead of Z
 _JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")]
 
 
+@app.command()
 @with_options
 def start(
     name: _NameArgument = None,
@@ -57,6 +62,7 @@ def start(
     _print_replies(replies, lambda take: f"take {take.name!r} is running", as_json=as_json)
 
 
+@app.command()
 @with_options
 def stop(
     *,
@@ -74,6 +80,7 @@ def stop(
     _print_replies(replies, lambda take: f"take {take.name!r} is stopped: {take.facts}", as_json=as_json)
 
 
+@app.command()
 @with_options
 def save(
     name: _NameArgument = None,
@@ -104,32 +111,7 @@ def save(
     )
 
 
-@with_options
-def list_(
-    *,
-    source: SourceOption = None,
-    as_json: _JsonOption = False,
-    lcm: _LcmOption = False,
-    query: QueryOptions,
-) -> None:
-    """List the takes of running gateways.
-
-    Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
-    """
-    from rich.console import Console
-
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_report import write_list
-
-    with query.client(lcm=lcm) as client:
-        replies = client.takes(source)
-    if as_json:
-        _print_json(replies.received)
-    else:
-        write_list(replies.received, Console(file=sys.stdout))
-    exit_with(replies.problems)
-
-
+@app.command()
 def fetch(
     name: Annotated[
         str, typer.Argument(metavar="NAME", callback=checked_take_name, help="The name of the take.")
@@ -176,38 +158,31 @@ def fetch(
     print(safe_text(f"{path}: {what}"))
 
 
-def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], *, as_json: bool) -> None:
-    """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_report import ListedTake
+@app.command("list")
+@with_options
+def list_(
+    *,
+    source: SourceOption = None,
+    as_json: _JsonOption = False,
+    lcm: _LcmOption = False,
+    query: QueryOptions,
+) -> None:
+    """List the takes of running gateways.
 
-    takes = {source: ListedTake(content) for source, content in replies.received.items()}
+    Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
+    """
+    from rich.console import Console
+
+    from gateway.cli.main import exit_with
+    from gateway.cli.take_report import write_list
+
+    with query.client(lcm=lcm) as client:
+        replies = client.takes(source)
     if as_json:
         _print_json(replies.received)
     else:
-        for source, take in takes.items():
-            print(safe_text(f"{source}: {text(take)}"))
+        write_list(replies.received, Console(file=sys.stdout))
     exit_with(replies.problems)
-    if any(take.problem for take in takes.values()):
-        raise typer.Exit(1)
-
-
-def _print_json(content: Any) -> None:
-    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
-
-
-def add_commands(app: typer.Typer) -> None:
-    """Add the commands of this module to ``take``."""
-    for command in (start, stop, save, fetch):
-        app.command()(command)
-    app.command("list")(list_)
-
-
-app = typer.Typer(
-    no_args_is_help=True, help="Inspect recordings (takes), and control those of running gateways."
-)
-
-add_commands(app)
 
 
 @app.command()
@@ -235,3 +210,23 @@ def info(
         write_report(statistics, Console(file=sys.stdout))
     if statistics.was_cut_short:
         raise typer.Exit(1)
+
+
+def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], *, as_json: bool) -> None:
+    """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
+    from gateway.cli.main import exit_with
+    from gateway.cli.take_report import ListedTake
+
+    takes = {source: ListedTake(content) for source, content in replies.received.items()}
+    if as_json:
+        _print_json(replies.received)
+    else:
+        for source, take in takes.items():
+            print(safe_text(f"{source}: {text(take)}"))
+    exit_with(replies.problems)
+    if any(take.problem for take in takes.values()):
+        raise typer.Exit(1)
+
+
+def _print_json(content: Any) -> None:
+    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
