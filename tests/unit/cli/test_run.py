@@ -3,14 +3,15 @@ import subprocess
 import sys
 
 COMMAND = """
-import os, signal, sys
+import os, signal, sys, time
 from gateway.cli.run import StopSignals
 stop = StopSignals(lambda number: os._exit(number))
 print("ready", flush=True)
 while not stop.wait(0):  # as often as possible: the signal comes at any place in it
     pass
 print("stopped", flush=True)
-signal.pause()
+while True:  # signal.pause() would miss a signal that comes just before it
+    time.sleep(0.01)
 """
 
 
