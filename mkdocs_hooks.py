@@ -11,6 +11,14 @@ ROOT = Path(__file__).parent
 LINK = re.compile(r"\]\(([^)\s#]+)[^)\s]*\)")
 
 
+class TextFile(File):
+    """A file that the site shows unchanged."""
+
+    def is_documentation_page(self) -> bool:
+        """Return False, even for Markdown: a page made of it would have links that lead out of the site."""
+        return False
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add each file outside docs/ that a page links to, as a text file that a browser can display."""
     for page in files.documentation_pages():
@@ -19,7 +27,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             path = (ROOT / config["docs_dir"] / uri).resolve()
             if uri.startswith("../") and path.is_file() and files.get_file_from_path(uri) is None:
                 name = path.relative_to(ROOT)
-                file = File(
+                file = TextFile(
                     uri,
                     src_dir=None,
                     dest_dir=config["site_dir"],
