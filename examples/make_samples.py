@@ -26,7 +26,7 @@ from gateway.stream.state import StreamState
 from gateway.takes.export.formats import export_take
 from gateway.takes.export.job import ExportJob
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.files.recording import LogFile
+from gateway.takes.files.writer_thread import LogFile
 
 SOURCE: Final = "lab"
 NAME: Final = "walk"

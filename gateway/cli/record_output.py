@@ -16,8 +16,7 @@ from gateway.client.reception import MAX_SERIES, MAX_SOURCES
 from gateway.client.series import POSE
 from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
-from gateway.takes.recorder.take_recording import RecordedSeries, RecordedSource, TakeRecording
-from gateway.takes.recorder.target import FileSink
+from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording
 
 SILENCE_S: Final = 2.0
 _NO_DATA_S: Final = 3.0
@@ -87,8 +86,8 @@ class RecordProgress:
     # The disk, and losses.
 
     def _check_disk(self) -> None:
-        sink = self._recording.sink
-        problem = "" if sink is None else sink.problem
+        file = self._recording.file
+        problem = "" if file is None else file.problem
         if problem != self._disk_problem:
             self._disk_problem = problem
             if problem:
@@ -187,10 +186,10 @@ class RecordProgress:
         )
         self._former, self._rate_s = counts, now_s
         minutes, seconds = divmod(int(now_s - self._start_s), 60)
-        sink = recording.sink
+        file = recording.file
         parts = [
             f"{minutes}:{seconds:02}",
-            "waiting for messages" if sink is None else size_text(sink.num_bytes),
+            "waiting for messages" if file is None else size_text(file.num_bytes),
             f"{message_rate:.0f} messages/s",
             f"{size_text(byte_rate)}/s",
             f"{self._num_lost} lost" if self._num_lost else "no gaps",
@@ -222,13 +221,13 @@ class SeriesCounts(NamedTuple):
     num_unwritten: int
 
 
-def counts_of(series: Sequence[RecordedSeries], sink: FileSink) -> SeriesCounts:
+def counts_of(series: Sequence[RecordedSeries], file: FileWriter) -> SeriesCounts:
     """Return the counts of some series together."""
-    num_unwritten = sum(each.num_refused + sink.lost[each.channel] for each in series)
+    num_unwritten = sum(each.num_refused + file.lost[each.channel] for each in series)
     num_messages = sum(each.num_messages for each in series)
     return SeriesCounts(
         num_messages - num_unwritten,
-        sum(each.num_bytes - each.num_refused_bytes - sink.lost_bytes[each.channel] for each in series),
+        sum(each.num_bytes - each.num_refused_bytes - file.lost_bytes[each.channel] for each in series),
         sum(_rate_hz(each) for each in series),
         sum(each.check.num_gaps for each in series),
         sum(each.check.num_lost for each in series),
@@ -247,8 +246,8 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     It is if it has a message of a frame, and none that was published meanwhile is missing.
     """
     console = Console(file=out)
-    sink = recording.sink
-    if sink is None:
+    file = recording.file
+    if file is None:
         console.print(Text("nothing was recorded, and there is no file: no message has arrived"))
         return False
     table = Table("source", "component", box=None, pad_edge=False)
@@ -256,7 +255,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
         table.add_column(column, justify="right")
     for source in recording.sources_now:
         for row, series in _rows(source):
-            counts = counts_of(series, sink)
+            counts = counts_of(series, file)
             table.add_row(
                 Text(safe_text(source.name)),
                 row,
@@ -273,7 +272,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     for note in (*notes, *problems):
         console.print(Text(safe_text(note)), soft_wrap=True)
     end = "INCOMPLETE" if problems else "complete: no gaps"
-    console.print(Text(f"{sink.path}: {size_text(sink.num_bytes)}, {end}"), soft_wrap=True)
+    console.print(Text(f"{file.path}: {size_text(file.num_bytes)}, {end}"), soft_wrap=True)
     return not problems
 
 
@@ -291,8 +290,8 @@ def _problems(recording: TakeRecording) -> Iterator[str]:
     if not any(source.num_data for source in recording.sources_now):
         yield "no frame was recorded"
     yield from _losses(recording)
-    if recording.sink is not None:
-        yield from _disk_problems(recording.sink)
+    if recording.file is not None:
+        yield from _disk_problems(recording.file)
     if recording.is_moved:
         yield "the file was moved or deleted while it was recorded"
     if recording.defect is not None:
@@ -323,12 +322,12 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
         yield f"{num_refused} messages were not written, because too many waited for the disk"
 
 
-def _disk_problems(sink: FileSink) -> Iterator[str]:
-    if sink.lost:
-        yield f"{sink.lost.total()} messages were not written: {sink.problem}"
-    elif sink.problem:
-        yield sink.problem
-    elif sink.is_unsafe:
+def _disk_problems(file: FileWriter) -> Iterator[str]:
+    if file.lost:
+        yield f"{file.lost.total()} messages were not written: {file.problem}"
+    elif file.problem:
+        yield file.problem
+    elif file.is_unsafe:
         yield "the disk reported errors: the file may be damaged"
 
 
@@ -339,8 +338,8 @@ def _notes(recording: TakeRecording) -> Iterator[str]:
             f"{recording.num_foreign} messages on these keys or channels were not recorded: they are none of "
             "this version's types; does another program, or another version of the gateway, publish there?"
         )
-    if recording.sink is not None and recording.sink.num_errors and not recording.sink.problem:
-        yield f"the disk did not accept what was written for a while ({_times(recording.sink.num_errors)})"
+    if recording.file is not None and recording.file.num_errors and not recording.file.problem:
+        yield f"the disk did not accept what was written for a while ({_times(recording.file.num_errors)})"
     for source in recording.sources_now:
         checks = [series.check for series in source.series]
         restarts = max((check.num_restarts for check in checks), default=0)

@@ -21,7 +21,7 @@ from gateway.outputs.takes.follow import EventPublisher, TakeFollower
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import ComponentType
-from gateway.takes.files.recording import MAX_QUEUED_BYTES
+from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES
 
 
 class TakesOutput(Output):

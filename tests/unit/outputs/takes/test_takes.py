@@ -337,8 +337,8 @@ def test_a_save_that_was_ended_does_not_end_again(tmp_path: Path) -> None:
         async with still_lab(tmp_path, keep_last_s=60) as lab:
             lab.publish()
             saved = await lab.takes.save("lab", 60, 30, "fall")
-            recording, recorder = lab.takes.recording("lab"), lab.takes._started_recorder()
-            recording.end_takes(recorder)
+            recording = lab.takes.recording("lab")
+            recording.end_takes()
             assert not recording.saves
             await asyncio.sleep(59)
             assert recording.take_of_c3d() == lab.path(saved.name)
