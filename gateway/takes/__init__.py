@@ -4,8 +4,8 @@
 
 In ``files``:
 
-- Writing: ``take_writer`` is a take that is being written. ``writer_thread`` has one thread for all files and a
-  queue with a limit in front of it. ``description`` says what is at the beginning and at the end of a file;
+- Writing: ``take_writer`` is a take that is being written. ``writer_thread`` has one thread for all files and
+  a queue with a limit in front of it. ``description`` says what is at the beginning and at the end of a file;
   ``new_file`` checks names. The output ``takes`` and the command ``record`` are built on these.
 - Reading: ``event_log`` reads events one after the other and goes on behind damage. ``reader`` adds what each
   of them is: the source, the component or kind of message.

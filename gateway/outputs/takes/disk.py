@@ -77,17 +77,6 @@ class Host:
     writer: Callable[[str, int], WriterThread] = WriterThread
 
 
-class DiskReader:
-    """Reads the disk for peers in a thread."""
-
-    def __init__(self, thread: WorkerThread) -> None:
-        self._thread = thread
-
-    async def read(self, call: Callable[[], _Result], path: Path) -> _Result:
-        """Return the result of ``call``, which reads ``path``. Raises QueryError."""
-        return await disk_result(self._thread.submit(call), path)
-
-
 async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = None) -> _Result:
     """Return the result of a call that needs the disk of ``path``. Raises QueryError if the disk fails.
 

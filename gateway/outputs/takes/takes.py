@@ -3,19 +3,18 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.takes.control import SourceTakes, StoredTake, TakePiece
-from gateway.outputs.takes.disk import Disk, DiskReader, Host, disk_problem, disk_result
-from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
-from gateway.outputs.takes.folder_watch import FolderWatch
+from gateway.outputs.takes.disk import Disk, Host, disk_problem, disk_result
+from gateway.outputs.takes.folder import ROLLING, StoredTake, TakePiece, TakesFolder, add_c3d
+from gateway.outputs.takes.folder_limits import FolderWatch
 from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
@@ -33,13 +32,30 @@ MAX_SAVES: Final = 16
 _CLOSE_S: Final = 0.8
 """How long the end of the gateway waits for the disk."""
 
+_Result = TypeVar("_Result")
+
 logger = logging.getLogger(__name__)
 
 
-class RecordedTakes:
-    """The takes of all sources (see Takes). Call it in the event loop; no call waits for the disk for long.
+class SourceTakes(NamedTuple):
+    """The takes of a source, the newest first.
 
-    ``server`` returns HOST:PORT of a source's server.
+    ``running`` is the one that was started and not stopped yet, ``kept_s`` how many seconds the rolling
+    segments hold, which ``save`` keeps.
+    """
+
+    running: StoredTake | None
+    takes: Sequence[StoredTake]
+    kept_s: float
+
+
+class Takes:
+    """The takes of all sources. Call it in the event loop; no call waits for the disk for long.
+
+    Every method for peers raises QueryError: bad-request for a name, text or number that cannot be, a take
+    that exists or is running already, or does not exist; nothing-yet if there is nothing to stop or save;
+    disk if the folder cannot be used. The text is for the peer. ``server`` returns HOST:PORT of a source's
+    server.
     """
 
     def __init__(self, settings: TakesSettings, max_queued_bytes: int, host: Host) -> None:
@@ -52,7 +68,7 @@ class RecordedTakes:
         self._writer: WriterThread | None = None
         self._is_closed = False
         self._recordings: dict[str, SourceRecording] = {}
-        self._reader = DiskReader(host.thread("takes-read"))
+        self._read_thread = host.thread("takes-read")
         self._copy_thread = host.thread("takes-copy")
 
     @property
@@ -62,7 +78,10 @@ class RecordedTakes:
     # For peers.
 
     async def start(self, source: str, name: str = "", details: TakeDetails = NO_DETAILS) -> StoredTake:
-        """See Takes."""
+        """Start a take and return it; everything that is published after this call is in it.
+
+        "" means a name of source and time. A source has one running take.
+        """
         return await self.begin(source, name, details, has_free_name=not name)
 
     def begin(
@@ -119,7 +138,7 @@ class RecordedTakes:
         return None if recording is None else recording.take
 
     async def stop(self, source: str) -> StoredTake:
-        """See Takes."""
+        """End the running take, and return it when everything is on the disk."""
         return await self.end(source)
 
     def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
@@ -133,7 +152,7 @@ class RecordedTakes:
 
     async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
         await disk_result(ended, take.path, self.disk)
-        stored = await self._reader.read(partial(self._folder.take_at, take.stem), take.path)
+        stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
         size = f"{stored.seconds:.1f} s, {stored.num_bytes / 1e6:.1f} MB"
         if take.num_lost or stored.is_cut_off:
             logger.warning("takes: %s is not complete: %s, %d messages lost", take.path, size, take.num_lost)
@@ -149,7 +168,10 @@ class RecordedTakes:
         name: str = "",
         details: TakeDetails = NO_DETAILS,
     ) -> StoredTake:
-        """See Takes."""
+        """Keep the last ``last_s`` seconds as a take, which goes on for ``after_s`` seconds.
+
+        Returns it at once; it is running until it is complete.
+        """
         recording, writer = self._announced(source), self._open_writer()
         if name:
             check_name(name)
@@ -188,17 +210,17 @@ class RecordedTakes:
             recording.ended(save.folder)
         logger.info("takes: saving %s", save.folder)
         stored = partial(self._folder.take_at, save.folder, is_running=after_s > 0)
-        return await self._reader.read(stored, folder)
+        return await self._read(stored, folder)
 
     async def list(self, source: str) -> SourceTakes:
-        """See Takes."""
+        """Return the takes of a source."""
         recording = self._announced(source)
         folder, running = self._folder, recording.running_names
-        takes = await self._reader.read(partial(folder.takes, source, running), folder.directory)
+        takes = await self._read(partial(folder.takes, source, running), folder.directory)
         take = recording.take
         current: StoredTake | None = None
         if take is not None:
-            stored = await self._reader.read(partial(folder.take_at, take.stem, is_running=True), take.path)
+            stored = await self._read(partial(folder.take_at, take.stem, is_running=True), take.path)
             if recording.take is take:  # otherwise, it has just ended
                 current = stored._replace(num_lost=take.num_lost)
                 takes = [current if each.name == current.name else each for each in takes]
@@ -206,14 +228,16 @@ class RecordedTakes:
         return SourceTakes(current, takes, kept_s)
 
     async def read(self, source: str, name: str, offset: int) -> TakePiece:
-        """See Takes."""
+        """Return up to MAX_PIECE_BYTES of a take; an empty piece at its end."""
         self._announced(source)
         check_name(name)
         if offset < 0:
             raise QueryError(f"expected an offset of 0 or more; found {offset}")
-        return await self._reader.read(
-            partial(self._folder.read, source, name, offset), self._folder.directory
-        )
+        return await self._read(partial(self._folder.read, source, name, offset), self._folder.directory)
+
+    async def _read(self, call: Callable[[], _Result], path: Path) -> _Result:
+        """Return the result of ``call``, which reads ``path`` in a thread. Raises QueryError."""
+        return await disk_result(self._read_thread.submit(call), path)
 
     def _announced(self, source: str) -> SourceRecording:
         recording = self._recordings.get(source)
