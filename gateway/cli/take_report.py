@@ -11,10 +11,10 @@ from rich.text import Text
 
 from gateway.display.terminal.lists import print_list
 from gateway.logs.safe_text import safe_text
+from gateway.messages.sequence import Gap
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.component_statistics import ComponentStatistics, MessageStatistics
 from gateway.takes.files.description import TakeDetails
-from gateway.takes.files.gaps import Gap
 from gateway.takes.files.reader import DESCRIPTIONS, is_gateways_channel
 from gateway.takes.files.statistics import SourceStatistics, TakeStatistics
 
@@ -201,13 +201,13 @@ def _messages_json(statistics: TakeStatistics, part: MessageStatistics) -> dict[
         "malformed": part.malformed,
         "first_s": statistics.seconds_at(part.first_utime) if part.first_utime else None,
         "last_s": statistics.seconds_at(part.last_utime) if part.last_utime else None,
-        "missing": gaps.missing,
+        "missing": gaps.num_lost,
         "gaps": gaps.num_gaps,
         "largest_gap": None if gaps.largest is None else _gap_json(statistics, gaps.largest),
         "gap_list": [_gap_json(statistics, gap) for gap in gaps.gaps],
-        "late": gaps.late,
-        "repeated": gaps.repeated,
-        "implausible": gaps.implausible,
+        "late": gaps.num_late,
+        "repeated": gaps.num_repeated,
+        "implausible": gaps.num_implausible,
     }
 
 
@@ -309,7 +309,7 @@ def _row(
         items,
         rate,
         f"{(part.last_utime - part.first_utime) / 1e6:.2f}" if part.first_utime else "",
-        sum(gap.missing for gap in gaps),
+        sum(gap.num_lost for gap in gaps),
         gap_text,
     )
 
@@ -379,9 +379,9 @@ def _source_problems(source: SourceStatistics) -> Iterator[str]:
     for key, part in parts.items():
         for number, what in (
             (part.malformed, "could not be read"),
-            (part.gaps.implausible, "with implausible sequence numbers"),
-            (part.gaps.late, "arrived late"),
-            (part.gaps.repeated, "arrived again"),
+            (part.gaps.num_implausible, "with implausible sequence numbers"),
+            (part.gaps.num_late, "arrived late"),
+            (part.gaps.num_repeated, "arrived again"),
         ):
             if number:
                 yield f"{_count(number, f'{key} message')} {what}"

@@ -11,8 +11,8 @@ In ``files``:
   of them is: the source, the component or kind of message.
 - Arrays: ``take`` and ``series`` decode a take into numpy arrays; ``component_rows`` does so for many
   messages at once.
-- Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory, and
-  ``gaps`` finds what interrupts it.
+- Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
+  with what interrupts it.
 """
 
 from typing import TYPE_CHECKING, Any
