@@ -10,13 +10,13 @@ import typer
 from gateway.cli.options import NoProgressOption, SourceOption
 from gateway.config.words import join_or
 from gateway.logs.safe_text import safe_text
-from gateway.takes.export.extensions import EXTENSIONS
+from gateway.takes.export.job import FORMATS, ExportJob, export_take
 
 
 def export(
     file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
     out: Annotated[
-        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(EXTENSIONS)}.")
+        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
     ],
     source: SourceOption = None,
     from_s: Annotated[
@@ -35,8 +35,6 @@ def export(
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
     from gateway.cli.export_progress import ExportProgress
-    from gateway.takes.export.formats import export_take
-    from gateway.takes.export.job import ExportJob
 
     job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
     with ExportProgress() if sys.stderr.isatty() and not quiet else nullcontext() as progress:
