@@ -183,7 +183,9 @@ class TakesFolder:
         for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
             segments = [path for path, _ in _files(folder) if path.suffix == SUFFIX]
             if segments:
-                take = self._new_folder(folder.name, default_name(folder.name))
+                take = new_folder(
+                    self.directory / folder.name / default_name(folder.name), has_free_name=True
+                )
                 for number, segment in enumerate(segments, start=1):
                     segment.replace(take / f"{take.name}-{number:03}{SUFFIX}")
                 logger.warning(
@@ -192,16 +194,6 @@ class TakesFolder:
                 )
             with contextlib.suppress(OSError):
                 folder.rmdir()
-
-    def _new_folder(self, source: str, name: str) -> Path:
-        (self.directory / source).mkdir(exist_ok=True)
-        number = 1
-        while True:
-            with contextlib.suppress(FileExistsError):
-                folder = self.directory / source / numbered(name, number)
-                folder.mkdir()
-                return folder
-            number += 1
 
     # Takes.
 
@@ -270,6 +262,21 @@ class TakesFolder:
                 for _, status in _files(Path(folder.path)):
                     sizes[status.st_dev, status.st_ino] = status.st_size
         return sizes
+
+
+def new_folder(folder: Path, *, has_free_name: bool) -> Path:
+    """Create a folder for a take, with a number if necessary and allowed. Raises OSError, QueryError."""
+    folder.parent.mkdir(exist_ok=True)
+    candidate, number = folder, 1
+    while True:
+        if not candidate.with_name(f"{candidate.name}{SUFFIX}").exists():
+            with contextlib.suppress(FileExistsError):
+                candidate.mkdir()
+                return candidate
+        if not has_free_name:
+            raise QueryError(f"there is a take {folder.name!r} of this source already; choose another name")
+        number += 1
+        candidate = folder.with_name(numbered(folder.name, number))
 
 
 def add_c3d(take: Path, c3d_file: Path) -> Path:

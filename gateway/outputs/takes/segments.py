@@ -15,10 +15,11 @@ from typing import Final
 from gateway.errors import QueryError, TakeError
 from gateway.logs.losses import Losses
 from gateway.outputs.takes.disk import Disk, is_full
+from gateway.outputs.takes.folder import new_folder
 from gateway.outputs.takes.take_file import SourceWriter
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.files.new_file import default_name, numbered
+from gateway.takes.files.new_file import default_name
 from gateway.takes.files.reader import SUFFIX
 from gateway.takes.files.take_writer import begin_log
 from gateway.takes.files.writer_thread import LogFile
@@ -202,7 +203,7 @@ class RollingSegments(SourceWriter):
         """
         if self._log is None and not self._segments:
             raise QueryError("no messages are kept yet, so there is nothing to save", code="nothing-yet")
-        save = Save(_new_folder(folder, has_free_name=has_free_name))
+        save = Save(new_folder(folder, has_free_name=has_free_name))
         try:
             for segment in self._segments:
                 if segment.end_s >= since_s:
@@ -260,18 +261,3 @@ class RollingSegments(SourceWriter):
         with contextlib.suppress(OSError):
             self._folder.rmdir()
         self.disk.ended()
-
-
-def _new_folder(folder: Path, *, has_free_name: bool) -> Path:
-    """Create a folder for a take, with a number if necessary and allowed. Raises OSError, QueryError."""
-    folder.parent.mkdir(exist_ok=True)
-    candidate, number = folder, 1
-    while True:
-        if not candidate.with_name(f"{candidate.name}{SUFFIX}").exists():
-            with contextlib.suppress(FileExistsError):
-                candidate.mkdir()
-                return candidate
-        if not has_free_name:
-            raise QueryError(f"there is a take {folder.name!r} of this source already; choose another name")
-        number += 1
-        candidate = folder.with_name(numbered(folder.name, number))
