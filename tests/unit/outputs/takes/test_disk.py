@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import errno
 import logging
-import os
 import resource
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +24,7 @@ from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import SourceWriter
 from gateway.takes.files.description import SourceDescription
-from gateway.takes.files.take_writer import RETRY_S, begin_log
+from gateway.takes.files.take_writer import RETRY_S
 from gateway.takes.files.writer_thread import LogFile
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
@@ -345,19 +344,6 @@ def test_what_is_given_up_is_counted_in_messages_and_in_frames() -> None:
     assert amounts(sink.losses.report()) == {"not written": (7, 3)}
     sink.write([message(10)])  # the disk has room again
     assert sink.log.content[-1] == message(10)
-
-
-def test_a_file_that_cannot_begin_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An empty file of that name would refuse the next attempt."""
-
-    def write(_descriptor: int, _content: memoryview) -> int:
-        raise FULL
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "write", write)
-        with pytest.raises(OSError, match="No space left"):
-            begin_log(tmp_path / "walk.lcmlog", [message(1)])
-    begin_log(tmp_path / "walk.lcmlog", [message(1)]).close()
 
 
 @pytest.mark.parametrize(

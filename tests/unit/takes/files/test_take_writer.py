@@ -1,5 +1,6 @@
 """A take whose disk is full while it is written, or when it ends."""
 
+import errno
 import os
 import resource
 import threading
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from gateway.takes.files.event_log import EventLogReader
+from gateway.takes.files.take_writer import begin_log
 from gateway.takes.files.writer_thread import LogFile
 from gateway.takes.recorder import FileWriter
 from tests.waiting import wait_until
@@ -92,10 +94,14 @@ def test_the_end_of_the_file_takes_the_place_of_a_message_on_a_full_disk(
     assert [message[-1] for _, message in found[num_kept:]] == {100_000: [0], 3200: [1], 0: []}[room_bytes]
 
 
-def test_no_end_of_an_event_is_left_behind_if_the_disk_is_full(take: FileWriter) -> None:
-    take.give_up()
-    with disk_of(100_500):  # not at the end of an event
-        take.write(messages(1))
-        take.write(messages(200))
-    take.write(messages(1))
-    assert len(written(take)) == 97  # 95 of the 200 fit
+def test_a_file_that_cannot_begin_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty file of that name would refuse the next attempt."""
+
+    def write(_descriptor: int, _content: memoryview) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write)
+        with pytest.raises(OSError, match="No space left"):
+            begin_log(tmp_path / "walk.lcmlog", messages(1))
+    begin_log(tmp_path / "walk.lcmlog", messages(1)).close()
