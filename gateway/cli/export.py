@@ -1,7 +1,6 @@
 """``rtc3d-gateway export``: convert a take to a file of another program."""
 
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -34,12 +33,10 @@ def export(
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
-    from gateway.cli.export_progress import ExportProgress
+    from gateway.cli.export_progress import export_progress
 
     job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
-    with ExportProgress() if sys.stderr.isatty() and not quiet else nullcontext() as progress:
-        if progress is not None:
-            job.progress = progress.show
+    with export_progress(quiet=quiet) as job.progress:
         paths = export_take(job)
     for note in job.notes:
         print(f"note: {safe_text(note)}", file=sys.stderr)

@@ -5,7 +5,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple, TextIO
+from typing import Final, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -210,36 +210,6 @@ _MAX_NOTES: Final = 10
 _COLUMNS: Final = ("messages", "size", "rate", "gaps", "lost", "not written")
 
 
-class SeriesCounts(NamedTuple):
-    """What was recorded of one component of a source. ``num_unwritten`` messages are not in the file."""
-
-    num_messages: int
-    num_bytes: int
-    rate_hz: float
-    num_gaps: int
-    num_lost: int
-    num_unwritten: int
-
-
-def counts_of(series: Sequence[RecordedSeries], file: FileWriter) -> SeriesCounts:
-    """Return the counts of some series together."""
-    num_unwritten = sum(each.num_refused + file.lost[each.channel] for each in series)
-    num_messages = sum(each.num_messages for each in series)
-    return SeriesCounts(
-        num_messages - num_unwritten,
-        sum(each.num_bytes - each.num_refused_bytes - file.lost_bytes[each.channel] for each in series),
-        sum(_rate_hz(each) for each in series),
-        sum(each.check.num_gaps for each in series),
-        sum(each.check.num_lost for each in series),
-        num_unwritten,
-    )
-
-
-def _rate_hz(series: RecordedSeries) -> float:
-    duration_us = series.last_utime - series.first_utime
-    return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
-
-
 def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     """Print what was recorded, and return whether the recording is complete.
 
@@ -255,15 +225,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
         table.add_column(column, justify="right")
     for source in recording.sources_now:
         for row, series in _rows(source):
-            counts = counts_of(series, file)
-            table.add_row(
-                Text(safe_text(source.name)),
-                row,
-                str(counts.num_messages),
-                size_text(counts.num_bytes),
-                f"{counts.rate_hz:.1f} Hz",
-                *(str(number) if number else "-" for number in counts[3:]),
-            )
+            table.add_row(Text(safe_text(source.name)), row, *_cells(series, file))
     console.print(table)
     problems = [*_problems(recording)]
     notes = [*_notes(recording)]
@@ -283,6 +245,24 @@ def _rows(source: RecordedSource) -> Iterator[tuple[str, list[RecordedSeries]]]:
             rows[series.row].append(series)
     for row in sorted(rows, key=_ORDER.index):
         yield row, rows[row]
+
+
+def _cells(series: Sequence[RecordedSeries], file: FileWriter) -> Iterator[str]:
+    """Yield the cells of _COLUMNS for some series together."""
+    num_unwritten = sum(each.num_refused + file.lost[each.channel] for each in series)
+    num_unwritten_bytes = sum(each.num_refused_bytes + file.lost_bytes[each.channel] for each in series)
+    yield str(sum(each.num_messages for each in series) - num_unwritten)
+    yield size_text(sum(each.num_bytes for each in series) - num_unwritten_bytes)
+    yield f"{sum(_rate_hz(each) for each in series):.1f} Hz"
+    num_gaps = sum(each.check.num_gaps for each in series)
+    num_lost = sum(each.check.num_lost for each in series)
+    for number in (num_gaps, num_lost, num_unwritten):
+        yield str(number) if number else "-"
+
+
+def _rate_hz(series: RecordedSeries) -> float:
+    duration_us = series.last_utime - series.first_utime
+    return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
 
 
 def _problems(recording: TakeRecording) -> Iterator[str]:
