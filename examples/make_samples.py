@@ -23,10 +23,9 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.stream.state import StreamState
-from gateway.takes.export.formats import export_take
-from gateway.takes.export.job import ExportJob
+from gateway.takes.export.job import ExportJob, export_take
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.files.recording import LogFile
+from gateway.takes.files.writer_thread import LogFile
 
 SOURCE: Final = "lab"
 NAME: Final = "walk"

@@ -19,7 +19,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.event_log import Event
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.files.recording import MAX_QUEUED_BYTES, Recorder
+from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES, WriterThread
 from gateway.workers import WorkerThread, make_call
 from tests.settable_clock import Clock
 from tests.waiting import wait_until_async
@@ -38,7 +38,7 @@ class NoThread(WorkerThread):
 
 def still_host(monotonic: Callable[[], float]) -> Host:
     """Return a host without threads, on this clock: whoever waits for the disk has its answer at once."""
-    return Host(monotonic, NoThread, partial(Recorder, has_thread=False))
+    return Host(monotonic, NoThread, partial(WriterThread, has_thread=False))
 
 
 class RecordingLab:

@@ -13,7 +13,7 @@ from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType, encode_component
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.takes.files.description import TakeDetails, encode_take_details
+from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import encode_event
 
 START_UTIME = 1_700_000_000_000_000
@@ -74,10 +74,11 @@ def description(source: str = "lab", server: str = "192.0.2.20:3020") -> Message
 
 def details(subject: str = "", session: str = "", note: str = "", source: str = "lab") -> Message:
     """Return a ``take_details_t``."""
-    message = encode_take_details(
-        utime=START_UTIME, source=source, details=TakeDetails(subject, session, note)
+    about = SourceDescription(
+        source, lcm_channel("MOCAP", source), details=TakeDetails(subject, session, note)
     )
-    return lcm_channel("MOCAP", source, "details"), message
+    channel, message = about.beginning("take", START_UTIME)[1]
+    return channel.decode(), message
 
 
 def log_bytes(messages: Iterable[Message]) -> bytes:

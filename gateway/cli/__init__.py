@@ -6,7 +6,8 @@ it needs to do its work within the function; ``options`` has the options that se
 
 - Running: ``run``, ``simulate``, ``demo`` (with ``demo_lab``), ``doctor``, ``config``.
 - Listening: ``list_gateways``, ``echo``, ``top``, ``view``, ``params``.
-- Takes: ``record``, ``replay``, ``export``, ``take``. ``take_report`` prints what is in one.
+- Takes: ``record``, ``replay``, ``export``, ``take``. ``take_list`` and
+  ``take_report`` print which there are, and what is in one.
 
 Everything that is asked of running gateways goes through ``gateway.client``.
 

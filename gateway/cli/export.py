@@ -1,7 +1,6 @@
 """``rtc3d-gateway export``: convert a take to a file of another program."""
 
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -10,13 +9,13 @@ import typer
 from gateway.cli.options import NoProgressOption, SourceOption
 from gateway.config.words import join_or
 from gateway.logs.safe_text import safe_text
-from gateway.takes.export.extensions import EXTENSIONS
+from gateway.takes.export.job import FORMATS, ExportJob, export_take
 
 
 def export(
     file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
     out: Annotated[
-        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(EXTENSIONS)}.")
+        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
     ],
     source: SourceOption = None,
     from_s: Annotated[
@@ -34,14 +33,10 @@ def export(
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
-    from gateway.cli.export_progress import ExportProgress
-    from gateway.takes.export.formats import export_take
-    from gateway.takes.export.job import ExportJob
+    from gateway.cli.export_progress import export_progress
 
     job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
-    with ExportProgress() if sys.stderr.isatty() and not quiet else nullcontext() as progress:
-        if progress is not None:
-            job.progress = progress.show
+    with export_progress(quiet=quiet) as job.progress:
         paths = export_take(job)
     for note in job.notes:
         print(f"note: {safe_text(note)}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What ``export`` shows while it runs."""
+"""What commands show on a terminal while they read or write a take."""
 
 import contextlib
 import sys
@@ -24,32 +24,25 @@ def file_progress(text: str, *, quiet: bool = False) -> Iterator[Callable[[int, 
         yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
-class ExportProgress:
-    """A progress bar on stderr."""
+@contextlib.contextmanager
+def export_progress(*, quiet: bool = False) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar of one step after the other; yield a function that shows how far a step is.
 
-    def __init__(self) -> None:
-        self._bar = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-        self._task: TaskID | None = None
-        self._what = ""
+    It takes what is done, how much of it, and how much there is; 0 is unknown. The bar is shown as that of
+    ``file_progress``.
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
+    disable = quiet or not sys.stderr.isatty()
+    with Progress(*columns, console=console, transient=True, disable=disable) as bar:
+        tasks: dict[str, TaskID] = {}  # the present one
 
-    def __enter__(self) -> "ExportProgress":
-        self._bar.start()
-        return self
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                for task in tasks.values():
+                    bar.remove_task(task)
+                tasks.clear()
+                tasks[what] = bar.add_task(safe_text(what), total=total or None)
+            bar.update(tasks[what], completed=done, total=total or None)
 
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def show(self, what: str, done: int, total: int) -> None:
-        """Show what is being done, and how much of it; a ``total`` of 0 is unknown."""
-        if self._task is None or what != self._what:
-            if self._task is not None:
-                self._bar.remove_task(self._task)
-            self._task = self._bar.add_task(safe_text(what), total=total or None)
-            self._what = what
-        self._bar.update(self._task, completed=done, total=total or None)
+        yield show

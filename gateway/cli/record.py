@@ -21,7 +21,7 @@ from gateway.cli.run import StopSignals
 if TYPE_CHECKING:
     from gateway.cli.record_output import RecordProgress
     from gateway.client.transport import GatewaySubscriber
-    from gateway.takes.recorder.take_recording import TakeRecording
+    from gateway.takes.recorder import TakeRecording
 
 _TICK_S: Final = 0.1
 
@@ -59,13 +59,12 @@ def record(
     from gateway.client.client import GatewayClient
     from gateway.client.lcm_subscriber import START_S
     from gateway.client.transport import close_in_time
-    from gateway.takes.recorder.take_recording import TakeRecording
-    from gateway.takes.recorder.target import FileSink, Target
+    from gateway.takes.recorder import FileWriter, TakeRecording, Target
 
     stop = StopSignals(_end_at_once)
     target = Target(file)
     recording = TakeRecording(
-        lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0, described
+        lambda sources: FileWriter(target.open(sources)), component, START_S if lcm else 0.0, described
     )
     sources = list(dict.fromkeys(source or ()))
     try:
@@ -112,7 +111,7 @@ def _run(
 def _end(recording: "TakeRecording", progress: "RecordProgress") -> None:
     """Write everything that has arrived. A disk that is full loses it; for a slow one, wait."""
     recording.stop()
-    if recording.sink is not None:
-        recording.sink.give_up()
+    if recording.file is not None:
+        recording.file.give_up()
     while not recording.close(_TICK_S):
         progress.tick()

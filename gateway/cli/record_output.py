@@ -5,7 +5,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple, TextIO
+from typing import Final, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -16,8 +16,7 @@ from gateway.client.reception import MAX_SERIES, MAX_SOURCES
 from gateway.client.series import POSE
 from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
-from gateway.takes.recorder.take_recording import RecordedSeries, RecordedSource, TakeRecording
-from gateway.takes.recorder.target import FileSink
+from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording
 
 SILENCE_S: Final = 2.0
 _NO_DATA_S: Final = 3.0
@@ -87,8 +86,8 @@ class RecordProgress:
     # The disk, and losses.
 
     def _check_disk(self) -> None:
-        sink = self._recording.sink
-        problem = "" if sink is None else sink.problem
+        file = self._recording.file
+        problem = "" if file is None else file.problem
         if problem != self._disk_problem:
             self._disk_problem = problem
             if problem:
@@ -187,10 +186,10 @@ class RecordProgress:
         )
         self._former, self._rate_s = counts, now_s
         minutes, seconds = divmod(int(now_s - self._start_s), 60)
-        sink = recording.sink
+        file = recording.file
         parts = [
             f"{minutes}:{seconds:02}",
-            "waiting for messages" if sink is None else size_text(sink.num_bytes),
+            "waiting for messages" if file is None else size_text(file.num_bytes),
             f"{message_rate:.0f} messages/s",
             f"{size_text(byte_rate)}/s",
             f"{self._num_lost} lost" if self._num_lost else "no gaps",
@@ -211,44 +210,14 @@ _MAX_NOTES: Final = 10
 _COLUMNS: Final = ("messages", "size", "rate", "gaps", "lost", "not written")
 
 
-class SeriesCounts(NamedTuple):
-    """What was recorded of one component of a source. ``num_unwritten`` messages are not in the file."""
-
-    num_messages: int
-    num_bytes: int
-    rate_hz: float
-    num_gaps: int
-    num_lost: int
-    num_unwritten: int
-
-
-def counts_of(series: Sequence[RecordedSeries], sink: FileSink) -> SeriesCounts:
-    """Return the counts of some series together."""
-    num_unwritten = sum(each.num_refused + sink.lost[each.channel] for each in series)
-    num_messages = sum(each.num_messages for each in series)
-    return SeriesCounts(
-        num_messages - num_unwritten,
-        sum(each.num_bytes - each.num_refused_bytes - sink.lost_bytes[each.channel] for each in series),
-        sum(_rate_hz(each) for each in series),
-        sum(each.check.num_gaps for each in series),
-        sum(each.check.num_lost for each in series),
-        num_unwritten,
-    )
-
-
-def _rate_hz(series: RecordedSeries) -> float:
-    duration_us = series.check.last_utime - series.check.first_utime
-    return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
-
-
 def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     """Print what was recorded, and return whether the recording is complete.
 
     It is if it has a message of a frame, and none that was published meanwhile is missing.
     """
     console = Console(file=out)
-    sink = recording.sink
-    if sink is None:
+    file = recording.file
+    if file is None:
         console.print(Text("nothing was recorded, and there is no file: no message has arrived"))
         return False
     table = Table("source", "component", box=None, pad_edge=False)
@@ -256,15 +225,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
         table.add_column(column, justify="right")
     for source in recording.sources_now:
         for row, series in _rows(source):
-            counts = counts_of(series, sink)
-            table.add_row(
-                Text(safe_text(source.name)),
-                row,
-                str(counts.num_messages),
-                size_text(counts.num_bytes),
-                f"{counts.rate_hz:.1f} Hz",
-                *(str(number) if number else "-" for number in counts[3:]),
-            )
+            table.add_row(Text(safe_text(source.name)), row, *_cells(series, file))
     console.print(table)
     problems = [*_problems(recording)]
     notes = [*_notes(recording)]
@@ -273,7 +234,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     for note in (*notes, *problems):
         console.print(Text(safe_text(note)), soft_wrap=True)
     end = "INCOMPLETE" if problems else "complete: no gaps"
-    console.print(Text(f"{sink.path}: {size_text(sink.num_bytes)}, {end}"), soft_wrap=True)
+    console.print(Text(f"{file.path}: {size_text(file.num_bytes)}, {end}"), soft_wrap=True)
     return not problems
 
 
@@ -286,13 +247,31 @@ def _rows(source: RecordedSource) -> Iterator[tuple[str, list[RecordedSeries]]]:
         yield row, rows[row]
 
 
+def _cells(series: Sequence[RecordedSeries], file: FileWriter) -> Iterator[str]:
+    """Yield the cells of _COLUMNS for some series together."""
+    num_unwritten = sum(each.num_refused + file.lost[each.channel] for each in series)
+    num_unwritten_bytes = sum(each.num_refused_bytes + file.lost_bytes[each.channel] for each in series)
+    yield str(sum(each.num_messages for each in series) - num_unwritten)
+    yield size_text(sum(each.num_bytes for each in series) - num_unwritten_bytes)
+    yield f"{sum(_rate_hz(each) for each in series):.1f} Hz"
+    num_gaps = sum(each.check.num_gaps for each in series)
+    num_lost = sum(each.check.num_lost for each in series)
+    for number in (num_gaps, num_lost, num_unwritten):
+        yield str(number) if number else "-"
+
+
+def _rate_hz(series: RecordedSeries) -> float:
+    duration_us = series.last_utime - series.first_utime
+    return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
+
+
 def _problems(recording: TakeRecording) -> Iterator[str]:
     """Yield why the recording is not complete."""
     if not any(source.num_data for source in recording.sources_now):
         yield "no frame was recorded"
     yield from _losses(recording)
-    if recording.sink is not None:
-        yield from _disk_problems(recording.sink)
+    if recording.file is not None:
+        yield from _disk_problems(recording.file)
     if recording.is_moved:
         yield "the file was moved or deleted while it was recorded"
     if recording.defect is not None:
@@ -323,12 +302,12 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
         yield f"{num_refused} messages were not written, because too many waited for the disk"
 
 
-def _disk_problems(sink: FileSink) -> Iterator[str]:
-    if sink.lost:
-        yield f"{sink.lost.total()} messages were not written: {sink.problem}"
-    elif sink.problem:
-        yield sink.problem
-    elif sink.is_unsafe:
+def _disk_problems(file: FileWriter) -> Iterator[str]:
+    if file.lost:
+        yield f"{file.lost.total()} messages were not written: {file.problem}"
+    elif file.problem:
+        yield file.problem
+    elif file.is_unsafe:
         yield "the disk reported errors: the file may be damaged"
 
 
@@ -339,14 +318,14 @@ def _notes(recording: TakeRecording) -> Iterator[str]:
             f"{recording.num_foreign} messages on these keys or channels were not recorded: they are none of "
             "this version's types; does another program, or another version of the gateway, publish there?"
         )
-    if recording.sink is not None and recording.sink.num_errors and not recording.sink.problem:
-        yield f"the disk did not accept what was written for a while ({_times(recording.sink.num_errors)})"
+    if recording.file is not None and recording.file.num_errors and not recording.file.problem:
+        yield f"the disk did not accept what was written for a while ({_times(recording.file.num_errors)})"
     for source in recording.sources_now:
         checks = [series.check for series in source.series]
         restarts = max((check.num_restarts for check in checks), default=0)
         if restarts:
             yield f"{source.name}: its gateway was started again ({_times(restarts)})"
-        late = sum(check.num_alternations for check in checks if not check.has_two_publishers)
+        late = sum(check.num_late for check in checks if not check.has_two_publishers)
         if late:
             yield f"{source.name}: {late} messages came in another order than they were sent"
         repeated = sum(check.num_repeated for check in checks)

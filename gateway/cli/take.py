@@ -22,7 +22,7 @@ from gateway.cli.options import (
 from gateway.logs.safe_text import safe_json, safe_text
 
 if TYPE_CHECKING:
-    from gateway.cli.take_report import ListedTake
+    from gateway.cli.take_list import ListedTake
     from gateway.client.client import TakeReplies
 
 app = typer.Typer(
@@ -133,7 +133,7 @@ def fetch(
     """
     from gateway.cli.export_progress import file_progress
     from gateway.cli.main import exit_with
-    from gateway.cli.take_report import size_text
+    from gateway.cli.take_list import size_text
     from gateway.client.client import GatewayAddress, GatewayClient
     from gateway.errors import QueryError
     from gateway.takes.files.new_file import NewFiles
@@ -174,7 +174,7 @@ def list_(
     from rich.console import Console
 
     from gateway.cli.main import exit_with
-    from gateway.cli.take_report import write_list
+    from gateway.cli.take_list import write_list
 
     with query.client(lcm=lcm) as client:
         replies = client.takes(source)
@@ -215,7 +215,7 @@ def info(
 def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], *, as_json: bool) -> None:
     """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
     from gateway.cli.main import exit_with
-    from gateway.cli.take_report import ListedTake
+    from gateway.cli.take_list import ListedTake
 
     takes = {source: ListedTake(content) for source, content in replies.received.items()}
     if as_json:

@@ -4,15 +4,15 @@
 
 In ``files``:
 
-- Writing: ``recording`` has one thread for all files and a queue with a limit in front of it. ``description``
-  says what stands at the beginning and at the end of a file; ``files`` creates files and checks names. The
-  outputs and the commands that record are built on these.
+- Writing: ``take_writer`` is a take that is being written. ``writer_thread`` has one thread for all files and
+  a queue with a limit in front of it. ``description`` says what is at the beginning and at the end of a file;
+  ``new_file`` checks names. The output ``takes`` and the command ``record`` are built on these.
 - Reading: ``event_log`` reads events one after the other and goes on behind damage. ``reader`` adds what each
   of them is: the source, the component or kind of message.
 - Arrays: ``take`` and ``series`` decode a take into numpy arrays; ``component_rows`` does so for many
   messages at once.
-- Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory, and
-  ``gaps`` finds what interrupts it.
+- Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
+  with what interrupts it.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -13,8 +13,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.formats import export_take
-from gateway.takes.export.job import ExportJob
+from gateway.takes.export.job import ExportJob, export_take
 from tests.configurations import local_settings, local_source
 from tests.foxglove_viewer import viewing
 from tests.networks import free_port

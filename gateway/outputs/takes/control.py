@@ -2,102 +2,18 @@
 
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 from urllib.parse import unquote
 
 from gateway.errors import QueryError
 from gateway.logs.safe_text import quoted
 from gateway.messages.decode import JSON, LOG, json_bytes
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, Answer
-from gateway.takes.files.description import MAX_DETAIL_CHARACTERS, NO_DETAILS, TakeDetails
+from gateway.outputs.takes.folder import StoredTake
+from gateway.outputs.takes.takes import Takes
+from gateway.takes.files.description import MAX_DETAIL_CHARACTERS, TakeDetails
 from gateway.token_bucket import TokenBucket
-
-MAX_PIECE_BYTES: Final = 1024 * 1024
-"""The most bytes of a take that one call reads."""
-
-
-class StoredTake(NamedTuple):
-    """A take in the folder.
-
-    ``begin_utime`` is the time of its first message in µs since the Unix epoch, ``seconds`` how long it
-    lasts, ``num_lost`` how many messages found no room on the disk. A take is running until everything of it
-    is in its files. It is cut off if one of its files was not ended in order, because the gateway was killed
-    or the disk failed.
-    """
-
-    name: str
-    num_bytes: int
-    begin_utime: int
-    seconds: float
-    is_running: bool = False
-    num_lost: int = 0
-    is_cut_off: bool = False
-    details: TakeDetails = NO_DETAILS
-
-
-class SourceTakes(NamedTuple):
-    """The takes of a source, the newest first.
-
-    ``running`` is the one that was started and not stopped yet, ``kept_s`` how many seconds the rolling
-    segments hold, which ``save`` keeps.
-    """
-
-    running: StoredTake | None
-    takes: Sequence[StoredTake]
-    kept_s: float
-
-
-class TakePiece(NamedTuple):
-    """A part of the bytes of a take; the files of a saved take are read as one."""
-
-    name: str
-    num_bytes: int
-    offset: int
-    content: bytes
-
-
-class Takes(Protocol):
-    """The takes of all sources. Call it in the event loop; no call waits for the disk for long.
-
-    Every method raises QueryError: bad-request for a name, text or number that cannot be, a take that exists
-    or is running already, or does not exist; nothing-yet if there is nothing to stop or save; disk if the
-    folder cannot be used. The text is for the peer.
-    """
-
-    async def start(self, source: str, name: str = "", details: TakeDetails = NO_DETAILS) -> StoredTake:
-        """Start a take and return it; everything that is published after this call is in it.
-
-        "" means a name of source and time. A source has one running take.
-        """
-        ...
-
-    async def stop(self, source: str) -> StoredTake:
-        """End the running take, and return it when everything is on the disk."""
-        ...
-
-    async def save(
-        self,
-        source: str,
-        last_s: float,
-        after_s: float = 0.0,
-        name: str = "",
-        details: TakeDetails = NO_DETAILS,
-    ) -> StoredTake:
-        """Keep the last ``last_s`` seconds as a take, which goes on for ``after_s`` seconds.
-
-        Returns it at once; it is running until it is complete.
-        """
-        ...
-
-    async def list(self, source: str) -> SourceTakes:
-        """Return the takes of a source."""
-        ...
-
-    async def read(self, source: str, name: str, offset: int) -> TakePiece:
-        """Return up to MAX_PIECE_BYTES of a take; an empty piece at its end."""
-        ...
-
 
 MAX_LISTED: Final = 1000
 """How many takes a list has, the newest."""

@@ -12,11 +12,8 @@ from typing import Final, TypeVar
 
 from gateway.errors import QueryError, TakeError
 from gateway.logs.failures import HOLD_S, FailureLog
-from gateway.takes.files.recording import Recorder
+from gateway.takes.files.writer_thread import WriterThread
 from gateway.workers import WorkerThread, result_of
-
-RETRY_S: Final = 0.25
-"""How often what the disk did not accept is written again."""
 
 _REMEDIES: Final = {
     errno.ENOSPC: "make room on it, or lower takes.max_bytes",
@@ -77,18 +74,7 @@ class Host:
 
     monotonic: Callable[[], float] = time.monotonic
     thread: Callable[[str], WorkerThread] = WorkerThread
-    recorder: Callable[[str, int], Recorder] = Recorder
-
-
-class DiskReader:
-    """Reads the disk for peers in a thread."""
-
-    def __init__(self, thread: WorkerThread) -> None:
-        self._thread = thread
-
-    async def read(self, call: Callable[[], _Result], path: Path) -> _Result:
-        """Return the result of ``call``, which reads ``path``. Raises QueryError."""
-        return await disk_result(self._thread.submit(call), path)
+    writer: Callable[[str, int], WriterThread] = WriterThread
 
 
 async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = None) -> _Result:

@@ -1,4 +1,4 @@
-"""The folder of takes: what is in it, and its limits. Everything here blocks: call it in a thread."""
+"""The folder of takes: what is in it, and reading it. Everything here blocks: call it in a thread."""
 
 import contextlib
 import errno
@@ -9,8 +9,7 @@ import re
 import shutil
 import stat
 import threading
-import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -18,7 +17,6 @@ import rtc3d
 
 from gateway.errors import ProtocolError, QueryError, TakeError
 from gateway.messages.decode import decode
-from gateway.outputs.takes.control import MAX_PIECE_BYTES, StoredTake, TakePiece
 from gateway.outputs.takes.disk import disk_problem
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.event_log import EventLogReader
@@ -39,13 +37,42 @@ _END_BYTES: Final = 4096
 _COPIED_BYTES: Final = 1024 * 1024
 _MAX_REMEMBERED: Final = 10_000
 
-_FRESH_S: Final = 5.0
-"""A take that was written so recently is not deleted: it may have been started a moment ago."""
-
 logger = logging.getLogger(__name__)
 
 FileId = tuple[int, int]
 """Device and inode: links to the same file count once."""
+
+
+MAX_PIECE_BYTES: Final = 1024 * 1024
+"""The most bytes of a take that one call reads."""
+
+
+class StoredTake(NamedTuple):
+    """A take in the folder.
+
+    ``begin_utime`` is the time of its first message in µs since the Unix epoch, ``seconds`` how long it
+    lasts, ``num_lost`` how many messages found no room on the disk. A take is running until everything of it
+    is in its files. It is cut off if one of its files was not ended in order, because the gateway was killed
+    or the disk failed.
+    """
+
+    name: str
+    num_bytes: int
+    begin_utime: int
+    seconds: float
+    is_running: bool = False
+    num_lost: int = 0
+    is_cut_off: bool = False
+    details: TakeDetails = NO_DETAILS
+
+
+class TakePiece(NamedTuple):
+    """A part of the bytes of a take; the files of a saved take are read as one."""
+
+    name: str
+    num_bytes: int
+    offset: int
+    content: bytes
 
 
 class TakeEntry:
@@ -95,16 +122,13 @@ class TakesFolder:
     Other files do not belong to the gateway: it leaves them alone.
     """
 
-    def __init__(self, directory: Path, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
         self._was_open = False
         self._lock: int | None = None
         self._is_closed = False
         self._opening = threading.Lock()
         self._facts: dict[tuple[Path, int, int], _Facts] = {}  # of takes, by path, size and time
-        self._monotonic = monotonic
-        # Of each take: when it was written last, and when that was noticed; None if it was there before.
-        self._noticed: dict[Path, tuple[float, float | None]] | None = None
 
     # The folder itself.
 
@@ -159,7 +183,9 @@ class TakesFolder:
         for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
             segments = [path for path, _ in _files(folder) if path.suffix == SUFFIX]
             if segments:
-                take = self._new_folder(folder.name, default_name(folder.name))
+                take = new_folder(
+                    self.directory / folder.name / default_name(folder.name), has_free_name=True
+                )
                 for number, segment in enumerate(segments, start=1):
                     segment.replace(take / f"{take.name}-{number:03}{SUFFIX}")
                 logger.warning(
@@ -168,16 +194,6 @@ class TakesFolder:
                 )
             with contextlib.suppress(OSError):
                 folder.rmdir()
-
-    def _new_folder(self, source: str, name: str) -> Path:
-        (self.directory / source).mkdir(exist_ok=True)
-        number = 1
-        while True:
-            with contextlib.suppress(FileExistsError):
-                folder = self.directory / source / numbered(name, number)
-                folder.mkdir()
-                return folder
-            number += 1
 
     # Takes.
 
@@ -238,67 +254,29 @@ class TakesFolder:
                 start -= size if start >= size else 0
         return TakePiece(name, sum(sizes), offset, b"".join(pieces))
 
-    # Limits.
-
-    def delete_old(self, *, max_bytes: int, max_age_s: float | None, protected: Collection[Path]) -> int:
-        """Delete the oldest takes beyond the limits, except the ``protected`` ones (paths without extension).
-
-        If there are none of those, the newest take of each source stays: it may be the one that has just
-        ended because of this limit. Returns how many bytes are still too many. Raises OSError.
-        """
-        entries = sorted(self.entries(), key=lambda entry: entry.end_s)
-        newest = {} if protected else {entry.source: entry.path for entry in entries}
-        users: dict[FileId, int] = {}
-        sizes = self._rolling_sizes()
-        rolling = set(sizes)
-        for entry in entries:
-            sizes |= entry.sizes
-            for file in entry.sizes:
-                users[file] = users.get(file, 0) + 1
-        total = sum(sizes.values())
-        ages_s = self._ages_s(entries)
-        for entry in entries:
-            age_s = ages_s[entry.path]
-            if entry.path in protected or age_s < _FRESH_S:
-                continue
-            if max_age_s is not None and age_s > max_age_s:
-                reason = f"it is older than takes.max_age_days ({max_age_s / 86_400:g})"
-            elif total > max_bytes and entry.path not in newest.values():
-                reason = f"the folder has {total} bytes, and takes.max_bytes is {max_bytes}"
-            else:
-                continue
-            _delete(entry)
-            logger.info("takes: deleted %s, the oldest one: %s", entry.path, reason)
-            for file, size in entry.sizes.items():
-                users[file] -= 1
-                if not users[file] and file not in rolling:
-                    total -= size
-        return max(0, total - max_bytes)
-
-    def _ages_s(self, entries: Sequence[TakeEntry]) -> dict[Path, float]:
-        """Return how long ago each take was written last.
-
-        The clock of the computer may have been corrected by years since then, so it counts only for takes
-        from before the first call.
-        """
-        now_s, monotonic_s = time.time(), self._monotonic()
-        former, self._noticed = self._noticed, {}
-        ages_s = {}
-        for entry in entries:
-            end_s, noticed_s = (former or {}).get(entry.path, (None, None))
-            if end_s != entry.end_s:
-                noticed_s = None if former is None else monotonic_s
-            self._noticed[entry.path] = entry.end_s, noticed_s
-            ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
-        return ages_s
-
-    def _rolling_sizes(self) -> dict[FileId, int]:
+    def rolling_sizes(self) -> dict[FileId, int]:
+        """Return the size of each file of the rolling segments. Raises OSError."""
         sizes: dict[FileId, int] = {}
         with contextlib.suppress(FileNotFoundError):
             for folder in [*os.scandir(self.directory / ROLLING)]:
                 for _, status in _files(Path(folder.path)):
                     sizes[status.st_dev, status.st_ino] = status.st_size
         return sizes
+
+
+def new_folder(folder: Path, *, has_free_name: bool) -> Path:
+    """Create a folder for a take, with a number if necessary and allowed. Raises OSError, QueryError."""
+    folder.parent.mkdir(exist_ok=True)
+    candidate, number = folder, 1
+    while True:
+        if not candidate.with_name(f"{candidate.name}{SUFFIX}").exists():
+            with contextlib.suppress(FileExistsError):
+                candidate.mkdir()
+                return candidate
+        if not has_free_name:
+            raise QueryError(f"there is a take {folder.name!r} of this source already; choose another name")
+        number += 1
+        candidate = folder.with_name(numbered(folder.name, number))
 
 
 def add_c3d(take: Path, c3d_file: Path) -> Path:
@@ -403,10 +381,3 @@ def _decoded(message: bytes, message_type: type[Any]) -> Any | None:
     except ProtocolError:
         return None
     return decoded if isinstance(decoded, message_type) else None
-
-
-def _delete(entry: TakeEntry) -> None:
-    for path, _ in (*entry.logs, *entry.c3d_files):
-        path.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # a file, or a folder in which somebody has put other files
-        entry.path.rmdir()

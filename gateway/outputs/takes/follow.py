@@ -5,15 +5,15 @@ import logging
 import struct
 import time
 from collections.abc import Callable, Coroutine
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from gateway.errors import QueryError
 from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.messages.encode import COUNT_OFFSET, ITEMS_OFFSET
 from gateway.outputs.contract import Publisher
-from gateway.outputs.takes.control import StoredTake
-from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.folder import StoredTake
 from gateway.outputs.takes.take_file import TakeFile
+from gateway.outputs.takes.takes import Takes
 
 END_S: Final = 2.0
 """For how long the server must send No Data until a take of a measurement ends."""
@@ -27,30 +27,13 @@ _EVENT_ID: Final = struct.Struct(">I20x")  # an event has 24 bytes, its id first
 logger = logging.getLogger(__name__)
 
 
-class FollowedTakes(Protocol):
-    """What following takes needs of them; see RecordedTakes."""
-
-    settings: TakesSettings
-
-    def begin(self, source: str, name: str, *, has_free_name: bool) -> Coroutine[Any, Any, StoredTake]:
-        """Start a take at once; the coroutine waits for the disk. Raises QueryError."""
-
-    def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
-        """End the running take at once; the coroutine waits for the disk. Raises QueryError."""
-
-    def running(self, source: str) -> TakeFile | None:
-        """Return the running take."""
-
-
 class TakeFollower:
     """Starts and stops takes of one source as ``takes.settings.follow`` says.
 
     It stops only a take that it started. If another take is running, that one goes on, and none is started.
     """
 
-    def __init__(
-        self, source: str, takes: FollowedTakes, monotonic: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, source: str, takes: Takes, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._source = source
         self._takes = takes
         self._monotonic = monotonic

@@ -18,10 +18,10 @@ from gateway.outputs.contract import (
 from gateway.outputs.takes.control import TakeCommand
 from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.follow import EventPublisher, TakeFollower
-from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.takes import Takes
 from gateway.rtc3d.components import ComponentType
-from gateway.takes.files.recording import MAX_QUEUED_BYTES
+from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES
 
 
 class TakesOutput(Output):
@@ -35,7 +35,7 @@ class TakesOutput(Output):
     ) -> None:
         self.has_tool_poses = settings.tool_poses
         self._host = host or Host()
-        self.takes = RecordedTakes(settings, max_queued_bytes, self._host)
+        self.takes = Takes(settings, max_queued_bytes, self._host)
         """What is recorded, and what peers can do with it."""
         self._command = TakeCommand(self.takes, self._host.monotonic)
         self._followers: dict[str, TakeFollower] = {}  # by source

@@ -5,7 +5,7 @@ from typing import Any
 
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
-from gateway.takes.files.recording import Recorder
+from gateway.takes.files.writer_thread import WriterThread
 
 
 class TakesPublisher:
@@ -25,7 +25,7 @@ class TakesPublisher:
         self._refusal = refusal
         self._full = full
         self._forget = forget
-        self._recorder: Recorder | None = None
+        self._writer: WriterThread | None = None
         self._targets: list[tuple[Any, bytes]] = []  # a Sink and the channel in its files
         self._is_closed = False
 
@@ -34,9 +34,9 @@ class TakesPublisher:
         """Whether messages are recorded now."""
         return bool(self._targets)
 
-    def set_targets(self, recorder: Recorder | None, targets: list[tuple[Any, bytes]]) -> None:
+    def set_targets(self, writer: WriterThread | None, targets: list[tuple[Any, bytes]]) -> None:
         """Record in these sinks, under these channels, from now on."""
-        self._recorder = recorder
+        self._writer = writer
         self._targets = targets
 
     def publish(self, message: bytes) -> None:
@@ -44,13 +44,13 @@ class TakesPublisher:
 
         Raises OutputError if the output is not open, or if too many messages wait for the disk.
         """
-        recorder = self._recorder
-        if recorder is None or not self._targets:
+        writer = self._writer
+        if writer is None or not self._targets:
             self._check_open()
             return
         is_refused = False
         for sink, channel in self._targets:
-            if not recorder.record(sink, channel, message):
+            if not writer.record(sink, channel, message):
                 sink.num_refused += 1
                 is_refused = True
         if is_refused:

@@ -15,12 +15,14 @@ from typing import Final
 from gateway.errors import QueryError, TakeError
 from gateway.logs.losses import Losses
 from gateway.outputs.takes.disk import Disk, is_full
-from gateway.outputs.takes.take_file import FileHeader, LogSink, SourceDescription
-from gateway.takes.files.description import NO_DETAILS, TakeDetails
+from gateway.outputs.takes.folder import new_folder
+from gateway.outputs.takes.take_file import SourceWriter
+from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.files.new_file import default_name, numbered
+from gateway.takes.files.new_file import default_name
 from gateway.takes.files.reader import SUFFIX
-from gateway.takes.files.recording import LogFile
+from gateway.takes.files.take_writer import begin_log
+from gateway.takes.files.writer_thread import LogFile
 
 SEGMENT_S: Final = 10.0
 """How long a segment is, unless that would be more than MAX_SEGMENTS."""
@@ -61,11 +63,8 @@ class Save:
     def describe(self, description: SourceDescription) -> None:
         """Add a file that says what the take is about, after the first segment. Raises OSError."""
         utime = next(EventLogReader(self._path(1)).events()).utime
-        log = FileHeader(description, None).begin_log(self._path(0), self.name, utime)
-        try:
-            log.append([(description.channel("end"), description.end_message(utime, 0))])
-        finally:
-            log.close()
+        messages = [*description.beginning(self.name, utime), description.end(utime, 0)]
+        begin_log(self._path(0), messages).close()
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.name}-{number:03}{SUFFIX}"
@@ -76,7 +75,7 @@ class Save:
         return self._num_files >= _MAX_FILES
 
 
-class RollingSegments(LogSink):
+class RollingSegments(SourceWriter):
     """Keeps the last ``keep_s`` seconds of a source, rounded up to whole segments, in ``folder``.
 
     Segments are on the same file system as the takes, so saving them is a matter of hard links. All methods
@@ -88,12 +87,13 @@ class RollingSegments(LogSink):
         folder: Path,
         keep_s: float,
         *,
-        header: FileHeader,
+        description: SourceDescription,
+        parameters: bytes | None,
         disk: Disk,
         losses: Losses,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__(header, disk, losses)
+        super().__init__(description, parameters, disk, losses)
         self._monotonic = monotonic
         self._keep_s = keep_s
         self._folder = folder
@@ -123,7 +123,7 @@ class RollingSegments(LogSink):
     # Writing.
 
     def log_for(self, utime: int) -> LogFile:
-        """See LogSink: begins another segment when it is time."""
+        """See TakeWriter: begins another segment when it is time."""
         now_s = self._monotonic()
         if self._log is not None and (
             now_s - self._log_began_s >= max(SEGMENT_S, self._keep_s / MAX_SEGMENTS)
@@ -140,23 +140,23 @@ class RollingSegments(LogSink):
             self._written_s = now_s
         return self._log
 
-    def make_room(self) -> bool:
-        """See LogSink: delete what has expired, otherwise the oldest segment."""
+    def delete_less_important(self) -> bool:
+        """See SourceWriter: delete what has expired, otherwise the oldest segment."""
         num_segments = len(self._segments)
         self._delete_expired()
         if self._segments and len(self._segments) == num_segments:
             self._delete_oldest()
         return bool(num_segments)
 
-    def _waits_for(self, error: OSError) -> bool:
+    def waits_for_room(self, error: OSError) -> bool:
         """Do not wait for room: what waits would hold up the running takes, and take their room later."""
         return not is_full(error)
 
     def _new_log(self, utime: int) -> LogFile:
         for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing
             folder.mkdir(exist_ok=True)
-        name = f"{default_name(self.header.description.source)}-{self._num_segments:06}"
-        log = self.header.begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
+        name = f"{default_name(self.description.source)}-{self._num_segments:06}"
+        log = self._begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
         self._num_segments += 1
         return log
 
@@ -203,7 +203,7 @@ class RollingSegments(LogSink):
         """
         if self._log is None and not self._segments:
             raise QueryError("no messages are kept yet, so there is nothing to save", code="nothing-yet")
-        save = Save(_new_folder(folder, has_free_name=has_free_name))
+        save = Save(new_folder(folder, has_free_name=has_free_name))
         try:
             for segment in self._segments:
                 if segment.end_s >= since_s:
@@ -212,7 +212,7 @@ class RollingSegments(LogSink):
             if self._log is not None:
                 save.link(self._log.path)
             if details != NO_DETAILS:
-                save.describe(replace(self.header.description, details=details))
+                save.describe(replace(self.description, details=details))
         except (OSError, TakeError):
             shutil.rmtree(save.folder, ignore_errors=True)
             raise
@@ -261,18 +261,3 @@ class RollingSegments(LogSink):
         with contextlib.suppress(OSError):
             self._folder.rmdir()
         self.disk.ended()
-
-
-def _new_folder(folder: Path, *, has_free_name: bool) -> Path:
-    """Create a folder for a take, with a number if necessary and allowed. Raises OSError, QueryError."""
-    folder.parent.mkdir(exist_ok=True)
-    candidate, number = folder, 1
-    while True:
-        if not candidate.with_name(f"{candidate.name}{SUFFIX}").exists():
-            with contextlib.suppress(FileExistsError):
-                candidate.mkdir()
-                return candidate
-        if not has_free_name:
-            raise QueryError(f"there is a take {folder.name!r} of this source already; choose another name")
-        number += 1
-        candidate = folder.with_name(numbered(folder.name, number))

@@ -17,9 +17,9 @@ from gateway.outputs.parameters_message import encode_parameters, published_agai
 from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.take_file import LogSink, TakeFile
+from gateway.outputs.takes.take_file import SourceWriter, TakeFile
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
-from gateway.takes.files.recording import Recorder
+from gateway.takes.files.writer_thread import WriterThread
 
 C3D_WAIT_S: Final = 60.0
 """A C3D file that the server sends within this time after a take belongs to the take."""
@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 class _Files:
     """A sink to which messages of the source go, and the channels of the publishers in its files."""
 
-    def __init__(self, sink: LogSink, components: Collection[ComponentType]) -> None:
+    def __init__(self, sink: SourceWriter, components: Collection[ComponentType]) -> None:
         self.sink = sink
         self._components = components
         self._channels: dict[TakesPublisher, str] = {}
@@ -44,7 +44,7 @@ class _Files:
         component = COMPONENTS_BY_KEY.get(topic.path[0])
         if len(topic.path) == 1 and component is not None and component not in self._components:
             return
-        name = lcm_channel(self.sink.header.description.prefix, topic.source, *topic.path)
+        name = lcm_channel(self.sink.description.channels, *topic.path)
         self._channels[publisher] = unique_name(name, self._channels.values())
 
     def remove(self, publisher: TakesPublisher) -> None:
@@ -75,7 +75,7 @@ class SourceRecording:
         """The takes that are being saved, and what will end them."""
         self.parameters: bytes | None = None
         """The newest ``parameters_t``."""
-        self._recorder: Recorder | None = None
+        self._writer: WriterThread | None = None
         self._publishers: list[TakesPublisher] = []
         self._files: list[_Files] = []
         self._num_parameters = 0
@@ -109,25 +109,25 @@ class SourceRecording:
             for files in self._files
             if (channel := files.channel(publisher)) is not None
         ]
-        publisher.set_targets(self._recorder, targets)
+        publisher.set_targets(self._writer, targets)
 
     def add(
         self,
-        recorder: Recorder,
-        sink: LogSink,
+        writer: WriterThread,
+        sink: SourceWriter,
         components: Collection[ComponentType],
         *,
         is_first: bool = False,
     ) -> None:
         """Record everything from now on in ``sink``, too, and before the others if it ``is_first``."""
-        self._recorder = recorder
+        self._writer = writer
         files = _Files(sink, components)
         for publisher in self._publishers:
             files.add(publisher)
         self._files.insert(0 if is_first else len(self._files), files)
         self._update()
 
-    def remove(self, sink: LogSink) -> None:
+    def remove(self, sink: SourceWriter) -> None:
         """Record nothing in ``sink`` from now on."""
         self._files = [files for files in self._files if files.sink is not sink]
         self._update()
@@ -162,9 +162,9 @@ class SourceRecording:
         for files in self._files:
             self._record_in(files.sink, message)
 
-    def _record_in(self, sink: LogSink, message: bytes) -> None:
-        recorder = self._recorder
-        if recorder is not None and not recorder.record(sink, sink.header.parameters_channel, message):
+    def _record_in(self, sink: SourceWriter, message: bytes) -> None:
+        writer = self._writer
+        if writer is not None and not writer.record(sink, sink.parameters_channel, message):
             self._are_parameters_missing = True
 
     def maintain(self) -> None:
@@ -206,40 +206,45 @@ class SourceRecording:
         if self.take is take:
             self.take = None
 
-    def end_take(self, recorder: Recorder, take: TakeFile) -> Future[None]:
+    def end_take(self, take: TakeFile) -> Future[None]:
         """End a take; the future is done when its file is complete."""
         self.detach(take)
         self.ended(take.stem)
         take.give_up()
-        return recorder.call(take.end)
+        return self._call(take.end)
 
-    def end_save(self, recorder: Recorder, save: Save) -> None:
+    def end_save(self, save: Save) -> None:
         """End a take that is being saved."""
         timer = self.saves.pop(save, None)
         if timer is not None:
             timer.cancel()
         self.ended(save.folder)
         if self.segments is not None:
-            recorder.call(partial(self.segments.end_save, save))
+            self._call(partial(self.segments.end_save, save))
 
-    def end_takes(self, recorder: Recorder) -> None:
+    def end_takes(self) -> None:
         """End the running take, and those that are being saved."""
         if self.take is not None:
-            self.end_take(recorder, self.take)
+            self.end_take(self.take)
         for save in [*self.saves]:
-            self.end_save(recorder, save)
+            self.end_save(save)
 
-    def end_segments(self, recorder: Recorder) -> None:
+    def end_segments(self) -> None:
         """End the rolling segments, and the takes that are being saved from them."""
         for save in [*self.saves]:
-            self.end_save(recorder, save)
+            self.end_save(save)
         segments, self.segments = self.segments, None
         if segments is not None:
             self.remove(segments)
             segments.give_up()
-            recorder.call(segments.close)
+            self._call(segments.close)
 
-    def end(self, recorder: Recorder) -> None:
+    def end(self) -> None:
         """End everything that is recorded."""
-        self.end_takes(recorder)
-        self.end_segments(recorder)
+        self.end_takes()
+        self.end_segments()
+
+    def _call(self, function: Callable[[], None]) -> Future[None]:
+        """Call ``function`` in the thread that writes, after everything recorded so far was written."""
+        assert self._writer is not None  # noqa: S101 - something was added, and is to be ended
+        return self._writer.call(function)

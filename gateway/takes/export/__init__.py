@@ -1,14 +1,14 @@
 """Converting takes to the files of other programs: C3D, MCAP, CSV, TRC.
 
-``formats`` lists the formats by extension. ``job`` says which part of which take becomes which file, creates
-the files, and collects what has to be reported. C3D and TRC have one rate and no times per frame, so
-``measurements`` divides a take into parts with one rate and one set of labels, and puts their frames on a
-grid of the server's time stamps; CSV and MCAP keep the time of capture of each frame.
+``job`` lists the formats by extension, says which part of which take becomes which file, creates the files,
+and collects what has to be reported. C3D and TRC have one rate and no times per frame, so ``measurements``
+divides a take into parts with one rate and one set of labels, and puts their frames on a grid of the server's
+time stamps; CSV and MCAP keep the time of capture of each frame.
 
 - ``c3d``: the groups of a C3D file and its events; ``c3d_content`` has points, channels and force plates,
   ``c3d_format`` the bytes.
 - ``mcap``: Foxglove's types, made by ``gateway.foxglove_schemas`` as for live viewers.
-- ``csv_files``, ``trc``: text.
+- ``text_files``: CSV and TRC.
 
 Files appear under their names when they are complete, and never replace others.
 """

@@ -27,8 +27,7 @@ from gateway.takes.export.c3d_format import (
     text_lists,
 )
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, named_measurements
-from gateway.takes.export.take_time import utc_text
+from gateway.takes.export.measurements import Measurement, named_measurements, utc_text
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.description import TakeDetails
 from gateway.takes.files.series import Series

@@ -22,8 +22,7 @@ from gateway.descriptions.force_plates import (
 from gateway.rtc3d.parameters import Parameters, Plate
 from gateway.takes.export.c3d_format import MAX_LIST, Parameter
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, Part, Placed, place
-from gateway.takes.export.take_time import seconds_of_row
+from gateway.takes.export.measurements import Measurement, Part, Placed, place, seconds_of_row
 from gateway.takes.files.component_rows import Array
 
 _MAX_STEPS: Final = 127

@@ -1,19 +1,55 @@
-"""An export: which part of which take becomes which file, and what is reported about it."""
+"""An export: which part of which take becomes which file, in which format, and what is reported about it.
 
+The formats are imported when they are used: the command line lists them, and numpy is slow to import.
+"""
+
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from gateway.config.words import join_or
 from gateway.errors import SelectionError, TakeError
 from gateway.takes.files.new_file import NewFiles
-from gateway.takes.files.take import Take, open_take
 
+if TYPE_CHECKING:
+    from gateway.takes.files.take import Take
+
+FORMATS: Final = {
+    ".c3d": ("c3d", "export_c3d"),
+    ".trc": ("text_files", "export_trc"),
+    ".csv": ("text_files", "export_csv"),
+    ".mcap": ("mcap", "export_mcap"),
+}
+"""The module and the function that write the files of a job, by the extension of its ``out``."""
+
+_INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
 _MAX_NAMED: Final = 10
 
 
 def _no_progress(*_: object) -> None:
     """Show nothing."""
+
+
+def export_take(job: "ExportJob") -> list[Path]:
+    """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
+    extension = job.out.suffix.lower()
+    if extension not in FORMATS:
+        raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
+    module, function = FORMATS[extension]
+    with job.files:
+        try:
+            write = getattr(import_module(f"gateway.takes.export.{module}"), function)
+        except ImportError as error:
+            if module != "mcap":
+                raise
+            raise TakeError(
+                f"{job.out} cannot be written without foxglove-sdk; install it: {_INSTALL}"
+            ) from error
+        write(job)
+    return job.files.paths
 
 
 @dataclass
@@ -39,11 +75,13 @@ class ExportJob:
         if text not in self.notes:
             self.notes.append(text)
 
-    def open_take(self, components: Collection[str] | None = None) -> Take:
+    def open_take(self, components: Collection[str] | None = None) -> "Take":
         """Return the chosen part of the take, and report what could not be read. Raises TakeError.
 
         ``components`` are the keys of those to load; None means all.
         """
+        from gateway.takes.files.take import open_take  # noqa: PLC0415 - see above
+
         text = f"reading {self.take.name}"
         take = open_take(
             self.take,
@@ -73,7 +111,13 @@ class ExportJob:
             self.note_malformed(take)
         return take
 
-    def note_malformed(self, take: Take) -> None:
+    def utimes(self, take: "Take") -> tuple[float, float]:
+        """Return from when on, and before when, the events are to be exported, in µs since 1970."""
+        first = -math.inf if self.from_s is None else take.start_utime + round(self.from_s * 1e6)
+        stop = math.inf if self.to_s is None else take.start_utime + round(self.to_s * 1e6)
+        return first, stop
+
+    def note_malformed(self, take: "Take") -> None:
         """Report messages that could not be read."""
         for source in take.sources.values():
             for key, count in source.malformed.items():

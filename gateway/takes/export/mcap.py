@@ -167,8 +167,7 @@ def _write_messages(job: ExportJob, take: Take, sources: dict[str, "_SourceExpor
     """Write the messages of the chosen time, and all parameters."""
     reader = TakeReader(job.take)
     total = sum(log.path.stat().st_size for log in reader.logs)
-    first = None if job.from_s is None else take.start_utime + round(job.from_s * 1e6)
-    last = None if job.to_s is None else take.start_utime + round(job.to_s * 1e6)
+    first, stop = job.utimes(take)
     done = shown = 0
     for utime, name, key, message in reader.messages():
         done += len(message) + _EVENT_HEADER_BYTES
@@ -180,9 +179,7 @@ def _write_messages(job: ExportJob, take: Take, sources: dict[str, "_SourceExpor
             continue
         if key == "parameters":
             source.attach_parameters(message, file)
-        elif (
-            key in COMPONENTS_BY_KEY and (first is None or utime >= first) and (last is None or utime < last)
-        ):
+        elif key in COMPONENTS_BY_KEY and first <= utime < stop:
             source.write(key, message, file)
 
 

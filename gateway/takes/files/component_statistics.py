@@ -1,14 +1,15 @@
-"""Statistics of one component of one source, in one pass with bounded memory."""
+"""Statistics of the messages of one source, and of its clock, in one pass with bounded memory."""
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from gateway.descriptions.labels import describe
+from gateway.messages.sequence import SequenceCheck
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.takes.files.component_rows import Array, Rows
-from gateway.takes.files.gaps import SequenceGaps, find_restarts
+from gateway.takes.files.component_rows import Array, Rows, find_restarts
 
 _MAX_STEP_US: Final = 1_000_000
 """Frames that are further apart do not count for the rate: a pause lies between them."""
@@ -17,6 +18,10 @@ _MAX_LAYOUTS: Final = 1000
 """For how many different labels and numbers of items the visibility is counted."""
 
 _MAX_EVENT_IDS: Final = 1000
+
+MAX_LISTED_GAPS: Final = 100
+"""How many gaps are listed; all are counted."""
+
 _CARRIED: Final = ("utime", "sequence", "session", "timestamp_us", "frame_number")
 
 
@@ -30,7 +35,7 @@ class MessageStatistics:
         self.num_bytes = 0
         self.first_utime = self.last_utime = 0
         """``utime`` of the first and the last message."""
-        self.gaps = SequenceGaps()
+        self.gaps = SequenceCheck(max_listed=MAX_LISTED_GAPS)
 
     def add_messages(self, utime: Array, sequence: Array) -> None:
         """Take the next messages."""
@@ -40,7 +45,7 @@ class MessageStatistics:
             self.first_utime = int(utime[0])
         self.last_utime = int(utime[-1])
         self.num_messages += len(utime)
-        self.gaps.add(sequence, utime)
+        self.gaps.add_all(sequence, utime)
 
 
 class ComponentStatistics(MessageStatistics):
@@ -155,3 +160,81 @@ class ComponentStatistics(MessageStatistics):
                 self.event_counts[number] = self.event_counts.get(number, 0) + count
             else:
                 self.other_events += count
+
+
+MAX_LISTED_STEPS: Final = 100
+"""How many steps are listed; all are counted."""
+
+_WINDOW_US: Final = 1_000_000
+_MIN_STEP_US: Final = 500_000
+"""Smaller steps look like frames that arrived late."""
+
+_MAX_DEVIATION_US: Final = 100_000
+_CONFIRMING_WINDOWS: Final = 5
+"""A step counts if the clock stays there for this many windows: after a stall, a network catches up."""
+
+_MAX_PAUSE_WINDOWS: Final = 60
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """The clock was set by ``step_us``; ``utime`` is its time after that."""
+
+    utime: int
+    step_us: int
+
+
+class ClockSteps:
+    """Finds steps by comparing the times of arrival with the server's time stamps.
+
+    In each second, the frame that arrived earliest counts, as others may have been delayed.
+    """
+
+    def __init__(self) -> None:
+        self.num_steps = 0
+        self.steps: list[ClockStep] = []
+        """The first steps, at most MAX_LISTED_STEPS."""
+        self._window: tuple[int, int, int] | None = None  # number, least offset, utime
+        self._previous = 0  # the number of the last complete window
+        self._offset_us: int | None = None  # in the windows so far
+        self._pending: list[tuple[int, int]] = []  # offset and utime of windows after a possible step
+
+    def add(self, utime: Array, timestamp_us: Array) -> None:
+        """Take the times of arrival and the server's time stamps of the next frames, in µs."""
+        if not len(utime):
+            return
+        offsets = utime - timestamp_us
+        numbers = timestamp_us // _WINDOW_US
+        (changes,) = np.nonzero(np.diff(numbers))
+        starts = np.concatenate([[0], changes + 1])
+        least = np.minimum.reduceat(offsets, starts)
+        for number, offset, first in zip(
+            numbers[starts].tolist(), least.tolist(), utime[starts].tolist(), strict=True
+        ):
+            if self._window is not None and self._window[0] == number:
+                offset = min(offset, self._window[1])  # noqa: PLW2901 - the window continues
+                first = self._window[2]  # noqa: PLW2901
+            elif self._window is not None:
+                self._end_window(*self._window)
+            self._window = number, offset, first
+
+    def _end_window(self, number: int, offset: int, utime: int) -> None:
+        is_continued = 0 < number - self._previous <= _MAX_PAUSE_WINDOWS
+        self._previous = number
+        before = self._offset_us
+        if before is None or not is_continued or abs(offset - before) < _MIN_STEP_US:
+            self._offset_us = offset
+            self._pending.clear()
+        else:
+            if self._pending and abs(offset - self._pending[-1][0]) > _MAX_DEVIATION_US:
+                self._pending.clear()
+            self._pending.append((offset, utime))
+            if len(self._pending) >= _CONFIRMING_WINDOWS:
+                self._confirm(*self._pending[0], before)
+
+    def _confirm(self, offset: int, utime: int, before: int) -> None:
+        self.num_steps += 1
+        if len(self.steps) < MAX_LISTED_STEPS:
+            self.steps.append(ClockStep(utime, offset - before))
+        self._offset_us = offset
+        self._pending.clear()

@@ -1,6 +1,7 @@
-"""What describes a source at the beginning and at the end of a file."""
+"""What describes a take in its files: who and what it is about, its sources, and how much is missing."""
 
 import socket
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import rtc3d
@@ -9,10 +10,10 @@ from gateway import __version__
 from gateway.errors import QueryError
 from gateway.logs.safe_text import quoted
 from gateway.messages.texts import encode_within_limits
+from gateway.messages.topics import lcm_channel
 
 _HAS_END: Final = "ends with take_end_t"
 """What ``take_t`` says of its recorder. Earlier versions did not write the end of a file."""
-
 
 MAX_DETAIL_CHARACTERS: Final = {"subject": 64, "session": 64, "note": 500}
 """The details of a take by name, and how long each may be."""
@@ -46,23 +47,51 @@ class TakeDetails(NamedTuple):
 NO_DETAILS: Final = TakeDetails()
 
 
-def encode_take(
-    *, utime: int, name: str, source: str, channels: str, server: str, gateway_version: str, recorder: str
-) -> bytes:
-    """Return a ``take_t``; docs/reference/messages.md describes its fields.
+@dataclass(frozen=True)
+class SourceDescription:
+    """A source in the files of a take: what each file says of it at its beginning and at its end.
 
-    ``recorder`` is the program that records, without its version.
+    ``channels`` is the beginning of its channels, such as MOCAP_LAB. ``server`` is HOST:PORT, "" if it is not
+    known. ``recorder`` is the program that records, without its version.
     """
-    message = rtc3d.take_t()
-    message.utime = utime
-    message.name = name
-    message.source = source
-    message.channels = channels
-    message.server = server
-    message.gateway_version = gateway_version
-    message.recorder = f"{recorder} {__version__}, {_HAS_END}"
-    message.host = socket.gethostname()
-    return encode_within_limits(message)
+
+    source: str
+    channels: str
+    server: str = ""
+    gateway_version: str = __version__
+    recorder: str = "rtc3d-gateway"
+    details: TakeDetails = NO_DETAILS
+
+    def channel(self, *path: str) -> bytes:
+        """Return the channel of the key with this path."""
+        return lcm_channel(self.channels, *path).encode()
+
+    def beginning(self, name: str, utime: int) -> list[tuple[bytes, bytes]]:
+        """Return the ``take_t``, and the ``take_details_t`` if there are details, each with its channel.
+
+        They are for a file of the take ``name`` that begins at ``utime``, in µs since the Unix epoch.
+        docs/reference/messages.md describes their fields.
+        """
+        take = rtc3d.take_t()
+        take.utime = utime
+        take.name = name
+        take.source, take.channels = self.source, self.channels
+        take.server, take.gateway_version = self.server, self.gateway_version
+        take.recorder = f"{self.recorder} {__version__}, {_HAS_END}"
+        take.host = socket.gethostname()
+        messages = [(self.channel("take"), encode_within_limits(take))]
+        if self.details != NO_DETAILS:
+            about = rtc3d.take_details_t()
+            about.utime, about.source = utime, self.source
+            about.subject, about.session, about.note = self.details
+            messages.append((self.channel("details"), encode_within_limits(about)))
+        return messages
+
+    def end(self, utime: int, num_lost: int) -> tuple[bytes, bytes]:
+        """Return the ``take_end_t`` of a file that lacks ``num_lost`` published messages, and its channel."""
+        end = rtc3d.take_end_t()
+        end.utime, end.source, end.messages_lost = utime, self.source, num_lost
+        return self.channel("end"), encode_within_limits(end)
 
 
 def has_end(take: rtc3d.take_t) -> bool:
@@ -70,21 +99,6 @@ def has_end(take: rtc3d.take_t) -> bool:
     return _HAS_END in take.recorder
 
 
-def encode_take_details(*, utime: int, source: str, details: TakeDetails) -> bytes:
-    """Return a ``take_details_t``: who and what a take of ``source`` is about."""
-    message = rtc3d.take_details_t()
-    message.utime, message.source = utime, source
-    message.subject, message.session, message.note = details
-    return encode_within_limits(message)
-
-
 def decoded_details(message: rtc3d.take_details_t) -> TakeDetails:
     """Return the details in a message."""
     return TakeDetails(message.subject, message.session, message.note)
-
-
-def encode_take_end(*, utime: int, source: str, messages_lost: int) -> bytes:
-    """Return a ``take_end_t``: how many messages of ``source`` were published, but are not in the file."""
-    message = rtc3d.take_end_t()
-    message.utime, message.source, message.messages_lost = utime, source, messages_lost
-    return encode_within_limits(message)

@@ -11,8 +11,14 @@ from gateway.descriptions.labels import Description, common, describe, event_lab
 from gateway.errors import TakeError
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array, GrowingArray, Rows
-from gateway.takes.files.gaps import find_restarts
+from gateway.takes.files.component_rows import (
+    HEAD,
+    NATIVE_ITEM_DTYPES,
+    Array,
+    GrowingArray,
+    Rows,
+    find_restarts,
+)
 
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
 

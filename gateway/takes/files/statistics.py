@@ -22,10 +22,9 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.files.component_rows import decode_rows
-from gateway.takes.files.component_statistics import ComponentStatistics, MessageStatistics
+from gateway.takes.files.component_statistics import ClockSteps, ComponentStatistics, MessageStatistics
 from gateway.takes.files.description import NO_DETAILS, decoded_details, has_end
 from gateway.takes.files.event_log import MAX_LISTED_DAMAGE
-from gateway.takes.files.gaps import ClockSteps
 from gateway.takes.files.reader import DESCRIPTIONS, TakeReader
 
 MAX_LISTED_CHANGES: Final = 100
@@ -100,7 +99,7 @@ class SourceStatistics:
     @property
     def gateway_restarts(self) -> int:
         """How often the sequence numbers started again."""
-        return max((component.gaps.restarts for component in self.components.values()), default=0)
+        return max((component.gaps.num_restarts for component in self.components.values()), default=0)
 
     def announced_hz(self, key: str) -> float | None:
         """Return the rate of a component in the newest parameters; None if they do not say it."""
@@ -118,8 +117,6 @@ class SourceStatistics:
 
     def finish(self) -> None:
         """Count what is left under its labels. Call it at the end."""
-        for part in (*self.components.values(), *self.others.values()):
-            part.gaps.finish()
         for component in self.components.values():
             for version in component.versions:
                 component.set_labels(version, self._parameters.get(version))
@@ -287,7 +284,7 @@ class TakeStatistics:
         ]
         return (
             not self.num_damaged
-            and not any(part.gaps.missing or part.malformed for part in parts)
+            and not any(part.gaps.num_lost or part.malformed for part in parts)
             and not self.was_cut_short
         )
 

@@ -20,8 +20,7 @@ from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.takes.replay.player import Player
-from gateway.takes.replay.publication import Publication, ReplayedSource
-from gateway.takes.replay.queries import ReplayQueries
+from gateway.takes.replay.publication import Publication, ReplayedSource, ReplayQueries
 from gateway.workers import WorkerThread
 
 OPENING_S: Final = 5.0

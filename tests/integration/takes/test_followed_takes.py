@@ -9,8 +9,8 @@ import pytest
 from gateway.messages.decode import decode
 from gateway.outputs.takes import follow
 from gateway.outputs.takes.output import TakesOutput
-from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.takes import Takes
 from gateway.service.gateway import Gateway
 from gateway.takes.files.reader import TakeReader
 from tests.networks import free_endpoint
@@ -23,7 +23,7 @@ def takes_in(folder: Path, setting: str) -> TakesSettings:
     return TakesSettings.model_validate({"enabled": True, "directory": str(folder), "follow": setting})
 
 
-async def opened(gateway: Gateway) -> RecordedTakes:
+async def opened(gateway: Gateway) -> Takes:
     """Wait until the gateway knows the parameters and records takes; return them."""
     await wait_until_cached(gateway)
     await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))

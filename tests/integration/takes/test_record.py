@@ -383,8 +383,8 @@ def test_without_a_gateway_there_is_no_file(
 HANGING: Final = """
 import sys, threading
 from gateway.cli.main import main
-from gateway.takes.recorder.take_recording import TakeRecording
-from gateway.takes.files.recording import LogFile
+from gateway.takes.recorder import TakeRecording
+from gateway.takes.files.writer_thread import LogFile
 
 def hang(*_):
     print("the disk hangs", file=sys.stderr, flush=True)

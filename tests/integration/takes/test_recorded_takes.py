@@ -17,8 +17,8 @@ from gateway.messages.decode import decode
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.output import TakesOutput
-from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.takes import Takes
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
@@ -58,7 +58,7 @@ async def running(settings: Settings) -> AsyncIterator[Gateway]:
         yield gateway
 
 
-def takes_of(gateway: Gateway) -> RecordedTakes:
+def takes_of(gateway: Gateway) -> Takes:
     [output] = [output.output for output in gateway.outputs if isinstance(output.output, TakesOutput)]
     return output.takes
 

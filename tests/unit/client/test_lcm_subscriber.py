@@ -15,8 +15,7 @@ from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.recorder.take_recording import TakeRecording
-from gateway.takes.recorder.target import FileSink, Target
+from gateway.takes.recorder import FileWriter, TakeRecording, Target
 from tests.networks import lcm_url
 from tests.waiting import wait_until
 
@@ -31,7 +30,7 @@ class Lab:
         self.url = url = lcm_url()
         self.path = folder / "walk.lcmlog"
         self.lcm = open_lcm(url)
-        self.recording = TakeRecording(lambda names: FileSink(target.open(names)))
+        self.recording = TakeRecording(lambda names: FileWriter(target.open(names)))
         client = GatewayClient(GatewayAddress(is_lcm=True, url=url))
         self.subscriber = client.subscribe(sources, None, self.recording)
 

@@ -7,14 +7,9 @@ from typing import Any, cast
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs.takes.control import (
-    MAX_LISTED,
-    MAX_SAVED_S,
-    SourceTakes,
-    StoredTake,
-    TakeCommand,
-    TakePiece,
-)
+from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, TakeCommand
+from gateway.outputs.takes.folder import StoredTake, TakePiece
+from gateway.outputs.takes.takes import SourceTakes
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from tests.settable_clock import Clock
 

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import errno
 import logging
-import os
 import resource
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -20,11 +19,13 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters
 from gateway.outputs.takes import disk as disk_calls
 from gateway.outputs.takes import disk as disk_module
-from gateway.outputs.takes.disk import RETRY_S, Disk
+from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.take_file import FileHeader, LogSink, SourceDescription
-from gateway.takes.files.recording import LogFile
+from gateway.outputs.takes.take_file import SourceWriter
+from gateway.takes.files.description import SourceDescription
+from gateway.takes.files.take_writer import RETRY_S
+from gateway.takes.files.writer_thread import LogFile
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
 from tests.waiting import wait_until_async
@@ -87,7 +88,7 @@ async def test_a_save_that_nobody_waits_for_leaves_nothing_behind(
             with pytest.raises(asyncio.CancelledError):
                 await task
         else:
-            lab.takes._started_recorder().call(free.wait)
+            lab.takes._started_writer().call(free.wait)
             monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.01)
             with pytest.raises(QueryError, match="did not respond"):
                 await lab.takes.save("lab", 60, 600, "fall")
@@ -218,7 +219,7 @@ async def test_a_disk_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
         responds = threading.Event()
-        lab.takes._started_recorder().call(responds.wait)
+        lab.takes._started_writer().call(responds.wait)
         with pytest.raises(QueryError, match="did not respond") as refused:
             await lab.takes.start("lab", "walk")
         assert refused.value.code == "disk"
@@ -291,12 +292,12 @@ class Waits(threading.Event):
         return self.is_set()
 
 
-class Sink(LogSink):
+class Sink(SourceWriter):
     """A sink whose log is scripted."""
 
     def __init__(self, log: ScriptedLog) -> None:
         self.losses = Losses(logging.getLogger("gateway"), "lab to takes")
-        super().__init__(FileHeader(SourceDescription("lab", "MOCAP", ""), None), Disk(), self.losses)
+        super().__init__(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses)
         self.log = log
         self.utimes: list[int] = []
         self.waits = Waits()
@@ -309,7 +310,7 @@ class Sink(LogSink):
 
     def log_for(self, utime: int) -> LogFile:
         self.utimes.append(utime)
-        newest = self.header.parameters
+        newest = self._parameters
         self.newest_version.append(None if newest is None else decode(newest).parameters_version)
         return cast(LogFile, self.log)
 
@@ -330,7 +331,7 @@ def test_what_the_disk_does_not_take_at_once_is_written_again_after_a_wait() -> 
 
 def test_what_is_given_up_is_counted_in_messages_and_in_frames() -> None:
     """A frame has a message on each channel: six messages of three frames are three frames lost."""
-    sink = Sink(ScriptedLog(2, FULL, FULL))
+    sink = Sink(ScriptedLog(2, FULL, FULL, FULL))  # the second time is the last try
     sink.log.on_failure = sink.give_up
     frames = [message(number, channel) for number in range(3) for channel in ("3D", "6D", "ANALOG")]
     sink.write(frames[:-1])
@@ -343,20 +344,6 @@ def test_what_is_given_up_is_counted_in_messages_and_in_frames() -> None:
     assert amounts(sink.losses.report()) == {"not written": (7, 3)}
     sink.write([message(10)])  # the disk has room again
     assert sink.log.content[-1] == message(10)
-
-
-def test_a_file_that_cannot_begin_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An empty file of that name would refuse the next attempt."""
-
-    def write(_descriptor: int, _content: memoryview) -> int:
-        raise FULL
-
-    header = FileHeader(SourceDescription("lab", "MOCAP", ""), None)
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "write", write)
-        with pytest.raises(OSError, match="No space left"):
-            header.begin_log(tmp_path / "walk.lcmlog", "walk", 1)
-    header.begin_log(tmp_path / "walk.lcmlog", "walk", 1).close()
 
 
 @pytest.mark.parametrize(

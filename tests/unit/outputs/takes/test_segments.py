@@ -15,11 +15,10 @@ from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.take_file import FileHeader, SourceDescription
-from gateway.takes.files.description import TakeDetails
+from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.files.recording import LogFile
+from gateway.takes.files.writer_thread import LogFile
 from tests.recording_output import frames, still_lab
 from tests.settable_clock import Clock
 
@@ -44,11 +43,11 @@ class Rolling:
         self.clock = Clock()
         self.disk = Disk()
         self.path = folder / ".rolling" / "lab"
-        description = SourceDescription("lab", "MOCAP", "")
         self.segments = RollingSegments(
             self.path,
             keep_s,
-            header=FileHeader(description, None),
+            description=SourceDescription("lab", "MOCAP_LAB"),
+            parameters=None,
             disk=self.disk,
             losses=Losses(logging.getLogger("gateway"), "lab to takes"),
             monotonic=self.clock,

@@ -15,11 +15,10 @@ from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
-from gateway.outputs.takes import recorded_takes
-from gateway.outputs.takes.control import StoredTake
-from gateway.outputs.takes.folder import TakesFolder
-from gateway.outputs.takes.recorded_takes import MAX_SAVES
+from gateway.outputs.takes import takes as takes_module
+from gateway.outputs.takes.folder import StoredTake, TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.outputs.takes.takes import MAX_SAVES
 from gateway.takes import open_take
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from gateway.takes.files.statistics import take_statistics
@@ -222,7 +221,7 @@ async def test_a_take_that_starts_too_late_has_no_file(
 
     async with still_lab(tmp_path) as lab:
         with monkeypatch.context() as patch:
-            patch.setattr(recorded_takes, "disk_result", too_late)
+            patch.setattr(takes_module, "disk_result", too_late)
             await refused(lab.takes.start("lab", "walk"), "did not respond")
         assert [*lab.path("").iterdir()] == []
         assert not lab.publishers["3d"].wanted
@@ -337,8 +336,8 @@ def test_a_save_that_was_ended_does_not_end_again(tmp_path: Path) -> None:
         async with still_lab(tmp_path, keep_last_s=60) as lab:
             lab.publish()
             saved = await lab.takes.save("lab", 60, 30, "fall")
-            recording, recorder = lab.takes.recording("lab"), lab.takes._started_recorder()
-            recording.end_takes(recorder)
+            recording = lab.takes.recording("lab")
+            recording.end_takes()
             assert not recording.saves
             await asyncio.sleep(59)
             assert recording.take_of_c3d() == lab.path(saved.name)

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.formats import export_take
-from gateway.takes.export.job import ExportJob
+from gateway.takes.export.job import ExportJob, export_take
 from tests.recorded_scenes import scene_messages
 from tests.takes import Message, parameters, write_take
 

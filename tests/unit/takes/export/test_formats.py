@@ -9,8 +9,6 @@ import pytest
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
-from gateway.takes.export.extensions import EXTENSIONS
-from gateway.takes.export.formats import FORMATS
 from tests.recorded_scenes import scene_messages
 from tests.takes import START_UTIME, Message, description, frame, markers, parameters
 from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled
@@ -18,11 +16,6 @@ from tests.unit.takes.export.test_trc import read_trc
 
 ANALOG = frame(ComponentType.ANALOG, [1, 2])
 EVENT = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
-
-
-def test_every_extension_has_a_format() -> None:
-    """The command line lists what the module of formats, which is slow to import, can do."""
-    assert tuple(FORMATS) == EXTENSIONS
 
 
 @pytest.mark.parametrize("end", [".c3d", ".trc", "-3d.csv"])

@@ -11,8 +11,7 @@ import rtc3d
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
 from gateway.takes.files import reader
-from gateway.takes.files.component_statistics import ComponentStatistics
-from gateway.takes.files.gaps import MAX_LISTED_GAPS, MAX_LISTED_STEPS, ClockSteps, SequenceGaps
+from gateway.takes.files.component_statistics import MAX_LISTED_STEPS, ClockSteps, ComponentStatistics
 from gateway.takes.files.statistics import SourceStatistics, take_statistics
 from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
 
@@ -79,7 +78,7 @@ def test_damaged_numbers_are_neither_gaps_nor_restarts(tmp_path: Path) -> None:
         for place, number in enumerate(numbers)
     ]
     gaps = markers_of(tmp_path, messages).gaps
-    assert (gaps.missing, gaps.num_gaps, gaps.implausible, gaps.restarts) == (1, 1, 3, 0)
+    assert (gaps.num_lost, gaps.num_gaps, gaps.num_implausible, gaps.num_restarts) == (1, 1, 3, 0)
 
 
 @pytest.mark.parametrize("batch_bytes", [1, 1_000_000])
@@ -97,7 +96,7 @@ def test_restarts_of_server_and_gateway(
     messages += [markers(1, 0, utime=START_UTIME + 10**6, timestamp_us=50_000, frame_number=5)]
     source = lab(tmp_path, messages)
     assert (source.sessions, source.server_restarts, source.gateway_restarts) == (2, 1, 1)
-    assert source.components["3d"].gaps.missing == 0
+    assert source.components["3d"].gaps.num_lost == 0
 
 
 def test_changes_of_parameters_say_what_changed(tmp_path: Path) -> None:
@@ -195,74 +194,9 @@ def test_a_gap_or_a_message_that_cannot_be_read_makes_a_take_incomplete(
     assert statistics.seconds == 0.02
 
 
-# Gaps in sequence numbers, and steps of the clock, in arrays of any division --------------------
+# Steps of the clock, in arrays of any division -------------------------------------------------
 
 SECOND_US = 1_000_000
-
-
-def gaps_of(*numbers: int, utimes: list[int] | None = None, pieces: int = 1) -> SequenceGaps:
-    """Return the gaps in numbers; without times, what goes back was overtaken."""
-    found = SequenceGaps()
-    times = [max(numbers[: place + 1]) for place in range(len(numbers))] if utimes is None else utimes
-    for start in range(0, len(numbers), max(1, len(numbers) // pieces)):
-        stop = start + max(1, len(numbers) // pieces)
-        found.add(np.array(numbers[start:stop], np.int64), np.array(times[start:stop], np.int64))
-    found.finish()
-    return found
-
-
-def counts(found: SequenceGaps) -> tuple[int, int, int, int, int, int]:
-    """Return missing, gaps, late, repeated, restarts and implausible."""
-    return (*(found.missing, found.num_gaps, found.late, found.repeated, found.restarts), found.implausible)
-
-
-@pytest.mark.parametrize("pieces", [1, 3, 100])
-@pytest.mark.parametrize(
-    ("numbers", "expected"),
-    [
-        ((), (0, 0, 0, 0, 0, 0)),
-        ((5, 6, 7, 8), (0, 0, 0, 0, 0, 0)),
-        ((5, 6, 8, 9, 20, 21), (11, 2, 0, 0, 0, 0)),
-        ((0, 1, 4, 2, 3, 3, 5, 7), (1, 1, 2, 1, 0, 0)),
-        ((0, 3, 1, 5), (2, 2, 1, 0, 0, 0)),
-        ((0, 1_000_000), (999_999, 1, 0, 0, 0, 0)),
-        ((0, 1_000_002, 1), (0, 0, 0, 0, 0, 1)),  # the message after it shows the damage
-        ((0, 1_000_002), (1_000_001, 1, 0, 0, 0, 0)),  # nothing contradicts it
-        ((2000, 1000, 2001), (0, 0, 0, 1, 0, 0)),  # late, though never missing
-        ((2000, 999, 2001), (0, 0, 0, 0, 0, 1)),
-        ((2000, 500, 501), (0, 0, 0, 0, 1, 0)),
-    ],
-)
-def test_what_is_missing_is_told_from_what_is_late_repeated_damaged_or_restarted(
-    numbers: tuple[int, ...], expected: tuple[int, ...], pieces: int
-) -> None:
-    """A report of losses that did not happen costs hours of search in a network."""
-    assert counts(gaps_of(*numbers, pieces=pieces)) == expected
-
-
-def test_after_a_restart_a_number_of_before_is_not_expected_any_more() -> None:
-    """A repeated message of the new numbering must not fill a gap of the old one."""
-    found = gaps_of(0, 4, 0, 1, 2, 3, 2, utimes=[0, 1, 2, 3, 4, 5, 5])
-    assert counts(found) == (3, 1, 0, 1, 1, 0)
-
-
-def test_the_numbers_that_may_come_late_are_the_newest_ones() -> None:
-    """The memory is bounded; after a gap of 10,000 messages, a short one can still be filled."""
-    assert counts(gaps_of(0, 10_001, 10_007, 10_003)) == (10_004, 2, 1, 0, 0, 0)
-    assert counts(gaps_of(0, 10_010, 9_500, 5))[:4] == (10_008, 1, 1, 0)
-
-
-def test_the_largest_gap_is_found_although_it_is_not_listed() -> None:
-    """The list is bounded, and the worst place is the first that a user wants to see."""
-    numbers = [2 * number for number in range(150)]
-    found = gaps_of(*numbers, 400, 402)
-    assert (len(found.gaps), found.num_gaps) == (MAX_LISTED_GAPS, 151)
-    assert found.largest is not None
-    assert (found.largest.missing, found.largest.utime) == (101, 400)
-    filled = gaps_of(0, 3, 1, 2, 5)
-    assert filled.largest is not None
-    assert (filled.largest.missing, len(filled.gaps)) == (1, 1)
-    assert gaps_of(0, 1).largest is None
 
 
 def steps_of(delays_us: list[int], per_window: int = 4) -> ClockSteps:

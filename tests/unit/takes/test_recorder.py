@@ -1,5 +1,6 @@
 """What `record` writes: each source described before its first message; the clock is the test's."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,13 +15,11 @@ from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
 from gateway.rtc3d.components import ComponentType
+from gateway.takes import recorder
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.recorder import take_recording
-from gateway.takes.recorder import take_recording as recorder_series
-from gateway.takes.recorder.take_recording import RecordedSeries, RecordedSource, TakeRecording
-from gateway.takes.recorder.target import FileSink, Target
+from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording, Target
 from tests.settable_clock import Clock
 from tests.waiting import wait_until
 
@@ -51,9 +50,9 @@ class Recorded:
         target = Target(self.path)
         self.opened: list[list[str]] = []
 
-        def open_file(sources: list[str]) -> FileSink:
+        def open_file(sources: list[str]) -> FileWriter:
             self.opened.append(sources)
-            return FileSink(target.open(sources))
+            return FileWriter(target.open(sources))
 
         self.recording = TakeRecording(open_file, components or None, start_s, details)
 
@@ -103,7 +102,7 @@ class Recorded:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The monotonic clock of everything that is received and recorded."""
     clock = Clock()
-    for module in (recorder_series, take_recording, reception, subscriber_series):
+    for module in (recorder, reception, subscriber_series):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=clock))
     return clock
 
@@ -117,7 +116,7 @@ def test_the_file_begins_with_the_description_although_messages_came_first(recor
     """Whoever reads the file from its beginning can label every frame."""
     recorded.receive("lab", "3d", *map(markers, range(40, 50)))
     recorded.recording.tick()
-    assert recorded.recording.sink is None
+    assert recorded.recording.file is None
     recorded.answer_parameters("lab", b"<b/>", 7)
     recorded.recording.answered_status(recorded.source("lab"), status("lab"))
     recorded.recording.tick()
@@ -173,7 +172,7 @@ def test_all_sources_at_the_start_are_described_before_any_message(recorded: Rec
     recorded.source("robot")
     recorded.receive("lab", "3d", markers(1))
     recorded.describe("lab")
-    assert recorded.recording.sink is None
+    assert recorded.recording.file is None
     recorded.describe("robot")
     assert recorded.opened == [["lab", "robot"]]
     assert recorded.channels()[:4] == [
@@ -201,7 +200,7 @@ def test_a_source_without_answers_is_recorded_soon(recorded: Recorded, clock: Cl
     recorded.receive("lab", "3d", *map(markers, range(3)))
     clock.now_s += after_s
     recorded.recording.tick()
-    assert (recorded.recording.sink is not None) is (after_s > 1.5)
+    assert (recorded.recording.file is not None) is (after_s > 1.5)
     assert recorded.channels() == ["MOCAP_LAB_TAKE", *["MOCAP_LAB_3D"] * 3]
 
 
@@ -211,7 +210,7 @@ def test_the_file_is_created_after_the_time_in_which_sources_are_found(tmp_path:
     recorded.describe("lab")
     clock.now_s += 1.9
     recorded.describe("robot")
-    assert recorded.recording.sink is None
+    assert recorded.recording.file is None
     clock.now_s += 0.1
     recorded.recording.tick()
     assert recorded.opened == [["lab", "robot"]]
@@ -220,7 +219,7 @@ def test_the_file_is_created_after_the_time_in_which_sources_are_found(tmp_path:
 
 def test_what_waits_for_descriptions_is_bounded(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
     """A source that is never described must not take all memory; what is refused is counted."""
-    monkeypatch.setattr(take_recording, "MAX_QUEUED_BYTES", 3 * len(markers(0)))
+    monkeypatch.setattr(recorder, "MAX_QUEUED_BYTES", 3 * len(markers(0)))
     recorded.receive("lab", "3d", *map(markers, range(5)))
     assert recorded.series("lab", "3d").num_refused == 2
     assert recorded.recording.queued_bytes == 3 * len(markers(0))
@@ -294,7 +293,7 @@ def test_nothing_is_recorded_without_a_message(recorded: Recorded) -> None:
 def test_a_file_that_cannot_be_created_is_an_error(recorded: Recorded) -> None:
     """The user learns it at the end, too."""
 
-    def fail(_sources: list[str]) -> FileSink:
+    def fail(_sources: list[str]) -> FileWriter:
         raise TakeError("no permission")
 
     recorded.recording = TakeRecording(fail)
@@ -302,3 +301,51 @@ def test_a_file_that_cannot_be_created_is_an_error(recorded: Recorded) -> None:
     with pytest.raises(TakeError, match="no permission"):
         recorded.recording.stop()
     recorded.recording.close(1)
+
+
+# The name of the file --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sources", "expected"),
+    [
+        (["lab"], "lab"),
+        (["lab", "robot", "Hand-2"], r"lab\+robot\+Hand-2"),
+        (["a", "b", "c", "d"], "4-sources"),
+    ],
+)
+def test_a_name_in_a_folder_follows_the_sources(tmp_path: Path, sources: list[str], expected: str) -> None:
+    first, second = (Target(tmp_path).open(sources).path.name for _ in range(2))
+    assert re.fullmatch(expected + r"-\d{8}-\d{6}\.lcmlog", first)
+    assert re.fullmatch(expected + r"-\d{8}-\d{6}(-2)?\.lcmlog", second)
+    assert first != second
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("there.lcmlog", "there.lcmlog exists already, and nothing is overwritten"),
+        ("there", "there.lcmlog exists already"),
+        ("dangling.lcmlog", "exists already"),
+        ("nowhere/walk.lcmlog", "there is no folder .*nowhere; create it first"),
+        ("there.lcmlog/walk.lcmlog", "there.lcmlog/walk.lcmlog cannot be created: Not a directory"),
+        ("walk.mcap", r"choose a name that ends with \.lcmlog, and convert it afterwards"),
+        ("x" * 300, "cannot be created: File name too long"),
+    ],
+)
+def test_what_cannot_be_a_new_file_is_an_error(tmp_path: Path, name: str, problem: str) -> None:
+    (tmp_path / "there.lcmlog").write_bytes(b"precious")
+    (tmp_path / "dangling.lcmlog").symlink_to("elsewhere")
+    with pytest.raises(TakeError, match=problem):
+        Target(tmp_path / name)
+    assert (tmp_path / "there.lcmlog").read_bytes() == b"precious"
+    assert {path.name for path in tmp_path.iterdir()} == {"there.lcmlog", "dangling.lcmlog"}
+
+
+def test_a_file_gets_the_extension_and_is_removed_if_it_remains_empty(tmp_path: Path) -> None:
+    targets = [Target(tmp_path / name) for name in ("walk", "run.lcmlog", "full")]
+    assert {path.name for path in tmp_path.iterdir()} == {"walk.lcmlog", "run.lcmlog", "full.lcmlog"}
+    targets[2].open([]).append([(b"MOCAP_LAB_3D", bytes(40))])
+    for target in targets:
+        target.discard_empty()
+    assert {path.name: path.stat().st_size for path in tmp_path.iterdir()} == {"full.lcmlog": 28 + 12 + 40}

@@ -1,16 +1,23 @@
-"""Export to CSV: one file per component, written while the take is read, so that its size does not matter."""
+"""Export to text: CSV with every component, and TRC, the format in which OpenSim reads markers.
+
+CSV is written while the take is read, so that its size does not matter.
+"""
 
 import csv
 import io
-import math
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import IO, Final
 
-from gateway.descriptions.labels import event_text
+import numpy as np
+
+from gateway.descriptions.labels import event_text, fitting_labels
 from gateway.errors import TakeError
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes.export.job import ExportJob, nothing_to_export
-from gateway.takes.files.component_rows import decode_rows
+from gateway.takes.export.measurements import Measurement, named_measurements, seconds_of_row, utc_text
+from gateway.takes.files.component_rows import Array, decode_rows
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series, SeriesBuilder
 from gateway.takes.files.take import Take
@@ -80,8 +87,7 @@ class _Writer:
 def _parts(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
     """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
     reader = TakeReader(job.take)
-    first = -math.inf if job.from_s is None else take.start_utime + round(job.from_s * 1e6)
-    end = math.inf if job.to_s is None else take.start_utime + round(job.to_s * 1e6)
+    first, stop = job.utimes(take)
     for batches in reader.batches():
         for batch in batches:
             source = take.sources.get(batch.source)
@@ -89,7 +95,7 @@ def _parts(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
                 continue
             component = COMPONENTS_BY_KEY[batch.key]
             events = zip(batch.utimes, batch.messages, strict=True)
-            messages = [message for utime, message in events if first <= utime < end]
+            messages = [message for utime, message in events if first <= utime < stop]
             if not messages:
                 continue
             rows = decode_rows(component, messages)
@@ -150,3 +156,87 @@ def _line(cells: list[str]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\r\n").writerow(cells)
     return text.getvalue()
+
+
+# TRC: markers of one rate, for OpenSim.
+
+_TRC_COLUMNS: Final = (
+    "DataRate",
+    "CameraRate",
+    "NumFrames",
+    "NumMarkers",
+    "Units",
+    "OrigDataRate",
+    "OrigDataStartFrame",
+    "OrigNumFrames",
+)
+_KNOWN_UNITS: Final = ("mm", "m")
+_NOT_IN_LABELS: Final = re.compile(r"[^\w.:+-]+")
+_MAX_LABEL_BYTES: Final = 100
+_BLOCK_ROWS: Final = 500
+
+
+def export_trc(job: ExportJob) -> None:
+    """Write the markers of each measurement of each source to a file of its own."""
+    for measurement, path in named_measurements(job, ("3d",), "markers"):
+        file = job.files.create(path)
+        file.write(_trc_head(job, measurement, path.name).encode())
+        _write_trc_rows(job, measurement, path, file)
+
+
+def _trc_head(job: ExportJob, measurement: Measurement, name: str) -> str:
+    """Return the five lines before the frames, and an empty one."""
+    markers, grid = measurement.base, measurement.grid
+    labels = fitting_labels(markers.labels, _valid, _MAX_LABEL_BYTES, "marker")
+    changed = sum(old != new for old, new in zip(markers.labels, labels, strict=True))
+    if changed:
+        job.note(f"{changed} labels were changed: OpenSim's labels have no spaces and few special characters")
+    unit = markers.unit or "mm"
+    if unit not in _KNOWN_UNITS:
+        job.note(f"the unit is {unit}; OpenSim expects {' or '.join(_KNOWN_UNITS)}")
+    rate = f"{grid.rate_hz:.10g}"
+    values = (rate, rate, grid.num_rows, len(labels), unit, rate, 1, grid.num_rows)
+    axes = [f"{axis}{number}" for number in range(1, len(labels) + 1) for axis in "XYZ"]
+    lines = [
+        # Readers take the rest of the line as the name of the file. They allow no more keys in the next two.
+        f"PathFileType\t4\t(X/Y/Z)\t{_NOT_IN_LABELS.sub('_', name)} time_0={utc_text(measurement)}",
+        "\t".join(_TRC_COLUMNS),
+        "\t".join(map(str, values)),
+        "Frame#\tTime\t" + "".join(f"{label}\t\t\t" for label in labels),
+        "\t\t" + "".join(f"{axis}\t" for axis in axes),
+        "",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _write_trc_rows(job: ExportJob, measurement: Measurement, path: Path, file: IO[bytes]) -> None:
+    """Write a line for each frame; a marker that is missing has three empty cells.
+
+    Each cell ends in a tab: OpenSim ignores an empty cell at the end of a line, unless a tab follows.
+    """
+    frames, grid = measurement.frames, measurement.grid
+    start_s = seconds_of_row(measurement, 0)
+    for start in range(0, grid.num_rows, _BLOCK_ROWS):
+        stop = min(start + _BLOCK_ROWS, grid.num_rows)
+        positions = frames.block(start, stop)[..., :3]
+        lines = [
+            f"{row + 1}\t{start_s + row / grid.rate_hz:.6f}\t{_cells(markers)}\n"
+            for row, markers in enumerate(positions, start)
+        ]
+        file.write("".join(lines).encode())
+        job.progress(f"writing {path.name}", stop, grid.num_rows)
+    missing = frames.num_missing(0, grid.num_rows)
+    if missing:
+        job.note(f"{path.name}: {missing} of {grid.num_rows} frames are missing in the take; they are empty")
+
+
+def _cells(positions: Array) -> str:
+    """Return the cells of markers, shape (markers, 3): the shortest texts that mean the same 32-bit
+    numbers."""
+    missing = np.isnan(positions).any(axis=1, keepdims=True)
+    cells = map(str, np.where(missing, np.float32(np.nan), positions).ravel())
+    return "\t".join(cells).replace("nan", "") + "\t"
+
+
+def _valid(label: str) -> str:
+    return _NOT_IN_LABELS.sub("_", label.strip())

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.files.recording import LogFile, Recorder, utime_of
+from gateway.takes.files.writer_thread import LogFile, WriterThread, utime_of
 
 ENTRY_BYTES = 128
 """What a message takes in the queue besides its content."""
@@ -37,11 +37,11 @@ class NotingSink:
 
 
 @pytest.fixture
-def recorder() -> Recorder:
-    return Recorder("test", 5 * (100 + ENTRY_BYTES), has_thread=False)
+def recorder() -> WriterThread:
+    return WriterThread("test", 5 * (100 + ENTRY_BYTES), has_thread=False)
 
 
-def test_a_queue_takes_as_much_as_its_limit_again_and_again(recorder: Recorder) -> None:
+def test_a_queue_takes_as_much_as_its_limit_again_and_again(recorder: WriterThread) -> None:
     """If what was written did not leave the count, recording would stop after hours."""
     sink = NotingSink()
     for _ in range(3):
@@ -55,7 +55,7 @@ def test_a_queue_takes_as_much_as_its_limit_again_and_again(recorder: Recorder) 
     assert recorder.record(sink, b"C", bytes(5 * (100 + ENTRY_BYTES) - ENTRY_BYTES))
 
 
-def test_calls_and_messages_are_made_in_the_order_of_their_arrival(recorder: Recorder) -> None:
+def test_calls_and_messages_are_made_in_the_order_of_their_arrival(recorder: WriterThread) -> None:
     """A take ends after what was published before its end, and before what comes later."""
     first, second = NotingSink(), NotingSink()
     for number in range(4):
@@ -68,7 +68,7 @@ def test_calls_and_messages_are_made_in_the_order_of_their_arrival(recorder: Rec
     assert (first.num_syncs, second.num_syncs) == (1, 1)
 
 
-def test_an_error_of_a_call_or_a_sink_leaves_the_others(recorder: Recorder) -> None:
+def test_an_error_of_a_call_or_a_sink_leaves_the_others(recorder: WriterThread) -> None:
     """A defect of one take must not end the recording of another source."""
     broken, sink = NotingSink(RuntimeError("a defect")), NotingSink()
     recorder.record(broken, *message(0))
@@ -76,13 +76,13 @@ def test_an_error_of_a_call_or_a_sink_leaves_the_others(recorder: Recorder) -> N
     failed = recorder.call(lambda: 1 // 0)
     assert isinstance(failed.exception(), ZeroDivisionError)
     assert sink.written == [message(1)]
-    cancelled = Recorder("test").call(lambda: None)
+    cancelled = WriterThread("test").call(lambda: None)
     assert cancelled.result(30) is None
 
 
 def test_the_thread_writes_what_waits_and_ends() -> None:
     """The same with a thread, which synchronises once more at its end."""
-    recorder, sink = Recorder("test"), NotingSink()
+    recorder, sink = WriterThread("test"), NotingSink()
     assert all(recorder.record(sink, *message(number)) for number in range(100))
     assert recorder.close(30)
     assert sink.written == [message(number) for number in range(100)]

@@ -1,25 +1,25 @@
-"""A recording of what gateways publish: from the messages that arrive to the thread that writes them."""
+"""Recording what gateways publish, as one of their subscribers: from the messages that arrive to the file."""
 
+import contextlib
 import functools
 import math
+import os
 import time
-from collections import deque
-from collections.abc import Callable, Collection
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from typing import Final
 
 from gateway.client.reception import Reception
 from gateway.client.series import Series, Source
+from gateway.errors import SelectionError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.outputs.parameters_message import published_again
-from gateway.takes.files.description import (
-    NO_DETAILS,
-    TakeDetails,
-    encode_take,
-    encode_take_details,
-    encode_take_end,
-)
-from gateway.takes.files.recording import MAX_QUEUED_BYTES, Recorder
-from gateway.takes.recorder.target import FileSink
+from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
+from gateway.takes.files.new_file import default_name, numbered
+from gateway.takes.files.reader import SUFFIX
+from gateway.takes.files.take_writer import Messages, TakeWriter
+from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES, LogFile, WriterThread
 
 _WAIT_S: Final = 1.5
 """How long the messages of a new source wait for its description; each second brings a status."""
@@ -53,8 +53,13 @@ class RecordedSource(Source):
         """The first one, which belongs to the description."""
         self.has_made_first = False
         """Whether this program has made that message, and no gateway."""
-        self.is_described = False
-        """Whether its description is in the file. Before that, its messages wait."""
+        self.description: SourceDescription | None = None
+        """What the file says of it; None before that, when its messages wait."""
+
+    @property
+    def is_described(self) -> bool:
+        """Whether its description is in the file."""
+        return self.description is not None
 
     @property
     def is_waiting(self) -> bool:
@@ -84,20 +89,20 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
 
     def __init__(
         self,
-        open_file: Callable[[list[str]], FileSink],
+        open_file: Callable[[list[str]], "FileWriter"],
         components: Collection[str] | None = None,
         start_s: float = 0.0,
         details: TakeDetails = NO_DETAILS,
     ) -> None:
         super().__init__()
-        self.sink: FileSink | None = None
+        self.file: FileWriter | None = None
         """The file, after it was created."""
         self.is_moved = False
         """Whether somebody has moved or deleted the file; known after ``close``."""
         self._open_file = open_file
         self._components = components
         self._details = details
-        self._recorder = Recorder("record")
+        self._writer = WriterThread("record")
         self._held: deque[tuple[RecordedSeries, bytes]] = deque()
         self._held_bytes = 0
         self._is_starting = True
@@ -106,7 +111,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
     @property
     def queued_bytes(self) -> int:
         """How many bytes are not written yet."""
-        return self._recorder.queued_bytes + self._held_bytes
+        return self._writer.queued_bytes + self._held_bytes
 
     @property
     def num_messages(self) -> int:
@@ -157,7 +162,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
                 return
             self._held.append((series, message))
             self._held_bytes += len(message)
-        elif self.sink is None or not self._recorder.record(self.sink, series.channel, message):
+        elif self.file is None or not self._writer.record(self.file, series.channel, message):
             series.refuse(message)
 
     # Descriptions. One thread.
@@ -180,8 +185,8 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         return sorted(source.name for source in self.sources.values() if source.heard_s is not None)
 
     def _begin(self, sources: list[str]) -> None:
-        if self.sink is None:
-            self.sink = self._open_file(sources)  # not under the lock: the disk may be slow
+        if self.file is None:
+            self.file = self._open_file(sources)  # not under the lock: the disk may be slow
         with self._lock:
             self._is_starting = False
             for source in self.sources.values():
@@ -190,31 +195,26 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
             self._release()
 
     def _describe(self, source: RecordedSource) -> None:
-        assert self.sink is not None  # noqa: S101 - see _begin
+        assert self.file is not None  # noqa: S101 - see _begin
         status = source.decoded_status()
         utime = source.first_utime or now_utime()
-        take = encode_take(
-            utime=utime,
-            name=self.sink.path.stem,
-            source=source.name,
-            channels=source.channels,
-            server=status.server if status is not None else "",
-            gateway_version=status.gateway_version if status is not None else "",
-            recorder="rtc3d-gateway record",
+        source.description = description = SourceDescription(
+            source.name,
+            source.channels,
+            status.server if status is not None else "",
+            status.gateway_version if status is not None else "",
+            "rtc3d-gateway record",
+            self._details,
         )
-        description = [(f"{source.channels}_TAKE".encode(), take)]
-        if self._details != NO_DETAILS:
-            about = encode_take_details(utime=utime, source=source.name, details=self._details)
-            description.append((f"{source.channels}_DETAILS".encode(), about))
+        messages = description.beginning(self.file.path.stem, utime)
         parameters = source.first_parameters
         series = self._find_series(source, "parameters", f"{source.channels}_PARAMETERS")
         if parameters is not None and series is not None:
             if source.has_made_first:
                 parameters = published_again(parameters, utime)
             series.add(parameters)
-            description.append((series.channel, parameters))
-        self._recorder.call(functools.partial(self.sink.write, description))
-        source.is_described = True
+            messages.append((series.channel, parameters))
+        self._writer.call(functools.partial(self.file.write, messages))
 
     def _release(self) -> None:
         """Record what has waited for the description of its source."""
@@ -236,23 +236,148 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
 
     def close(self, timeout_s: float) -> bool:
         """Write what waits, and close the file. Return False if the disk needs longer than ``timeout_s``."""
-        if not self._recorder.close(timeout_s):
+        if not self._writer.close(timeout_s):
             return False
-        if self.sink is not None:
-            self.is_moved = not self.sink.is_in_place
-            self.sink.end(functools.partial(self._ends, self.sink))
-            self.sink.close()
+        if self.file is not None:
+            self.is_moved = not self.file.is_in_place
+            self.file.end_log(functools.partial(self._ends, self.file))
         return True
 
-    def _ends(self, sink: FileSink, num_removed: int) -> list[tuple[bytes, bytes]]:
+    def _ends(self, sink: "FileWriter", num_removed: int) -> Messages:
         """Return the end of each source; ``num_removed`` further losses are counted with the first."""
         utime = now_utime()
         ends: list[tuple[bytes, bytes]] = []
         for source in self.sources.values():
-            if source.is_described:
+            if source.description is not None:
                 recorded = [series for series in source.series if series.is_recorded]
                 num_lost = sum(series.num_refused + sink.lost[series.channel] for series in recorded)
-                num_lost += 0 if ends else num_removed
-                end = encode_take_end(utime=utime, source=source.name, messages_lost=num_lost)
-                ends.append((f"{source.channels}_END".encode(), end))
+                ends.append(source.description.end(utime, num_lost + (0 if ends else num_removed)))
         return ends
+
+
+class FileWriter(TakeWriter):
+    """Writes the file of a recording, and counts what is not in it by channel. Any thread may read these."""
+
+    def __init__(self, log: LogFile) -> None:
+        super().__init__(log)
+        self.problem = ""
+        """What is wrong with the disk now; "" if it accepts messages."""
+        self.lost: Counter[bytes] = Counter()
+        """How many messages the disk has not accepted in the end, by channel."""
+        self.lost_bytes: Counter[bytes] = Counter()
+        self.num_errors = 0
+        """How often the disk stopped accepting messages."""
+        self._file = log
+
+    @property
+    def path(self) -> Path:
+        """The path of the file."""
+        return self._file.path
+
+    @property
+    def is_in_place(self) -> bool:
+        """Whether the file still has its path. Do not call it after ``end_log``."""
+        return self._file.is_in_place()
+
+    @property
+    def num_bytes(self) -> int:
+        """The size of the file."""
+        return self._file.num_bytes
+
+    def log_for(self, utime: int) -> LogFile:  # noqa: ARG002 - one file for all times
+        """See TakeWriter."""
+        return self._file
+
+    def succeeded(self) -> None:
+        """See TakeWriter."""
+        self.problem = ""
+
+    def failed(self, error: OSError) -> None:
+        """See TakeWriter. A problem counts once, however often the disk is tried."""
+        if not self.problem:
+            self.num_errors += 1
+        self.problem = f"{self.path} cannot be written: {error.strerror or error}"
+
+    def lose(self, messages: Messages) -> None:
+        """See TakeWriter."""
+        for channel, message in messages:
+            self.lost[channel] += 1
+            self.lost_bytes[channel] += len(message)
+
+    def lose_newest(self, error: OSError) -> None:
+        """See TakeWriter: the end of the file counts it, and the problem makes the recording incomplete."""
+        self.failed(error)
+
+
+_MAX_NAMED: Final = 3
+"""The default name has the names of at most this many sources."""
+
+
+class Target:
+    """Where to record: a file, which is created at once, or a folder, where the name follows the sources.
+
+    Raises TakeError if nothing can be recorded there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._folder: Path | None = None
+        self._log: LogFile | None = None
+        if _is_dir(path):
+            if not os.access(path, os.W_OK | os.X_OK):
+                raise TakeError(f"no permission to write in the folder {path}; choose another one")
+            self._folder = path
+            return
+        if path.suffix not in {"", SUFFIX}:
+            raise SelectionError(
+                f"{path}: recordings are LCM event logs; choose a name that ends with {SUFFIX}, "
+                "and convert it afterwards (rtc3d-gateway export)"
+            )
+        self._log = _create(path.with_suffix(SUFFIX))
+
+    def open(self, sources: Sequence[str]) -> LogFile:
+        """Return the new file, named after the sources if it is in a folder. Raises TakeError."""
+        if self._log is None:
+            assert self._folder is not None  # noqa: S101 - there is one of both
+            self._log = _create_free(self._folder, default_name(_names(sources)))
+        return self._log
+
+    def discard_empty(self) -> None:
+        """Remove the file if nothing was written, so that its name is free for the next attempt."""
+        if self._log is not None:
+            with contextlib.suppress(OSError):
+                if not self._log.path.stat().st_size:
+                    self._log.path.unlink()
+
+
+def _is_dir(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:
+        return False  # a name that is too long: creating it says so
+
+
+def _names(sources: Sequence[str]) -> str:
+    """Return up to three sources, joined by "+"; of more, only their number."""
+    return "+".join(sources) if len(sources) <= _MAX_NAMED else f"{len(sources)}-sources"
+
+
+def _create_free(folder: Path, name: str) -> LogFile:
+    number = 1
+    while True:
+        path = folder / f"{numbered(name, number)}{SUFFIX}"
+        if not os.path.lexists(path):
+            return _create(path)
+        number += 1
+
+
+def _create(path: Path) -> LogFile:
+    try:
+        return LogFile(path)
+    except FileExistsError:
+        raise TakeError(
+            f"{path} exists already, and nothing is overwritten; choose another name, or a folder"
+        ) from None
+    except FileNotFoundError as error:
+        raise TakeError(f"there is no folder {path.parent}; create it first") from error
+    except OSError as error:
+        raise TakeError(f"{path} cannot be created: {error.strerror or error}") from error

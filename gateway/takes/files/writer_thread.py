@@ -115,7 +115,7 @@ class LogFile:
 
 
 class Sink(Protocol):
-    """What a Recorder writes to: it handles the errors of the disk, and raises nothing."""
+    """What a WriterThread writes to: it handles the errors of the disk, and raises nothing."""
 
     def write(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
         """Write messages, each with its channel."""
@@ -124,7 +124,7 @@ class Sink(Protocol):
         """Store on the disk what was written."""
 
 
-class Recorder:
+class WriterThread:
     """A thread that writes messages to sinks, in the order in which they were recorded.
 
     The program does not wait for the thread when it ends; ``close`` does. Without a thread, ``call`` and

@@ -3,25 +3,25 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
-from gateway.outputs.takes.control import SourceTakes, StoredTake, TakePiece
-from gateway.outputs.takes.disk import Disk, DiskReader, Host, disk_problem, disk_result
-from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
-from gateway.outputs.takes.folder_watch import FolderWatch
+from gateway.messages.topics import lcm_channel
+from gateway.outputs.takes.disk import Disk, Host, disk_problem, disk_result
+from gateway.outputs.takes.folder import ROLLING, StoredTake, TakePiece, TakesFolder, add_c3d
+from gateway.outputs.takes.folder_limits import FolderWatch
 from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
-from gateway.outputs.takes.take_file import FileHeader, SourceDescription, TakeFile
-from gateway.takes.files.description import NO_DETAILS, TakeDetails
+from gateway.outputs.takes.take_file import TakeFile
+from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.new_file import check_name, default_name
-from gateway.takes.files.recording import Recorder
+from gateway.takes.files.writer_thread import WriterThread
 
 MAX_AFTER_S: Final = 3600.0
 """How long a take that is saved may go on."""
@@ -32,13 +32,30 @@ MAX_SAVES: Final = 16
 _CLOSE_S: Final = 0.8
 """How long the end of the gateway waits for the disk."""
 
+_Result = TypeVar("_Result")
+
 logger = logging.getLogger(__name__)
 
 
-class RecordedTakes:
-    """The takes of all sources (see Takes). Call it in the event loop; no call waits for the disk for long.
+class SourceTakes(NamedTuple):
+    """The takes of a source, the newest first.
 
-    ``server`` returns HOST:PORT of a source's server.
+    ``running`` is the one that was started and not stopped yet, ``kept_s`` how many seconds the rolling
+    segments hold, which ``save`` keeps.
+    """
+
+    running: StoredTake | None
+    takes: Sequence[StoredTake]
+    kept_s: float
+
+
+class Takes:
+    """The takes of all sources. Call it in the event loop; no call waits for the disk for long.
+
+    Every method for peers raises QueryError: bad-request for a name, text or number that cannot be, a take
+    that exists or is running already, or does not exist; nothing-yet if there is nothing to stop or save;
+    disk if the folder cannot be used. The text is for the peer. ``server`` returns HOST:PORT of a source's
+    server.
     """
 
     def __init__(self, settings: TakesSettings, max_queued_bytes: int, host: Host) -> None:
@@ -48,10 +65,10 @@ class RecordedTakes:
         self._max_queued_bytes = max_queued_bytes
         self._host = host
         self._watch = FolderWatch(settings, host)
-        self._recorder: Recorder | None = None
+        self._writer: WriterThread | None = None
         self._is_closed = False
         self._recordings: dict[str, SourceRecording] = {}
-        self._reader = DiskReader(host.thread("takes-read"))
+        self._read_thread = host.thread("takes-read")
         self._copy_thread = host.thread("takes-copy")
 
     @property
@@ -61,7 +78,10 @@ class RecordedTakes:
     # For peers.
 
     async def start(self, source: str, name: str = "", details: TakeDetails = NO_DETAILS) -> StoredTake:
-        """See Takes."""
+        """Start a take and return it; everything that is published after this call is in it.
+
+        "" means a name of source and time. A source has one running take.
+        """
         return await self.begin(source, name, details, has_free_name=not name)
 
     def begin(
@@ -71,7 +91,7 @@ class RecordedTakes:
 
         With ``has_free_name``, a number is added to the name if there is such a take already.
         """
-        recording, recorder = self._announced(source), self._open_recorder()
+        recording, writer = self._announced(source), self._open_writer()
         if name:
             check_name(name)
         if recording.take is not None:
@@ -79,37 +99,37 @@ class RecordedTakes:
                 f"take {recording.take.name!r} of source {source!r} is running already; stop it first"
             )
         take = TakeFile(
-            self._folder.directory / source,
-            name or default_name(source),
+            self._folder.directory / source / (name or default_name(source)),
             now_utime(),
             has_free_name=has_free_name,
-            header=self._header(recording, details),
+            description=self._description(source, details),
+            parameters=recording.parameters,
             disk=self.disk,
             losses=recording.losses,
-            make_room=self._make_room,
+            delete_less_important=self._delete_rolling,
         )
         recording.take = take
-        created = recorder.call(take.create)  # first, because what is recorded from now on follows it
-        recording.add(recorder, take, self.settings.components, is_first=True)
-        return self._begun(recorder, recording, take, created)
+        created = writer.call(take.create)  # first, because what is recorded from now on follows it
+        recording.add(writer, take, self.settings.components, is_first=True)
+        return self._begun(writer, recording, take, created)
 
-    def _make_room(self) -> bool:
+    def _delete_rolling(self) -> bool:
         """Delete rolling segments, the oldest of each source, in the thread that writes."""
         rolling = [each.segments for each in [*self._recordings.values()] if each.segments is not None]
-        return any([segments.make_room() for segments in rolling])  # noqa: C419 - of every source
+        return any([segments.delete_less_important() for segments in rolling])  # noqa: C419 - of every source
 
     async def _begun(
-        self, recorder: Recorder, recording: SourceRecording, take: TakeFile, created: Future[None]
+        self, writer: WriterThread, recording: SourceRecording, take: TakeFile, created: Future[None]
     ) -> StoredTake:
         try:
             await disk_result(created, take.path, self.disk)
         except QueryError:
             take.cancel()
-            recorder.call(take.discard)
+            writer.call(take.discard)
             recording.detach(take)
             raise
         logger.info("takes: recording %s", take.path)
-        details = take.header.description.details
+        details = take.description.details
         return StoredTake(take.name, 0, take.utime, 0.0, is_running=True, details=details)
 
     def running(self, source: str) -> TakeFile | None:
@@ -118,20 +138,21 @@ class RecordedTakes:
         return None if recording is None else recording.take
 
     async def stop(self, source: str) -> StoredTake:
-        """See Takes."""
+        """End the running take, and return it when everything is on the disk."""
         return await self.end(source)
 
     def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
         """End the running take at once, like ``stop``; the coroutine, which must be awaited, waits."""
-        recording, recorder = self._announced(source), self._started_recorder()
+        recording = self._announced(source)
+        self._started_writer()  # otherwise, it says why nothing is recorded
         take = recording.take
         if take is None:
             raise QueryError(f"no take of source {source!r} is running", code="nothing-yet")
-        return self._ended(take, recording.end_take(recorder, take))
+        return self._ended(take, recording.end_take(take))
 
     async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
         await disk_result(ended, take.path, self.disk)
-        stored = await self._reader.read(partial(self._folder.take_at, take.stem), take.path)
+        stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
         size = f"{stored.seconds:.1f} s, {stored.num_bytes / 1e6:.1f} MB"
         if take.num_lost or stored.is_cut_off:
             logger.warning("takes: %s is not complete: %s, %d messages lost", take.path, size, take.num_lost)
@@ -147,8 +168,11 @@ class RecordedTakes:
         name: str = "",
         details: TakeDetails = NO_DETAILS,
     ) -> StoredTake:
-        """See Takes."""
-        recording, recorder = self._announced(source), self._open_recorder()
+        """Keep the last ``last_s`` seconds as a take, which goes on for ``after_s`` seconds.
+
+        Returns it at once; it is running until it is complete.
+        """
+        recording, writer = self._announced(source), self._open_writer()
         if name:
             check_name(name)
         if not last_s > 0 or not 0 <= after_s <= MAX_AFTER_S:
@@ -171,32 +195,32 @@ class RecordedTakes:
         folder = self._folder.directory / source / (name or default_name(source))
         since_s = now_s - last_s
         call = partial(segments.save, folder, since_s, details, has_free_name=not name, goes_on=after_s > 0)
-        saved = recorder.call(call)
+        saved = writer.call(call)
         try:
             save = await disk_result(saved, folder, self.disk)
         except BaseException:  # nobody waits for it any more, or knows it
             saved.cancel()
-            recorder.call(partial(segments.undo, saved))
+            writer.call(partial(segments.undo, saved))
             raise
         if after_s > 0:
             loop = asyncio.get_running_loop()
             delay_s = max(0.0, now_s + after_s - self._host.monotonic())
-            recording.saves[save] = loop.call_later(delay_s, recording.end_save, recorder, save)
+            recording.saves[save] = loop.call_later(delay_s, recording.end_save, save)
         else:
             recording.ended(save.folder)
         logger.info("takes: saving %s", save.folder)
         stored = partial(self._folder.take_at, save.folder, is_running=after_s > 0)
-        return await self._reader.read(stored, folder)
+        return await self._read(stored, folder)
 
     async def list(self, source: str) -> SourceTakes:
-        """See Takes."""
+        """Return the takes of a source."""
         recording = self._announced(source)
         folder, running = self._folder, recording.running_names
-        takes = await self._reader.read(partial(folder.takes, source, running), folder.directory)
+        takes = await self._read(partial(folder.takes, source, running), folder.directory)
         take = recording.take
         current: StoredTake | None = None
         if take is not None:
-            stored = await self._reader.read(partial(folder.take_at, take.stem, is_running=True), take.path)
+            stored = await self._read(partial(folder.take_at, take.stem, is_running=True), take.path)
             if recording.take is take:  # otherwise, it has just ended
                 current = stored._replace(num_lost=take.num_lost)
                 takes = [current if each.name == current.name else each for each in takes]
@@ -204,14 +228,16 @@ class RecordedTakes:
         return SourceTakes(current, takes, kept_s)
 
     async def read(self, source: str, name: str, offset: int) -> TakePiece:
-        """See Takes."""
+        """Return up to MAX_PIECE_BYTES of a take; an empty piece at its end."""
         self._announced(source)
         check_name(name)
         if offset < 0:
             raise QueryError(f"expected an offset of 0 or more; found {offset}")
-        return await self._reader.read(
-            partial(self._folder.read, source, name, offset), self._folder.directory
-        )
+        return await self._read(partial(self._folder.read, source, name, offset), self._folder.directory)
+
+    async def _read(self, call: Callable[[], _Result], path: Path) -> _Result:
+        """Return the result of ``call``, which reads ``path`` in a thread. Raises QueryError."""
+        return await disk_result(self._read_thread.submit(call), path)
 
     def _announced(self, source: str) -> SourceRecording:
         recording = self._recordings.get(source)
@@ -219,16 +245,16 @@ class RecordedTakes:
             raise QueryError(f"the gateway has no source {source!r}")
         return recording
 
-    def _started_recorder(self) -> Recorder:
-        if self._recorder is None or self._is_closed:
+    def _started_writer(self) -> WriterThread:
+        if self._writer is None or self._is_closed:
             raise QueryError(self.problem, code="disk")
-        return self._recorder
+        return self._writer
 
-    def _open_recorder(self) -> Recorder:
-        recorder, problem = self._started_recorder(), self.problem
+    def _open_writer(self) -> WriterThread:
+        writer, problem = self._started_writer(), self.problem
         if problem and self._watch.is_checked:  # otherwise, creating the file shows it
             raise QueryError(problem, code="disk")
-        return recorder
+        return writer
 
     # Sources.
 
@@ -245,29 +271,29 @@ class RecordedTakes:
     def withdraw(self, source: str) -> None:
         """End everything that is recorded of a source, and accept no takes of it."""
         recording = self._recordings.pop(source, None)
-        if recording is not None and self._recorder is not None:
-            recording.end(self._recorder)
+        if recording is not None:
+            recording.end()
 
     def _keep(self, recording: SourceRecording) -> None:
         """Begin rolling segments of a source if they are switched on."""
-        recorder = self._recorder
-        if recorder is None or self._is_closed or not recording.is_announced or not self.settings.keep_last_s:
+        writer = self._writer
+        if writer is None or self._is_closed or not recording.is_announced or not self.settings.keep_last_s:
             return
         segments = RollingSegments(
             self._folder.directory / ROLLING / recording.source,
             self.settings.keep_last_s,
-            header=self._header(recording),
+            description=self._description(recording.source),
+            parameters=recording.parameters,
             disk=self.disk,
             losses=recording.losses,
             monotonic=self._host.monotonic,
         )
         recording.segments = segments
-        recording.add(recorder, segments, self.settings.components)
+        recording.add(writer, segments, self.settings.components)
 
-    def _header(self, recording: SourceRecording, details: TakeDetails = NO_DETAILS) -> FileHeader:
-        source = recording.source
-        description = SourceDescription(source, self.settings.prefix, self.server(source), details)
-        return FileHeader(description, recording.parameters)
+    def _description(self, source: str, details: TakeDetails = NO_DETAILS) -> SourceDescription:
+        channels = lcm_channel(self.settings.prefix, source)
+        return SourceDescription(source, channels, self.server(source), details=details)
 
     def add_c3d(self, source: str, c3d_file: Path) -> None:
         """Link or copy a C3D file beside the take to which it belongs, if there is one."""
@@ -279,10 +305,10 @@ class RecordedTakes:
 
     def open(self) -> None:
         """Start to write, and to check the folder."""
-        if self._recorder is not None or self._is_closed:
+        if self._writer is not None or self._is_closed:
             return
-        self._recorder = recorder = self._host.recorder("takes", self._max_queued_bytes)
-        recorder.call(partial(self._recover, self._folder))
+        self._writer = writer = self._host.writer("takes", self._max_queued_bytes)
+        writer.call(partial(self._recover, self._folder))
         self._check_folder()
         for recording in self._recordings.values():
             self._keep(recording)
@@ -300,13 +326,13 @@ class RecordedTakes:
         """What is wrong and what to do; "" if takes can be recorded."""
         if self._is_closed:
             return "the output takes is closed; start the gateway again"
-        if self._recorder is None:
+        if self._writer is None:
             return "the output takes is not open; start it first"
         return self._watch.problem or self.disk.problem
 
     async def written(self) -> None:
         """Wait until everything that was published so far is in the files."""
-        await asyncio.wrap_future(self._started_recorder().call(lambda: None))
+        await asyncio.wrap_future(self._started_writer().call(lambda: None))
 
     def refusal(self) -> OutputError | None:
         """Return the error for a message that is published while the output is not open."""
@@ -332,13 +358,13 @@ class RecordedTakes:
         self._check_folder()
 
     def _check_folder(self) -> None:
-        if self._recorder is not None and not self._is_closed:
+        if self._writer is not None and not self._is_closed:
             protected = {path for each in self._recordings.values() for path in each.running_paths}
             self._watch.check(self.settings, protected)
 
     def _end_because_full(self, excess_bytes: int) -> None:
-        recorder = self._recorder
-        if recorder is None:
+        writer = self._writer
+        if writer is None:
             return
         limit = f"the folder {self._folder.directory} has {excess_bytes} bytes more than takes.max_bytes"
         recordings = [each for each in self._recordings.values() if each.running_names]
@@ -349,11 +375,11 @@ class RecordedTakes:
                 f"{names} ends, because {limit}, and no other take can be deleted; raise takes.max_bytes",
                 frames=0,
             )
-            recording.end_takes(recorder)
+            recording.end_takes()
         if not recordings:
             for recording in self._recordings.values():
                 if recording.segments is not None:
-                    recorder.call(recording.segments.shorten)
+                    writer.call(recording.segments.shorten)
 
     def change(self, settings: TakesSettings) -> None:
         """Apply settings: limits at once, everything else to the next take and to the rolling segments."""
@@ -362,16 +388,16 @@ class RecordedTakes:
             old, self._watch = self._watch, FolderWatch(settings, self._host)
             old.close()
             self._check_folder()
-        recorder = self._recorder
-        if recorder is None:
+        writer = self._writer
+        if writer is None:
             return
-        recorder.call(self._folder.open)
+        writer.call(self._folder.open)
         for recording in self._recordings.values():
             segments = recording.segments
             if segments is not None and settings.keep_last_s and _same_files(settings, before):
-                recorder.call(partial(segments.keep, settings.keep_last_s))
+                writer.call(partial(segments.keep, settings.keep_last_s))
             elif segments is not None or settings.keep_last_s:
-                recording.end_segments(recorder)
+                recording.end_segments()
                 self._keep(recording)
 
     def cancel_timers(self) -> None:
@@ -385,14 +411,14 @@ class RecordedTakes:
         if self._is_closed:
             return
         self._is_closed = True
-        recorder = self._recorder
-        if recorder is not None:
+        writer = self._writer
+        if writer is not None:
             for recording in self._recordings.values():
-                recording.end(recorder)
-            if not recorder.close(_CLOSE_S):
+                recording.end()
+            if not writer.close(_CLOSE_S):
                 logger.warning(
                     "takes: the disk of %s does not respond; %d bytes are not written",
-                    *(self._folder.directory, recorder.queued_bytes),
+                    *(self._folder.directory, writer.queued_bytes),
                 )
                 return
         self._watch.close()

@@ -1,0 +1,153 @@
+"""The limits of the folder of takes, ``max_bytes`` and ``max_age_days``, and whether it can be written."""
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Collection, Sequence
+from collections.abc import Set as AbstractSet
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Final
+
+from gateway.outputs.takes.disk import Host, disk_problem
+from gateway.outputs.takes.folder import FileId, TakeEntry, TakesFolder
+from gateway.outputs.takes.settings import TakesSettings
+
+_SILENT_S: Final = 5.0
+"""How long a check of the folder may take; after that, the disk does not respond."""
+
+_REST: Final = 50
+"""After a check, the next one waits for this many times the duration of the check. After a problem, it does
+not wait: the former gateway with this folder may just be ending."""
+
+_DAY_S: Final = 86_400.0
+
+
+class FolderWatch:
+    """Checks the folder of ``settings`` in a thread of its own, because its disk may not respond."""
+
+    def __init__(self, settings: TakesSettings, host: Host) -> None:
+        self._monotonic = host.monotonic
+        self.folder = TakesFolder(settings.effective_directory)
+        self._limits = FolderLimits(self.folder, host.monotonic)
+        self.is_checked = False
+        """Whether it has been checked once."""
+        self.excess_bytes = 0
+        """By how much the folder was too large at the newest check, after deleting what may be deleted."""
+        self._problem = f"{self.folder.directory} is not checked yet; does its disk respond?"
+        self._thread = host.thread("takes-folder")
+        self._check: Future[None] | None = None
+        self._next_check_s = 0.0
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the folder and what to do; "" if takes can be recorded there."""
+        if self._thread.call_age_s > _SILENT_S:
+            return (
+                f"the disk of {self.folder.directory} does not respond; check it, and whether it is mounted"
+            )
+        return self._problem
+
+    def check(self, settings: TakesSettings, protected: AbstractSet[Path]) -> None:
+        """Check the folder and keep its limits, unless that was done a moment ago.
+
+        ``protected`` are the paths, without extension, of the takes that must not be deleted.
+        """
+        if (self._check is None or self._check.done()) and self._monotonic() >= self._next_check_s:
+            self._check = self._thread.submit(lambda: self._check_now(settings, protected))
+
+    def _check_now(self, settings: TakesSettings, protected: AbstractSet[Path]) -> None:
+        began_s = self._monotonic()
+        problem, excess_bytes = self.folder.open(), 0
+        if not problem:
+            days = settings.max_age_days
+            try:
+                excess_bytes = self._limits.delete_old(
+                    max_bytes=settings.max_bytes,
+                    max_age_s=None if days is None else days * _DAY_S,
+                    protected=protected,
+                )
+            except OSError as error:
+                problem = disk_problem(self.folder.directory, error)
+        self._problem, self.excess_bytes, self.is_checked = problem, excess_bytes, True
+        ended_s = self._monotonic()  # with thousands of takes, every second would keep a disk busy
+        self._next_check_s = ended_s if problem else ended_s + _REST * (ended_s - began_s)
+
+    def close(self) -> None:
+        """Let another gateway use the folder, once no check is in progress."""
+        self._thread.submit(self.folder.close)
+
+
+_FRESH_S: Final = 5.0
+"""A take that was written so recently is not deleted: it may have been started a moment ago."""
+
+logger = logging.getLogger(__name__)
+
+
+class FolderLimits:
+    """Deletes the oldest takes of a folder beyond its limits. It blocks: call it in a thread."""
+
+    def __init__(self, folder: TakesFolder, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._folder = folder
+        self._monotonic = monotonic
+        # Of each take: when it was written last, and when that was noticed; None if it was there before.
+        self._noticed: dict[Path, tuple[float, float | None]] | None = None
+
+    def delete_old(self, *, max_bytes: int, max_age_s: float | None, protected: Collection[Path]) -> int:
+        """Delete the oldest takes beyond the limits, except the ``protected`` ones (paths without extension).
+
+        If there are none of those, the newest take of each source stays: it may be the one that has just
+        ended because of this limit. Returns how many bytes are still too many. Raises OSError.
+        """
+        entries = sorted(self._folder.entries(), key=lambda entry: entry.end_s)
+        newest = {} if protected else {entry.source: entry.path for entry in entries}
+        users: dict[FileId, int] = {}
+        sizes = self._folder.rolling_sizes()
+        rolling = set(sizes)
+        for entry in entries:
+            sizes |= entry.sizes
+            for file in entry.sizes:
+                users[file] = users.get(file, 0) + 1
+        total = sum(sizes.values())
+        ages_s = self._ages_s(entries)
+        for entry in entries:
+            age_s = ages_s[entry.path]
+            if entry.path in protected or age_s < _FRESH_S:
+                continue
+            if max_age_s is not None and age_s > max_age_s:
+                reason = f"it is older than takes.max_age_days ({max_age_s / 86_400:g})"
+            elif total > max_bytes and entry.path not in newest.values():
+                reason = f"the folder has {total} bytes, and takes.max_bytes is {max_bytes}"
+            else:
+                continue
+            _delete(entry)
+            logger.info("takes: deleted %s, the oldest one: %s", entry.path, reason)
+            for file, size in entry.sizes.items():
+                users[file] -= 1
+                if not users[file] and file not in rolling:
+                    total -= size
+        return max(0, total - max_bytes)
+
+    def _ages_s(self, entries: Sequence[TakeEntry]) -> dict[Path, float]:
+        """Return how long ago each take was written last.
+
+        The clock of the computer may have been corrected by years since then, so it counts only for takes
+        from before the first call.
+        """
+        now_s, monotonic_s = time.time(), self._monotonic()
+        former, self._noticed = self._noticed, {}
+        ages_s = {}
+        for entry in entries:
+            end_s, noticed_s = (former or {}).get(entry.path, (None, None))
+            if end_s != entry.end_s:
+                noticed_s = None if former is None else monotonic_s
+            self._noticed[entry.path] = entry.end_s, noticed_s
+            ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
+        return ages_s
+
+
+def _delete(entry: TakeEntry) -> None:
+    for path, _ in (*entry.logs, *entry.c3d_files):
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # a file, or a folder in which somebody has put other files
+        entry.path.rmdir()

@@ -1,1 +1,0 @@
-"""Recording what gateways publish, as one of their subscribers."""
