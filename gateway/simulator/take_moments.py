@@ -23,7 +23,6 @@ from gateway.rtc3d.components import (
     num_described_items,
 )
 from gateway.rtc3d.parameters import (
-    SECTIONS,
     AnalogChannel,
     EventDefinition,
     Marker,
@@ -35,9 +34,8 @@ from gateway.rtc3d.parameters import (
     ParametersForce,
     Plate,
     Tool,
-    only_sections,
 )
-from gateway.rtc3d.parameters_xml import encode_parameters, extract_sections, parse_parameters
+from gateway.rtc3d.parameters_xml import cut_sections, encode_parameters, parse_parameters
 
 _HEAD: Final = struct.Struct(">iqi")
 """The fields of a content before its items: frame number, time stamp in µs, number of items."""
@@ -198,10 +196,7 @@ class RecordedParameters:
 
     def xml_of(self, sections: Collection[str]) -> bytes:
         """Return the XML of some sections (keys of SECTIONS); for all, it is the server's own, unchanged."""
-        if not sections or SECTIONS.keys() <= set(sections):
-            return self.xml
-        extracted = extract_sections(self.xml, sections)
-        return encode_parameters(only_sections(self.parsed, sections)) if extracted is None else extracted
+        return cut_sections(self.xml, self.parsed, sections)
 
 
 def derived_parameters(
