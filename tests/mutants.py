@@ -31,7 +31,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "stream": ("unit/stream/test_* unit/service/test_*source* property/*_clock_*",),
     "publish": ("unit/publish/test_* property/*_pacing_*",),
     "queries": ("unit/queries/test_* unit/service/test_source*",),
-    "takes/files": ("unit/takes/files/test_* property/*takes* property/*_seek_* property/*_components_*",),
+    "takes/files": ("unit/takes/files/test_* property/*takes* property/*_components_*",),
 } | {
     f"outputs/{name}": (f"unit/outputs/{name}/test_* unit/outputs/test_*", f"contract/test_* -k {name}")
     for name in ("zenoh", "ros2", "rtc3d", "takes", "lcm")
