@@ -29,7 +29,7 @@ _COMPONENT: Final = struct.Struct(">II")
 """A component's size and type (§7.1), which are not in its message."""
 
 _BLOCK_FRAMES: Final = 64
-_WAIT_S: Final = 30.0
+_WAIT_S: Final = 120.0  # catches what hangs; a program on a busy machine may take a minute to start
 
 
 @dataclass(frozen=True)
