@@ -2,8 +2,7 @@
 
 from typing import Any, Final
 
-from benchmarks.comparison import Pair, table_cell
-from benchmarks.report import Goal, Progress, Table
+from benchmarks.report import Goal, Pair, Progress, Table, table_cell
 from benchmarks.workbench import GATEWAY, RELAY, Workbench
 from benchmarks.workloads import DENSE
 

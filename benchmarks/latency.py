@@ -3,9 +3,8 @@
 from itertools import chain
 from typing import Any, Final
 
-from benchmarks.comparison import Pair, percentile, table_cell
 from benchmarks.processes import Worker
-from benchmarks.report import Goal, Progress, Table
+from benchmarks.report import Goal, Pair, Progress, Table, percentile, table_cell
 from benchmarks.subscribers import subscribe_tcp
 from benchmarks.workbench import GATEWAY, PLAIN_TCP, RELAY, Workbench
 from benchmarks.workloads import DENSE, cuts

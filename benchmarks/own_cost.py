@@ -16,9 +16,8 @@ from typing import Any, Final
 
 import uvloop
 
-from benchmarks.comparison import Pair, table_cell
 from benchmarks.processes import PLAIN_PYTHON, run_measured
-from benchmarks.report import Goal, Progress, Table
+from benchmarks.report import Goal, Pair, Progress, Table, table_cell
 from benchmarks.workloads import DENSE, Frames
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.messages.decode import decode

@@ -5,12 +5,10 @@ import time
 from collections.abc import Iterator
 from typing import Any, Final
 
-from benchmarks.comparison import percentile
-from benchmarks.lab import Lab
 from benchmarks.processes import Worker
-from benchmarks.report import Goal, Progress, Table
+from benchmarks.report import Goal, Progress, Table, percentile
 from benchmarks.subscribers import Received
-from benchmarks.workbench import GATEWAY
+from benchmarks.workbench import GATEWAY, Lab
 from gateway.outputs.zenoh.subscriber import open_zenoh
 
 TITLE: Final = "Queries for parameters, answered from the cache while the lab workload streams"

@@ -1,9 +1,12 @@
-"""The results of the benchmarks: a file, tables on the terminal, and tables in docs/performance.md."""
+"""The parts of the benchmarks, and their results: in a file, on the terminal, and in docs/performance.md."""
 
+import importlib
 import json
+import math
 import os
 import platform
 import re
+import statistics
 import subprocess
 import time
 from collections.abc import Iterable, Sequence
@@ -12,7 +15,8 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from types import ModuleType
+from typing import Any, Final, NamedTuple, Self
 
 from rich.console import Console
 from rich.table import Table as RichTable
@@ -23,6 +27,19 @@ from gateway import version_text
 DOCUMENT: Final = ROOT / "docs" / "performance.md"
 RESULTS: Final = ROOT / "benchmarks" / "results.json"
 QUICK_RESULTS: Final = ROOT / "benchmarks" / "results-quick.json"
+
+PARTS: Final = (
+    "own_cost",
+    "outputs",
+    "ceiling",
+    "latency",
+    "loss",
+    "resources",
+    "scale",
+    "queries",
+    "replay",
+)
+"""The parts of the benchmarks, in order; each is a module."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +165,22 @@ def machines_table(results: dict[str, Any]) -> Table:
     return Table("Machine", ["parts", *(", ".join(each) for each in parts.values())], rows)
 
 
+def part(name: str) -> ModuleType:
+    """Return the module of a part, with ``expected_s``, ``measure``, ``tables`` and ``goals``."""
+    return importlib.import_module(f"benchmarks.{name}")
+
+
+def sections(results: dict[str, Any]) -> dict[str, list[Table]]:
+    """Return the tables of each part that has results, and of the sections "machine" and "goals"."""
+    measured: dict[str, Any] = {name: results[name] for name in PARTS if name in results}
+    goals = [goal for name, result in measured.items() for goal in part(name).goals(result)]
+    return {
+        "machine": [machines_table(measured)],
+        "goals": [goals_table(goals)],
+        **{name: part(name).tables(result) for name, result in measured.items()},
+    }
+
+
 def rendered(document: str, sections: dict[str, list[Table]]) -> str:
     """Return the document with each section's tables between its markers, if the document has them."""
     for name, tables in sections.items():
@@ -157,3 +190,55 @@ def rendered(document: str, sections: dict[str, list[Table]]) -> str:
         if start and end:
             document = f"{before}{start}\n{text}\n\n{end}{after}"
     return document
+
+
+class Pair:
+    """The measured values of two alternately measured programs.
+
+    The ratio of each pair of neighbouring runs is the first program's value divided by the second's.
+    """
+
+    def __init__(self, first: str, second: str) -> None:
+        self._names = (first, second)
+        self._values: dict[str, list[float]] = {first: [], second: []}
+
+    @classmethod
+    def of(cls, values: dict[str, list[float]]) -> Self:
+        """Return the pair from which ``as_dict`` returned ``values``."""
+        pair = cls(*values)
+        pair._values = {name: list(each) for name, each in values.items()}
+        return pair
+
+    def as_dict(self) -> dict[str, list[float]]:
+        """Return the values of both programs in the order of measurement, rounded to 5 digits."""
+        return {name: [float(f"{value:.5g}") for value in each] for name, each in self._values.items()}
+
+    def add(self, name: str, value: float) -> None:
+        """Add the next value of one of the two programs."""
+        self._values[name].append(value)
+
+    def median(self, name: str) -> float:
+        """Return the median of one program's values."""
+        return statistics.median(self._values[name])
+
+    @property
+    def ratios(self) -> list[float]:
+        """The ratios of all pairs of neighbouring runs."""
+        first, second = (self._values[name] for name in self._names)
+        return [one / other for one, other in zip(first, second, strict=True)]
+
+    @property
+    def ratio(self) -> float:
+        """The median of the ratios."""
+        return statistics.median(self.ratios)
+
+
+def table_cell(pair: Pair) -> str:
+    """Return the median ratio, and in brackets the smallest and the largest, as text."""
+    return f"{pair.ratio:.2f} ({min(pair.ratios):.2f}–{max(pair.ratios):.2f})"
+
+
+def percentile(values: Sequence[float], per_cent: float) -> float:
+    """Return the smallest value that ``per_cent`` % of the values do not exceed (nearest rank)."""
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(len(ordered) * per_cent / 100) - 1)]

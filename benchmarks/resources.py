@@ -3,12 +3,10 @@
 import time
 from typing import Any, Final
 
-from benchmarks.lab import Lab
 from benchmarks.processes import cpu_s, memory_bytes, peak_memory_bytes
 from benchmarks.report import Goal, Progress, Table
-from benchmarks.sender import Paced
-from benchmarks.workbench import GATEWAY, Workbench
-from benchmarks.workloads import DENSE
+from benchmarks.workbench import GATEWAY, Lab, Workbench
+from benchmarks.workloads import DENSE, Paced
 
 TITLE: Final = "CPU and memory of the gateway, with one Zenoh subscriber and one LCM subscriber"
 GOAL_MIB: Final = 2.0

@@ -14,7 +14,7 @@ from gateway.rtc3d.components import (
     ITEM_DTYPES,
     LONG_EVENT,
     MISSING,
-    MISSING_RELIABILITY,
+    MISSING_MARKER,
     ComponentType,
     Items,
 )
@@ -291,7 +291,7 @@ class WalkingPerson(ComputedScene):
         values[..., :3] = np.stack([*self._body.markers(time_s).values()], axis=1) + noise_mm
         values[..., 3] = np.linalg.norm(noise_mm, axis=2)
         for place, label in enumerate(self._labels):
-            values[_is_hidden(label, time_s), place] = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
+            values[_is_hidden(label, time_s), place] = MISSING_MARKER
         return values.astype(">f4").view(ITEM_DTYPES[ComponentType.MARKERS])[..., 0]
 
     def _tools(self, samples: SampleNumbers) -> Items:

@@ -9,7 +9,7 @@ from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.loading import Configuration, read, read_server
 from gateway.outputs.registry import settings_type
-from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
+from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 
 
 def chosen_file(

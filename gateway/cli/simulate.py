@@ -13,7 +13,7 @@ from gateway.cli.completion import source_names
 from gateway.cli.options import LogOptions, SceneOptions, check_exists, checked_host, with_options
 from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.logs.log_format import set_up_log
-from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
+from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 
 if TYPE_CHECKING:
     from gateway.simulator.simulator import Scenario, Simulator

@@ -47,8 +47,7 @@ from gateway.config.values import (
 )
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
-from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES
+from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES, FIRST_PRINCIPLES_PORT
 
 
 class StreamSettings(Section):

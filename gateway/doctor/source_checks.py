@@ -14,7 +14,7 @@ from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStrea
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.logs.safe_text import quoted
 from gateway.outputs.findings import Finding, MessageLoad, Result, Subject, as_sentence
-from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
+from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.tcp import is_address, look_up
 

@@ -6,8 +6,8 @@ From the bytes upwards:
 - ``frames`` (§7.1) and ``components`` (§7.3 to §7.7): what data packets contain, as views of the bytes
   received. Nothing is converted unless somebody asks for numpy arrays.
 - ``commands`` (§5): what a client sends, as typed objects.
-- ``parameters`` (§6): what a server says about itself. ``parameters_xml`` reads and writes them;
-  ``parameters_layout`` is the table of elements and attributes.
+- ``parameters`` (§6): what a server says about itself, and the table of its elements and attributes in XML.
+  ``parameters_xml`` reads and writes them.
 - ``client_protocol``: one connection as a client sees it, with its states. ``reply_matcher`` finds out which
   command a reply answers, because replies do not say so. The server's side is in ``gateway.rtc3d_server``.
 

@@ -104,7 +104,7 @@ _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
 
 
 class Answered(NamedTuple):
-    """The server answered ``command`` with ``packet``, whose type is in ANSWERING_TYPES."""
+    """The server answered ``command`` with ``packet``, which is not an error packet."""
 
     command: Command
     packet: Packet

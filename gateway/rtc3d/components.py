@@ -19,6 +19,7 @@ __all__ = [
     "ITEM_DTYPES",
     "LONG_EVENT",
     "MISSING",
+    "MISSING_MARKER",
     "MISSING_RELIABILITY",
     "SHORT_EVENT",
     "WIRE_ORDER",
@@ -38,6 +39,9 @@ MISSING: Final = np.uint32(0xFFFFFFFF).view(np.float32)
 
 MISSING_RELIABILITY: Final = 999.0
 """The Reliability of a missing marker (field note 7)."""
+
+MISSING_MARKER: Final = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
+"""The values of a missing marker."""
 
 
 def _floats(*names: str) -> np.dtype[Any]:

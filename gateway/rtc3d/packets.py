@@ -6,6 +6,10 @@ from typing import Final
 
 from gateway.errors import PacketError
 
+FIRST_PRINCIPLES_PORT: Final = 3020
+WAVEFRONT_PORT: Final = 3030
+"""The TCP ports on which RT servers listen by default (§2, field note 12)."""
+
 PACKET_HEADER: Final = struct.Struct(">II")
 PACKET_HEADER_BYTES: Final = 8
 DEFAULT_MAX_PACKET_BYTES: Final = 16 * 1024 * 1024

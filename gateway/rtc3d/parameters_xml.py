@@ -11,8 +11,7 @@ from lxml import etree
 
 from gateway.errors import ParametersError
 from gateway.logs.safe_text import quoted, safe_text
-from gateway.rtc3d.parameters import SECTIONS, Parameters
-from gateway.rtc3d.parameters_layout import LAYOUT, PARENT_TAGS, ROOT, TAGS
+from gateway.rtc3d.parameters import LAYOUT, PARENT_TAGS, ROOT, SECTIONS, TAGS, Parameters, only_sections
 
 MAX_XML_BYTES: Final = 1024 * 1024
 """Larger documents are not parsed. This is enough for about 8000 markers; parsing takes 1.4 s at worst."""
@@ -103,6 +102,18 @@ def extract_sections(xml: bytes, sections: Collection[str]) -> bytes | None:
         if _tag(element) not in tags:
             root.remove(element)
     return etree.tostring(root)
+
+
+def cut_sections(xml: bytes, parsed: Parameters, sections: Collection[str]) -> bytes:
+    """Return some sections (keys of SECTIONS) of a server's reply, which has been ``parsed``, as XML.
+
+    For all, and for none, it is the reply itself. If XML that is not well-formed has to be cut, what was read
+    is written again.
+    """
+    if not sections or SECTIONS.keys() <= set(sections):
+        return xml
+    extracted = extract_sections(xml, sections)
+    return encode_parameters(only_sections(parsed, sections)) if extracted is None else extracted
 
 
 def named_sections(xml: bytes) -> frozenset[str]:

@@ -3,8 +3,8 @@
 A reply has no number that identifies its command. The client therefore has at most one pending command,
 and the matcher remembers earlier commands whose replies may still arrive. The rules:
 
-- Only a packet of the right type answers a command: see ``ANSWERING_TYPES``. An acknowledgement that
-  precedes XML or a frame (field note 3) is ignored.
+- Only a packet of the right type answers a command: see ``_ACKNOWLEDGED_COMMANDS``; an error answers any
+  command. An acknowledgement that precedes XML or a frame (field note 3) is ignored.
 - A text that names a command, with its parameters or without, replies to that command, or it is a duplicate.
 - A text that names none may be the late reply to the oldest command whose reply is outstanding, or it
   answers the pending command, and the server has ignored the earlier ones (field note 20). It counts as the
@@ -22,7 +22,6 @@ from gateway.rtc3d.commands import (
     Bye,
     Command,
     ControlRecording,
-    SendCurrentFrame,
     SendParameters,
     SetByteOrder,
     StopStreaming,
@@ -33,18 +32,8 @@ from gateway.rtc3d.packets import Packet, PacketType, decode_text
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.rtc3d.parameters_xml import named_sections
 
-ANSWERING_TYPES: Final[dict[type[Command], frozenset[PacketType]]] = {
-    Version: frozenset({PacketType.COMMAND}),
-    SetByteOrder: frozenset({PacketType.COMMAND}),
-    SendParameters: frozenset({PacketType.XML}),
-    SendCurrentFrame: frozenset({PacketType.DATA, PacketType.NO_DATA}),
-    # A frame shows that StreamFrames was accepted; its acknowledgement may follow (field note 3).
-    StreamFrames: frozenset({PacketType.COMMAND, PacketType.DATA, PacketType.NO_DATA}),
-    StopStreaming: frozenset({PacketType.COMMAND}),
-    Bye: frozenset({PacketType.COMMAND}),
-    ControlRecording: frozenset({PacketType.COMMAND}),
-}
-"""The packet types that answer each command; an error packet answers any command."""
+_ACKNOWLEDGED_COMMANDS: Final = (Version, SetByteOrder, StreamFrames, StopStreaming, Bye, ControlRecording)
+"""The commands that an acknowledgement answers. The others are answered by XML, and by a frame or No Data."""
 
 _VERBS: Final = r"(version|setbyteorder|sendparameters|sendcurrentframe|streamframes|bye|recording)\b"
 _ACKNOWLEDGED: Final = re.compile(rf"(?:ok\W*)?{_VERBS}")
@@ -102,7 +91,12 @@ class ReplyMatcher:
 
     def match_xml(self, packet: Packet) -> Command | None:
         """Return the pending command if a type 2 packet answers it, otherwise None."""
-        return self._settle(self._command_of_xml(packet))
+        command = self._command_of_xml(packet)
+        if command is self.pending:
+            return command
+        if command is not None:  # a late reply
+            self._outstanding.remove(command)
+        return None
 
     def finish_by_reply(self) -> None:
         """End the pending command, which a text or XML has answered."""
@@ -124,14 +118,6 @@ class ReplyMatcher:
             self._answered.append(self.pending)
             self.pending = self.possible = None
 
-    def _settle(self, command: Command | None) -> Command | None:
-        """Return ``command`` if it is pending; otherwise note that its late reply arrived, return None."""
-        if command is None or command is self.pending:
-            return command
-        if command in self._outstanding:
-            self._outstanding.remove(command)
-        return None
-
     def _candidates(self, packet: Packet) -> list[Command]:
         """Return the unanswered commands that a text may answer, oldest first."""
         text = decode_text(packet.body[:_MAX_TEXT_BYTES]).lower()
@@ -145,7 +131,7 @@ class ReplyMatcher:
             # The text may mention other commands as well ("Version must be sent first").
             refused = set(_REFUSED.findall(text))
             return [command for command in unanswered if _verb(command) in refused] or unanswered
-        unanswered = [command for command in unanswered if packet.type in ANSWERING_TYPES[type(command)]]
+        unanswered = [command for command in unanswered if isinstance(command, _ACKNOWLEDGED_COMMANDS)]
         acknowledged = _ACKNOWLEDGED.match(text)
         if acknowledged is None:
             return unanswered

@@ -3,8 +3,8 @@
 The server itself is ``gateway.rtc3d_server``. A scene tells it which frames there are at which time:
 
 - ``synthetic``: computed from the time alone, of the ``bodies`` and force plates that move in it.
-- ``c3d_scene``: a C3D file. ``c3d_reader`` reads it in a child process with limits, because files may be
-  malformed; ``c3d_recording`` is what that process does.
+- ``c3d_scene``: a C3D file, which a child process with limits reads, because files may be malformed;
+  ``c3d_recording`` is what that process does.
 - ``take_scene``: a take of this gateway. It reads ahead while it plays. ``take_moments`` decides which
   components belong to the same frame and when it is due, ``take_frames`` makes the frames that a client has
   requested.

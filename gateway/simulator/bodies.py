@@ -5,7 +5,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gateway.rtc3d.components import ITEM_DTYPES, MISSING, MISSING_RELIABILITY, ComponentType, Items
+from gateway.rtc3d.components import ITEM_DTYPES, MISSING, MISSING_MARKER, ComponentType, Items
 from gateway.rtc3d.parameters import ForceChannel, ParametersForce, Plate, Point
 from gateway.rtc3d_server.scene import SampleNumbers
 
@@ -93,7 +93,7 @@ class RigidBodies:
         values = np.empty((*noise_mm.shape[:2], 4), np.float32)
         np.add(position_mm, noise_mm, out=values[..., :3], casting="same_kind")
         values[..., 3] = np.sqrt(_square_sum(noise_mm))
-        values[self._hidden(time_s)] = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
+        values[self._hidden(time_s)] = MISSING_MARKER
         return values.astype(">f4").view(_MARKER_ITEM)[..., 0]
 
     def tools(self, samples: SampleNumbers) -> Items:
@@ -207,20 +207,6 @@ _STRIDE_S: Final = 1.2  # time between two steps of the same foot
 _STANCE_S: Final = 0.72  # how long the foot is on the plate in each stride
 _WEIGHT_N: Final = 800.0
 _NOISE_N: Final = 0.5
-_CHANNELS: Final = tuple(
-    ForceChannel(id=str(number), label=label, unit=unit)
-    for number, (label, unit) in enumerate(
-        [
-            ("Force X", "N"),
-            ("Force Y", "N"),
-            ("Force Z", "N"),
-            ("Moment X", "Nm"),
-            ("Moment Y", "Nm"),
-            ("Moment Z", "Nm"),
-        ],
-        start=1,
-    )
-)
 
 
 class ForcePlates:
@@ -269,9 +255,16 @@ def _plate(index: int, rate_hz: float) -> Plate:
             Point(0.0, far, 0.0),
         ),
         origin=Point(0.0, 0.0, 0.0),
-        channels=_CHANNELS,
+        channels=force_channels("N", "Nm"),
         excitation_voltage_v=5.0,
         amplifier_gain=4000.0,
         calibration_unit="microV",
         calibration_matrix=tuple(tuple(float(row == column) for column in range(6)) for row in range(6)),
     )
+
+
+def force_channels(force_unit: str, moment_unit: str) -> tuple[ForceChannel, ...]:
+    """Return the channels of a plate, in the order of the items of the Force component (§7.5)."""
+    kinds = (("Force", force_unit), ("Moment", moment_unit))
+    channels = [(f"{kind} {axis}", unit) for kind, unit in kinds for axis in "XYZ"]
+    return tuple(ForceChannel(str(number), *channel) for number, channel in enumerate(channels, start=1))

@@ -12,8 +12,7 @@ from gateway.errors import TakeError
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
     LONG_EVENT,
-    MISSING,
-    MISSING_RELIABILITY,
+    MISSING_MARKER,
     ComponentType,
     Items,
 )
@@ -22,7 +21,6 @@ from gateway.rtc3d.parameters import (
     EventDefinition,
     EventParameter,
     ExpectedValue,
-    ForceChannel,
     Marker,
     Parameters,
     Parameters3D,
@@ -34,6 +32,7 @@ from gateway.rtc3d.parameters import (
     Point,
 )
 from gateway.rtc3d_server.scene import NO_EVENTS
+from gateway.simulator.bodies import force_channels
 
 _WORD_BYTES: Final = 2
 _COUNT_OFFSET: Final = 150 * _WORD_BYTES
@@ -171,7 +170,6 @@ def _padded(texts: list[str], count: int) -> list[str]:
 
 
 _HEADER_BYTES: Final = 512
-_FORCE_LABELS: Final = ("Force X", "Force Y", "Force Z", "Moment X", "Moment Y", "Moment Z")
 _WHOLE_UNITS: Final = {"mill": "mm", "cent": "cm", "mete": "m"}
 """Units that programs cut to four characters (field note 28)."""
 
@@ -278,7 +276,7 @@ def _markers(points: npt.NDArray[np.float64], residuals: npt.NDArray[np.float64]
     values[..., :3] = points[:3].T
     values[..., 3] = residuals[0].T
     missing = np.isnan(values[..., :3]).any(axis=2) | (values[..., 3] == -1)
-    values[missing] = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
+    values[missing] = MISSING_MARKER
     return values.view(ITEM_DTYPES[ComponentType.MARKERS])[..., 0]
 
 
@@ -339,7 +337,6 @@ def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float,
     force_unit, moment_unit = plate["unit_force"], plate["unit_moment"]
     if plate["unit_position"] != unit:  # ezc3d says metres if the file says nothing
         moment_unit = f"{force_unit}{unit}"
-    units = [force_unit] * 3 + [moment_unit] * 3
     channels = np.reshape(force_platform["CHANNEL"]["value"], (-1, len(force_platform["TYPE"]["value"])))
     calibration = plate["cal_matrix"]
     return Plate(
@@ -348,10 +345,7 @@ def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float,
         frequency_hz=rate_hz,
         corners=tuple(_point(corner, unit) for corner in plate["corners"].T),
         origin=_point(plate["origin"], unit),
-        channels=tuple(
-            ForceChannel(str(number), label, unit)
-            for number, (label, unit) in enumerate(zip(_FORCE_LABELS, units, strict=True), start=1)
-        ),
+        channels=force_channels(force_unit, moment_unit),
         analog_channel_ids=tuple(str(channel) for channel in channels[:, index] if channel > 0),
         # for plate types without a calibration matrix, ezc3d returns zeros
         calibration_matrix=tuple(tuple(map(float, row)) for row in calibration) if calibration.any() else (),

@@ -23,6 +23,7 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
     only_sections,
+    relabelled,
 )
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.rtc3d_server.measurement import ComputedScene
@@ -44,7 +45,8 @@ class SyntheticScene(ComputedScene):
 
     ``markers``, ``tools``, ``analog`` (channels) and ``plates`` are numbers of items and can be 0.
     ``rate_hz`` is the rate of markers and tools, ``analog_rate_hz`` that of analog channels and force
-    plates. Another ``seed`` gives another scene of the same size.
+    plates. ``marker_label`` comes before the numbers of markers in their labels. Another ``seed`` gives
+    another scene of the same size.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class SyntheticScene(ComputedScene):
         plates: int = 2,
         rate_hz: float = 100.0,
         analog_rate_hz: float = 1000.0,
+        marker_label: str = "Marker",
         seed: int = 1,
     ) -> None:
         rng = np.random.default_rng(seed)
@@ -74,7 +77,9 @@ class SyntheticScene(ComputedScene):
         self.parameters = Parameters(
             markers=Parameters3D(
                 frequency_hz=rate_hz,
-                markers=tuple(Marker(str(number), f"Marker {number}") for number in range(1, markers + 1)),
+                markers=tuple(
+                    Marker(str(number), f"{marker_label} {number}") for number in range(1, markers + 1)
+                ),
             ),
             tools=Parameters6D(frequency_hz=rate_hz, tools=_describe_tools(bodies)),
             analog=channels.parameters,
@@ -174,7 +179,7 @@ Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), expects("a whole n
 
 
 class SceneSettings(Section):
-    """The arguments of SyntheticScene, and the labels of its markers."""
+    """The arguments of SyntheticScene."""
 
     markers: Size = 24
     """The number of markers."""
@@ -206,14 +211,7 @@ class SceneSettings(Section):
 
     def build(self) -> SyntheticScene:
         """Return the scene."""
-        scene = SyntheticScene(**self.model_dump(exclude={"marker_label"}))
-        parameters_3d = scene.parameters.markers
-        if parameters_3d is not None:
-            markers = tuple(
-                replace(marker, label=f"{self.marker_label} {marker.id}") for marker in parameters_3d.markers
-            )
-            scene.parameters = replace(scene.parameters, markers=replace(parameters_3d, markers=markers))
-        return scene
+        return SyntheticScene(**self.model_dump())
 
 
 class RenamedScene:
@@ -226,7 +224,7 @@ class RenamedScene:
     @property
     def parameters(self) -> Parameters:
         """See Scene."""
-        return _renamed(self._scene.parameters, self._prefix)
+        return relabelled(self._scene.parameters, lambda each: self._prefix + each.label)
 
     @property
     def length_us(self) -> int | None:
@@ -255,13 +253,3 @@ class RenamedScene:
     def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameSource:
         """See Scene."""
         return self._scene.frames(components, event_bytes)
-
-
-def _renamed(parameters: Parameters, prefix: str) -> Parameters:
-    if parameters.markers is not None:
-        markers = tuple(replace(each, label=prefix + each.label) for each in parameters.markers.markers)
-        parameters = replace(parameters, markers=replace(parameters.markers, markers=markers))
-    if parameters.tools is not None:
-        tools = tuple(replace(each, label=prefix + each.label) for each in parameters.tools.tools)
-        parameters = replace(parameters, tools=replace(parameters.tools, tools=tools))
-    return parameters

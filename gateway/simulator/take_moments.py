@@ -2,7 +2,7 @@
 
 import struct
 from bisect import insort
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -23,7 +23,6 @@ from gateway.rtc3d.components import (
     num_described_items,
 )
 from gateway.rtc3d.parameters import (
-    SECTIONS,
     AnalogChannel,
     EventDefinition,
     Marker,
@@ -35,9 +34,8 @@ from gateway.rtc3d.parameters import (
     ParametersForce,
     Plate,
     Tool,
-    only_sections,
 )
-from gateway.rtc3d.parameters_xml import encode_parameters, extract_sections, parse_parameters
+from gateway.rtc3d.parameters_xml import cut_sections, encode_parameters, parse_parameters
 
 _HEAD: Final = struct.Struct(">iqi")
 """The fields of a content before its items: frame number, time stamp in µs, number of items."""
@@ -198,10 +196,7 @@ class RecordedParameters:
 
     def xml_of(self, sections: Collection[str]) -> bytes:
         """Return the XML of some sections (keys of SECTIONS); for all, it is the server's own, unchanged."""
-        if not sections or SECTIONS.keys() <= set(sections):
-            return self.xml
-        extracted = extract_sections(self.xml, sections)
-        return encode_parameters(only_sections(self.parsed, sections)) if extracted is None else extracted
+        return cut_sections(self.xml, self.parsed, sections)
 
 
 def derived_parameters(
@@ -211,43 +206,31 @@ def derived_parameters(
 ) -> RecordedParameters:
     """Return minimal parameters: numbered items, and rates rounded to 0.01 Hz."""
 
-    def ids(component: ComponentType) -> Sequence[str]:
-        return [str(number) for number in range(1, num_items.get(component, 0) + 1)]
+    def numbered(component: ComponentType, noun: str) -> Iterator[tuple[str, str]]:
+        """Yield the id and the label of each item."""
+        return ((str(number), f"{noun} {number}") for number in range(1, num_items.get(component, 0) + 1))
 
-    def rate_hz(component: ComponentType) -> float | None:
-        rate = rates_hz.get(component)
-        return None if rate is None else round(rate, 2)
-
-    analog_hz, force_hz = rate_hz(ComponentType.ANALOG), rate_hz(ComponentType.FORCE)
+    rate_hz = {component: round(rate, 2) for component, rate in rates_hz.items()}.get
+    markers = (Marker(*each) for each in numbered(ComponentType.MARKERS, "Marker"))
+    tools = (Tool(*each) for each in numbered(ComponentType.TOOLS, "Tool"))
+    channels = (
+        AnalogChannel(*each, frequency_hz=rate_hz(ComponentType.ANALOG))
+        for each in numbered(ComponentType.ANALOG, "Analog")
+    )
+    plates = (
+        Plate(*each, frequency_hz=rate_hz(ComponentType.FORCE))
+        for each in numbered(ComponentType.FORCE, "Force plate")
+    )
+    kinds = sorted(set(event_ids))[:_MAX_EVENT_KINDS]
+    events = (EventDefinition(str(event_id), f"Event {event_id}") for event_id in kinds)
     return RecordedParameters(
         encode_parameters(
             Parameters(
-                markers=Parameters3D(
-                    rate_hz(ComponentType.MARKERS),
-                    markers=tuple(Marker(each, f"Marker {each}") for each in ids(ComponentType.MARKERS)),
-                ),
-                tools=Parameters6D(
-                    rate_hz(ComponentType.TOOLS),
-                    tuple(Tool(each, f"Tool {each}") for each in ids(ComponentType.TOOLS)),
-                ),
-                analog=ParametersAnalog(
-                    tuple(
-                        AnalogChannel(each, f"Analog {each}", frequency_hz=analog_hz)
-                        for each in ids(ComponentType.ANALOG)
-                    )
-                ),
-                force=ParametersForce(
-                    tuple(
-                        Plate(each, f"Force plate {each}", frequency_hz=force_hz)
-                        for each in ids(ComponentType.FORCE)
-                    )
-                ),
-                events=ParametersEvents(
-                    tuple(
-                        EventDefinition(str(event_id), f"Event {event_id}")
-                        for event_id in sorted(set(event_ids))[:_MAX_EVENT_KINDS]
-                    )
-                ),
+                markers=Parameters3D(rate_hz(ComponentType.MARKERS), markers=tuple(markers)),
+                tools=Parameters6D(rate_hz(ComponentType.TOOLS), tuple(tools)),
+                analog=ParametersAnalog(tuple(channels)),
+                force=ParametersForce(tuple(plates)),
+                events=ParametersEvents(tuple(events)),
             )
         )
     )

@@ -28,9 +28,9 @@ MAX_GROWTH_MIB = 40
 def asker(
     gateway: RunningGateway, count: int, *selectors: str, num_bytes: int = 0
 ) -> AbstractAsyncContextManager[Process]:
-    """Run tests/hostile/asker.py until the end of the block."""
+    """Run ``ask`` of tests/hostile/zenoh_peer.py until the end of the block."""
     facts = (gateway.zenoh_endpoint, str(count), str(num_bytes))
-    return python("-m", "tests.hostile.asker", *facts, *selectors, stderr=DEVNULL)  # Zenoh's log
+    return python("-m", "tests.hostile.zenoh_peer", "ask", *facts, *selectors, stderr=DEVNULL)  # Zenoh's log
 
 
 async def ask(gateway: RunningGateway, count: int, *selectors: str, num_bytes: int = 0) -> dict[str, int]:

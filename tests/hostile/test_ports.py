@@ -15,9 +15,8 @@ from typing import Any, Final, NamedTuple
 import pytest
 
 from tests.foxglove_viewer import viewing
-from tests.hostile import foxglove_viewers, lsl_attacks, rtc3d_clients, vrpn_clients
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, num_missing, python, rss_kib
-from tests.hostile.port_attacks import Attack, attacking
+from tests.hostile.port_attacks import ATTACKS, Attack, attacking
 from tests.integration.raw_client import connected, consecutive
 from tests.lsl_receiver import LslReceiver, lsl_config
 from tests.networks import free_port
@@ -115,7 +114,7 @@ def viewers(name: str) -> Attack:
     """Viewers in a process of their own, which would otherwise take the time of this one."""
 
     async def attack(port: int) -> None:
-        async with python("-m", "tests.hostile.foxglove_viewers", name, str(port)) as process:
+        async with python("-m", "tests.hostile.port_attacks", name, str(port)) as process:
             await process.wait()
 
     return attack
@@ -123,20 +122,20 @@ def viewers(name: str) -> Attack:
 
 TARGETS: Final = {
     "rtc3d": Target(
-        lambda port, _: {"enabled": True, "ports": {"healthy": port}}, rtc3d_client, rtc3d_clients.ATTACKS, 60
+        lambda port, _: {"enabled": True, "ports": {"healthy": port}}, rtc3d_client, ATTACKS["rtc3d"], 60
     ),
-    "vrpn": Target(lambda port, _: {"enabled": True, "port": port}, vrpn_client, vrpn_clients.ATTACKS, 60),
+    "vrpn": Target(lambda port, _: {"enabled": True, "port": port}, vrpn_client, ATTACKS["vrpn"], 60),
     "foxglove": Target(
         lambda port, _: {"enabled": True, "port": port},
         foxglove_client,
-        {name: viewers(name) for name in foxglove_viewers.ATTACKS},
+        {name: viewers(name) for name in ATTACKS["foxglove"]},
         100,
         serves_during_attacks=False,
     ),
     "lsl": Target(
         lambda _, folder: {"enabled": True, "config": str(lsl_config(folder))},
         lsl_client,
-        lsl_attacks.ATTACKS,
+        ATTACKS["lsl"],
         100,
         serves_during_attacks=False,
     ),

@@ -3,21 +3,29 @@
     python -m tests.hostile.zenoh_peer KIND ENDPOINT COUNT
 
 It prints "done" after it has done this COUNT times, keeps everything open, and ends with stdin.
+
+    python -m tests.hostile.zenoh_peer ask ENDPOINT COUNT PAYLOAD_BYTES SELECTOR...
+
+See ``ask``.
 """
 
 import json
 import os
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 import zenoh
 
-from tests.networks import zenoh_keys
+from tests.networks import open_zenoh, zenoh_keys
 
 _BUFFER_BYTES: Final = 4096
 """The receive buffer: small, so that a peer that does not read is noticed soon."""
+
+_ANSWER_TIMEOUT_S: Final = 20.0
 
 _LEASE_MS: Final = 60_000
 """Zenoh closes the link of a silent peer after the lease that this peer has announced."""
@@ -105,8 +113,40 @@ KINDS: Final[dict[str, Callable[[str, int], Iterator[Any]]]] = {
 }
 
 
+def ask(endpoint: str, count: int, payload: bytes, selectors: list[str]) -> None:
+    """Send ``count`` queries at once, with the selectors in turn, and print a line when they are sent.
+
+    "{}" in a selector stands for the number of the query. When every query has ended, print a JSON object:
+    the number of replies by code ("ok", or the code of the error), and of queries without any.
+    """
+    counts: Counter[str] = Counter()
+    unanswered = set(range(count))
+    ended = threading.Semaphore(0)
+
+    def receive(number: int, reply: zenoh.Reply) -> None:
+        unanswered.discard(number)
+        counts["ok" if reply.err is None else str(reply.err.encoding).rpartition(";")[2]] += 1
+
+    with open_zenoh("client", connect=endpoint) as session:
+        for number in range(count):
+            session.get(
+                selectors[number % len(selectors)].replace("{}", str(number)),
+                zenoh.handlers.Callback(partial(receive, number), drop=ended.release),
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=_ANSWER_TIMEOUT_S,
+                payload=payload or None,
+            )
+        print("sent", flush=True)
+        for _ in range(count):
+            ended.acquire(timeout=_ANSWER_TIMEOUT_S)
+        print(json.dumps(counts | {"unanswered": len(unanswered)}), flush=True)
+
+
 def main() -> None:
-    kind, endpoint, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    kind, endpoint, count, *others = sys.argv[1], sys.argv[2], int(sys.argv[3]), *sys.argv[4:]
+    if kind == "ask":
+        ask(endpoint, count, bytes(int(others[0])), others[1:])
+        return
     kept: list[Any] = []
 
     def attack() -> None:

@@ -1,10 +1,16 @@
-"""Takes with any content and damage: the arrays are those of LCM's own decoder, or an error is reported."""
+"""Takes with any content and damage.
 
+The arrays are those of LCM's own decoder, or an error is reported. A take has what was published, and a seek
+gives the same as reading everything.
+"""
+
+import asyncio
 import json
 import struct
 import tempfile
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from hypothesis import given, settings
@@ -15,13 +21,18 @@ from gateway.cli.take_report import statistics_json, write_report
 from gateway.errors import ProtocolError, TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
+from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes import open_take
 from gateway.takes.files.event_log import EventLogReader, encode_event
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
+from gateway.takes.replay.play_list import Entry, SeekIndex, Selection, play_list
+from gateway.takes.replay.timeline import ReplayTimeline
+from tests.recording_output import events as recorded_events
+from tests.recording_output import still_lab
 from tests.strategies import damaged
-from tests.takes import START_UTIME, Message, description, parameters
+from tests.takes import START_UTIME, Message, description, markers, parameters, write_take
 from tests.vectors import COMPONENTS
 
 HEADER_BYTES = 28
@@ -152,3 +163,100 @@ def test_a_message_of_the_wrong_size_is_malformed(wire: bytes, rest: bytes) -> N
                 is_whole = False
             source = open_take(path).sources["lab"]
             assert source.malformed == ({} if is_whole else {key: 1})
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.sampled_from(["3d", "event", "6d"]), st.integers(0, 20)),
+        st.tuples(st.just("parameters"), st.integers(0, 100)),
+        st.tuples(st.sampled_from(["start", "stop", "pause"]), st.just(0)),
+    ),
+    max_size=60,
+)
+
+
+@settings(max_examples=50)
+@given(steps=STEPS)
+def test_a_take_is_what_was_published(steps: list[tuple[str, int]]) -> None:
+    """However starts, stops, frames and parameters follow each other."""
+    with tempfile.TemporaryDirectory() as folder:
+        expected = asyncio.run(_record(Path(folder), steps))
+        for name, messages in expected.items():
+            found = recorded_events(Path(folder) / "lab" / f"{name}.lcmlog")[1:]
+            assert [event.message for event in found if not event.channel.endswith("_PARAMETERS")] == [
+                message for message in messages if isinstance(message, bytes)
+            ]
+            assert [event.channel.endswith("_PARAMETERS") for event in found] == [
+                not isinstance(message, bytes) for message in messages
+            ]
+
+
+async def _record(folder: Path, steps: list[tuple[str, int]]) -> dict[str, list[bytes | None]]:
+    """Make the steps; return what each take must have, None for parameters."""
+    takes: dict[str, list[bytes | None]] = {}
+    running: list[bytes | None] | None = None
+    has_parameters = False
+    async with still_lab(folder) as lab:
+        for number, (step, size) in enumerate(steps):
+            match step:
+                case "start" if running is None:
+                    await lab.takes.start("lab", str(number))
+                    running = takes[str(number)] = [None] if has_parameters else []
+                case "stop" if running is not None:
+                    await lab.takes.stop("lab")
+                    running = None
+                case "pause":
+                    await lab.takes.written()
+                case "parameters":
+                    xml = b"<!--" + b"x" * (size * 1000) + b"-->"
+                    sent = lab.output.publish_parameters("lab", ServerParameters(xml, 1, number))
+                    if sent is not None:
+                        await sent
+                    has_parameters = True
+                    if running is not None:
+                        running.append(None)
+                case "3d" | "event" | "6d":
+                    message = lab.publish(step, size if step == "3d" else 0)
+                    if running is not None:
+                        running.append(message)
+    return takes
+
+
+XML = b"<Parameters><The_3D><Markers>1</Markers></The_3D></Parameters>"
+
+steps = st.tuples(
+    st.sampled_from(["lab", "stage"]),
+    st.sampled_from(["frame", "frame", "frame", "parameters"]),
+    st.sampled_from([0, *[300_000] * 5, 2_500_000, 60_000_000, -10_000_000]),  # gaps, steps of the clock
+)
+
+
+def entries(reader: TakeReader, start_us: int, index: SeekIndex | None) -> list[Entry]:
+    return list(play_list(reader, Selection(), ReplayTimeline(), start_us, index))
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(steps, min_size=15, max_size=60),
+    st.integers(1, 3),
+    st.lists(st.integers(0, 8_000_000), min_size=2, max_size=6),
+)
+def test_reading_from_the_index_gives_the_same(
+    made: list[tuple[str, str, int]], num_files: int, starts: list[int]
+) -> None:
+    """Whatever the gaps, the steps of clocks and the division into files are."""
+    utimes = dict.fromkeys(("lab", "stage"), START_UTIME)
+    messages = [description(), description("stage")]  # one for each source
+    for number, (source, kind, step_us) in enumerate(made):
+        utimes[source] += step_us
+        if kind == "frame":
+            messages.append(markers(1, number, source=source, utime=utimes[source]))
+        else:
+            messages.append(parameters(XML, number, source=source, utime=utimes[source]))
+    with TemporaryDirectory() as folder:
+        size = -(-len(messages) // num_files)
+        for place in range(0, len(messages), size):
+            write_take(Path(folder) / f"{place:04}.lcmlog", messages[place : place + size])
+        reader, index = TakeReader(Path(folder)), SeekIndex()
+        for start_us in starts:
+            assert entries(reader, start_us, index) == entries(reader, start_us, None)

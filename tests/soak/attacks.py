@@ -21,12 +21,9 @@ import zenoh
 
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
-from tests.hostile.foxglove_viewers import ATTACKS as VIEWERS
-from tests.hostile.lsl_attacks import ATTACKS as LSL_ATTACKS
-from tests.hostile.rtc3d_clients import ATTACKS as RTC3D_CLIENTS
+from tests.hostile.port_attacks import ATTACKS as PORT_ATTACKS
 from tests.hostile.server_floods import FLOODS
 from tests.hostile.servers import SERVERS, streaming
-from tests.hostile.vrpn_clients import ATTACKS as VRPN_CLIENTS
 from tests.hostile.zenoh_peer import KINDS
 from tests.networks import open_zenoh
 from tests.servers import Client, Script, ScriptedServer, c3d_file, packet
@@ -152,6 +149,9 @@ async def _reloads(target: Target) -> None:
         await asyncio.sleep(0.2)
 
 
+_ON_PORTS: Final = {"rtc3d": "RTC3D client", "vrpn": "VRPN client", "foxglove": "viewer", "lsl": "LSL"}
+"""Who attacks the port of an output."""
+
 ATTACKS: Final[dict[str, Attack]] = {
     **{f"server: {name}": _server(script) for group in SERVERS.values() for name, script in group.items()},
     "server: many-files": _server(streaming(_many_files)),
@@ -169,10 +169,11 @@ ATTACKS: Final[dict[str, Attack]] = {
     "sender: LCM": _lcm_garbage,
     "Zenoh peer: stalled subscribers": _stalled_subscribers,
     **{f"Zenoh peer: {kind}": _zenoh_peer(kind) for kind in KINDS},
-    **{f"RTC3D client: {name}": _on_port_of("rtc3d", attack) for name, attack in RTC3D_CLIENTS.items()},
-    **{f"VRPN client: {name}": _on_port_of("vrpn", attack) for name, attack in VRPN_CLIENTS.items()},
-    **{f"viewer: {name}": _on_port_of("foxglove", attack) for name, attack in VIEWERS.items()},
-    **{f"LSL: {name}": _on_port_of("lsl", attack) for name, attack in LSL_ATTACKS.items()},
+    **{
+        f"{who}: {name}": _on_port_of(output, attack)
+        for output, who in _ON_PORTS.items()
+        for name, attack in PORT_ATTACKS[output].items()
+    },
     "host: HTTP connections": _held_http_connections,
     "host: reloads": _reloads,
 }

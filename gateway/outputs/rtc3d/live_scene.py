@@ -11,8 +11,8 @@ from gateway.outputs.rtc3d.arrivals import Arrivals
 from gateway.outputs.rtc3d.live_frames import LiveFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, described_rate_hz, num_described_items
 from gateway.rtc3d.frames import Frame
-from gateway.rtc3d.parameters import SECTIONS, General, Parameters, only_sections
-from gateway.rtc3d.parameters_xml import encode_parameters, extract_sections
+from gateway.rtc3d.parameters import General, Parameters
+from gateway.rtc3d.parameters_xml import cut_sections
 
 _KEPT_CHOICES: Final = 2
 _CACHED_SECTIONS: Final = 16  # clients can ask for 63 different choices
@@ -81,10 +81,7 @@ class LiveScene:
         return self._xml_of(frozenset(sections))
 
     def _cut_sections(self, sections: frozenset[str]) -> bytes:
-        if not sections or sections == SECTIONS.keys():
-            return self._xml
-        extracted = extract_sections(self._xml, sections)
-        return encode_parameters(only_sections(self._parsed, sections)) if extracted is None else extracted
+        return cut_sections(self._xml, self._parsed, sections)
 
     def start(self) -> None:
         """See Scene."""

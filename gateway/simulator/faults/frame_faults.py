@@ -13,7 +13,7 @@ from gateway.config.section import expects
 from gateway.errors import FrameError
 from gateway.rtc3d.components import (
     MISSING,
-    MISSING_RELIABILITY,
+    MISSING_MARKER,
     SHORT_EVENT,
     ByteOrder,
     Component,
@@ -91,7 +91,7 @@ class Occlusion(FrameFault):
             items = component.items().copy()
             if component.type is ComponentType.MARKERS:
                 hidden = _choose(self.markers, len(items), active.variant)
-                items[hidden] = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
+                items[hidden] = MISSING_MARKER
             elif component.type is ComponentType.TOOLS:
                 items[_choose(self.tools, len(items), active.variant)] = (MISSING,) * 8
             return _rebuild(component, items=items)

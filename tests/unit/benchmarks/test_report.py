@@ -7,19 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import parts, report
-from benchmarks.comparison import Pair, percentile
-from benchmarks.report import Table, rendered
+from benchmarks import report
+from benchmarks.report import Pair, Table, percentile, rendered
 
 
 def test_the_document_has_the_figures_of_the_results() -> None:
     document = report.DOCUMENT.read_text()
-    assert rendered(document, parts.sections(report.load(report.RESULTS))) == document
+    assert rendered(document, report.sections(report.load(report.RESULTS))) == document
 
 
 def test_the_document_has_markers_for_every_part() -> None:
     document = report.DOCUMENT.read_text()
-    for name in ("goals", "machine", *parts.NAMES):
+    for name in ("goals", "machine", *report.PARTS):
         assert rendered(document, {name: [Table("A title", ["a"], [["12345"]])]}) != document, name
 
 

@@ -12,7 +12,7 @@ import pytest
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D, Point
-from gateway.simulator import c3d_reader
+from gateway.simulator import c3d_scene
 from gateway.simulator.c3d_recording import _markers
 from gateway.simulator.c3d_scene import C3dScene
 
@@ -280,9 +280,9 @@ def test_a_file_that_takes_too_much_is_refused(
     path: Path, limit: str, value: int, problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not every damage is visible in the sizes; this file has a rate that would make ezc3d use 28 GB."""
-    monkeypatch.setattr(c3d_reader, limit, value)
-    monkeypatch.setattr(c3d_reader, "_MEMORY_PER_BYTE", 0)
-    monkeypatch.setattr(c3d_reader, "problem_of_sizes", lambda *_: "")
+    monkeypatch.setattr(c3d_scene, limit, value)
+    monkeypatch.setattr(c3d_scene, "_MEMORY_PER_BYTE", 0)
+    monkeypatch.setattr(c3d_scene, "problem_of_sizes", lambda *_: "")
     whole = path.read_bytes()
     path.write_bytes(whole.replace(struct.pack("<f", 1000.0), struct.pack("<f", 1e10)))
     with pytest.raises(TakeError, match=problem) as raised:
