@@ -237,7 +237,7 @@ def counts_of(series: Sequence[RecordedSeries], sink: FileSink) -> SeriesCounts:
 
 
 def _rate_hz(series: RecordedSeries) -> float:
-    duration_us = series.check.last_utime - series.check.first_utime
+    duration_us = series.last_utime - series.first_utime
     return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
 
 
@@ -346,7 +346,7 @@ def _notes(recording: TakeRecording) -> Iterator[str]:
         restarts = max((check.num_restarts for check in checks), default=0)
         if restarts:
             yield f"{source.name}: its gateway was started again ({_times(restarts)})"
-        late = sum(check.num_alternations for check in checks if not check.has_two_publishers)
+        late = sum(check.num_late for check in checks if not check.has_two_publishers)
         if late:
             yield f"{source.name}: {late} messages came in another order than they were sent"
         repeated = sum(check.num_repeated for check in checks)

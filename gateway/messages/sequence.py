@@ -1,0 +1,226 @@
+"""What the sequence numbers of one key or channel show: losses, restarts, and messages in another order.
+
+Subscribers check the messages that they receive, and the statistics of a take those that it has.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+MAX_LATE: Final = 1000
+"""A number that is further behind the newest one was not overtaken on the network: the numbers restart."""
+
+_MAX_GAP: Final = 1_000_000
+"""A number that is further ahead is doubtful: if the numbers before it go on, the message was damaged."""
+
+_NUM_RECENT: Final = 32
+"""How many messages are remembered to recognise copies, and how many gaps to be filled by late messages."""
+
+_NUM_FORMER: Final = 4
+"""How many interrupted numberings are remembered: networks reorder few messages, and few gateways collide."""
+
+_MANY_ALTERNATIONS: Final = 10
+
+
+@dataclass(slots=True)
+class Gap:
+    """``missing`` messages in a row, before the message that arrived at ``utime``."""
+
+    utime: int
+    missing: int
+    stop: int
+    """The number after those of the gap."""
+    late: int = 0
+    """A bit for each message that arrived late: 0 for number ``stop - 1``, 1 for the one before."""
+
+    def fill(self, number: int) -> bool:
+        """Take a late message; return whether it was missing. At most MAX_LATE bits are set."""
+        bit = 1 << (self.stop - 1 - number)
+        if self.late & bit:
+            return False
+        self.late |= bit
+        self.missing -= 1
+        return True
+
+
+@dataclass(slots=True)
+class _Numbering:
+    """Numbers that follow each other without a gap."""
+
+    newest: int
+    utime: int
+    """When the newest message was sent."""
+    num_messages: int
+    gaps: deque[Gap]
+    """The recent gaps that late messages may fill. What follows a gap shares them."""
+    gap: Gap | None = None
+    is_restart: bool = False
+    """What was counted when the numbering was interrupted: it did not happen if the numbering goes on."""
+
+
+class SequenceCheck:
+    """Follows the sequence numbers of one key, and counts what is missing. Messages may arrive late or twice.
+
+    Numbers before the first message are not missing. If the numbers start again, the gateway has restarted.
+    Each gap and each restart interrupts a numbering. If that goes on later, nothing was missing there: the
+    message between had a damaged number, or two gateways publish on the same key.
+
+    ``max_listed`` is how many gaps are listed; all are counted. ``counts_first``: the messages before the
+    first one after a restart are missing, because a subscriber would have received them.
+    """
+
+    def __init__(self, *, max_listed: int = 0, counts_first: bool = False) -> None:
+        self.num_lost = 0
+        """How many messages are missing."""
+        self.num_gaps = 0
+        """In how many places they are missing."""
+        self.num_restarts = 0
+        """How often the numbers started again: the gateway did, or another recording follows."""
+        self.num_late = 0
+        """How many messages arrived after later ones; they are not missing."""
+        self.num_repeated = 0
+        """How many messages arrived twice."""
+        self.num_implausible = 0
+        """How many messages have numbers that fit neither what comes before nor after: they are damaged."""
+        self.num_alternations = 0
+        """How often an interrupted numbering went on."""
+        self.session = 0
+        """The session of the newest message."""
+        self._max_listed = max_listed
+        self._counts_first = counts_first
+        self._listed: list[Gap] = []
+        self._largest: Gap | None = None
+        self._current: _Numbering | None = None
+        self._former: deque[_Numbering] = deque(maxlen=_NUM_FORMER)
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_NUM_RECENT)  # number and time
+
+    @property
+    def has_two_publishers(self) -> bool:
+        """Whether two gateways publish, as far as the numbers show. Then losses are not counted exactly."""
+        return self.num_alternations >= _MANY_ALTERNATIONS
+
+    @property
+    def gaps(self) -> list[Gap]:
+        """The first gaps, at most ``max_listed``."""
+        return [gap for gap in self._listed if gap.missing]
+
+    @property
+    def largest(self) -> Gap | None:
+        """The largest gap; None if there is none, or none is listed."""
+        candidates = self.gaps
+        if self._largest is not None and self._largest.missing:
+            candidates.append(self._largest)
+        return max(candidates, key=lambda gap: gap.missing, default=None)
+
+    def add(self, sequence: int, utime: int, session: int = 0) -> None:
+        """Take the next message, by its number, its time, and its session if sessions can show a restart."""
+        current = self._current
+        if current is None:
+            self._current = _Numbering(sequence, utime, 1, deque(maxlen=_NUM_RECENT))
+        elif sequence == current.newest + 1:
+            current.newest = sequence
+            current.utime = utime
+            current.num_messages += 1
+        elif (sequence, utime) in self._recent:
+            self.num_repeated += 1
+            return
+        elif not self._fill_gap(current, sequence, utime):
+            self._interrupt(current, sequence, utime, session)
+        self._recent.append((sequence, utime))
+        self.session = session
+
+    def add_all(self, sequences: npt.NDArray[np.int64], utimes: npt.NDArray[np.int64]) -> None:
+        """Take the next messages; both arrays have the shape (messages,)."""
+        done = 0
+        if len(sequences) > _NUM_RECENT and (np.diff(sequences) == 1).all():
+            self.add(int(sequences[0]), int(utimes[0]))
+            done = 1
+            current = self._current
+            if current is not None and current.newest == int(sequences[0]):
+                # Those that only follow each other are skipped, up to those that copies are compared with.
+                done = len(sequences) - _NUM_RECENT
+                current.newest = int(sequences[done - 1])
+                current.num_messages += done - 1
+        for sequence, utime in zip(sequences[done:].tolist(), utimes[done:].tolist(), strict=True):
+            self.add(sequence, utime)
+
+    def _fill_gap(self, current: _Numbering, sequence: int, utime: int) -> bool:
+        """Return whether a message was missing, and was only overtaken by others."""
+        if not (0 < current.newest - sequence <= MAX_LATE and utime <= current.utime):
+            return False
+        for gap in current.gaps:
+            # The missing and the late messages of a gap are all of it.
+            if gap.stop - gap.missing - gap.late.bit_count() <= sequence < gap.stop and gap.fill(sequence):
+                self.num_late += 1
+                self.num_lost -= 1
+                self.num_gaps -= not gap.missing
+                return True
+        return False
+
+    def _interrupt(self, current: _Numbering, sequence: int, utime: int, session: int) -> None:
+        """Take a number that does not follow the newest one: of a former numbering, or of a new one."""
+        former = self._find_former(current, sequence)
+        if former is not None:
+            self._resume(former, current)
+            self.add(sequence, utime, session)
+            return
+        gaps = current.gaps
+        is_restart = sequence <= current.newest or session < self.session
+        if is_restart:
+            current.is_restart = True
+            self.num_restarts += 1
+            gaps = deque(maxlen=_NUM_RECENT)
+        num_lost = sequence - current.newest - 1
+        if is_restart:
+            num_lost = max(0, sequence) if self._counts_first else 0
+        if num_lost:
+            current.gap = Gap(utime, num_lost, sequence)
+            self._add_gap(current.gap)
+            gaps.append(current.gap)
+        self._former.append(current)
+        self._current = _Numbering(sequence, utime, 1, gaps)
+
+    def _find_former(self, current: _Numbering, sequence: int) -> _Numbering | None:
+        """Return the interrupted numbering that a message continues; None if it continues none."""
+        for each in self._former:
+            if sequence == each.newest + 1:
+                return each
+        if current.num_messages > 1:
+            return None
+        # The message between may have been damaged or late, and the one after it lost.
+        followed = [each for each in (*self._former, current) if _follows(each, sequence)]
+        nearest = max(followed, key=lambda each: each.newest, default=current)
+        return None if nearest is current else nearest
+
+    def _resume(self, former: _Numbering, current: _Numbering) -> None:
+        """Continue a numbering, and undo what was counted when it was interrupted."""
+        self._former.remove(former)
+        self.num_alternations += 1
+        self.num_implausible += current.num_messages == 1
+        self.num_restarts -= former.is_restart
+        if (gap := former.gap) is not None:
+            self.num_lost -= gap.missing
+            self.num_gaps -= gap.missing > 0
+            gap.missing = 0
+            former.gaps = deque((each for each in former.gaps if each is not gap), _NUM_RECENT)
+            self._listed = [each for each in self._listed if each is not gap]
+        former.gap, former.is_restart = None, False
+        current.gap, current.is_restart = None, False
+        self._former.append(current)
+        self._current = former
+
+    def _add_gap(self, gap: Gap) -> None:
+        self.num_gaps += 1
+        self.num_lost += gap.missing
+        if len(self._listed) < self._max_listed:
+            self._listed.append(gap)
+        if self._max_listed and (self._largest is None or gap.missing > self._largest.missing):
+            self._largest = gap
+
+
+def _follows(numbering: _Numbering, sequence: int) -> bool:
+    """Return whether a number comes after those of ``numbering``, with a gap that is plausible."""
+    return 0 < sequence - numbering.newest <= _MAX_GAP
