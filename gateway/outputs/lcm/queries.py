@@ -29,7 +29,6 @@ from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
 from gateway.outputs.parameters_message import encode_parameters
-from gateway.outputs.threads import SendThread
 from gateway.workers import WorkerThread
 
 REPEAT_S: Final = 5.0
@@ -59,7 +58,7 @@ class LcmParameters:
         self,
         loop: asyncio.AbstractEventLoop,
         publish: Callable[[str, bytes], None],
-        long_sender: SendThread,
+        long_sender: WorkerThread,
     ) -> None:
         self._loop = loop
         self._publish = publish
@@ -148,7 +147,7 @@ class LcmQueries:
         url = settings.effective_queries_url
         is_own_url = url != settings.effective_url
         self._reply_sender = new_sender(url, None, lambda: None, "replies") if is_own_url else sender
-        self._long_sender = SendThread("lcm-send-long")
+        self._long_sender = WorkerThread("lcm-send-long")
         self._commands = LcmCommands(service)
         kinds = (parameter_requests(service), self._commands.kind)
         self._requests = LcmRequests(

@@ -23,7 +23,7 @@ from gateway.messages.topics import lcm_channel
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.query_admission import QueryAdmission, QueryDefects, QueryLimits, Refusal
-from gateway.outputs.threads import SendThread
+from gateway.workers import WorkerThread
 
 MAX_PENDING: Final = 64
 """The maximum number of requests in progress. Further ones are dropped and counted."""
@@ -71,7 +71,7 @@ class LcmRequests:
         loop: asyncio.AbstractEventLoop,
         kinds: Sequence[RequestKind],
         send: Callable[[str, bytes], None],
-        long_sender: SendThread,
+        long_sender: WorkerThread,
     ) -> None:
         self._prefix = settings.prefix
         self._service = service

@@ -19,10 +19,10 @@ from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, QueryService, ServerParameters
 from gateway.outputs.query_admission import QueryAdmission, QueryLimits
-from gateway.outputs.threads import SendThread
 from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
 from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.workers import WorkerThread
 
 # Parameters must arrive, even if that takes longer, and messages of streams have priority.
 _RELIABLE: Final = zenoh.CongestionControl.BLOCK
@@ -73,7 +73,7 @@ class SourceDeclarations:
         self._due: set[str] = set()  # sources whose parameters will be published for a new subscriber
         self._published_s: dict[str, float] = {}  # when that was done last
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
-        self._sender = SendThread("zenoh-send")
+        self._sender = WorkerThread("zenoh-send")
         self._admission = QueryAdmission(
             QueryLimits(
                 output="zenoh",
@@ -207,7 +207,7 @@ class SourceDeclarations:
             if self._is_closed or source not in self._declared or source not in self._parameters:
                 return None
             sent = self._unsent.get(source)
-            if sent is None:
+            if sent is None or sent.done():  # no thread could be started
                 sent = self._sender.submit(functools.partial(self._put_parameters, source))
                 self._unsent[source] = sent
             return sent

@@ -110,7 +110,7 @@ async def test_a_long_reply_is_sent_by_a_thread(lab: Lab, monkeypatch: pytest.Mo
     """It would keep the frames of all sources waiting."""
     monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
     may_send = threading.Event()
-    lab.queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
+    lab.queries._long_sender.submit(may_send.wait)
     lab.send(request(1))
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
     lab.deliver()
