@@ -22,7 +22,8 @@ from gateway.messages.decode import JSON, MAX_JSON_SOURCE_BYTES, decode, json_te
 from gateway.messages.topics import JSON_NAME, Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
+from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.session import declare_publisher, has_subscribers, undeclare
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.token_bucket import TokenBucket
@@ -185,20 +186,17 @@ class JsonPublisher:
 
     def declare(self, session: zenoh.Session) -> None:
         """Declare the publisher on an open session."""
-        publisher = session.declare_publisher(
-            self._key, encoding=JSON, congestion_control=zenoh.CongestionControl.DROP
+        self._publisher = declare_publisher(
+            *(session, self._key, self._set_wanted),
+            encoding=JSON,
+            congestion_control=zenoh.CongestionControl.DROP,
         )
-        publisher.declare_matching_listener(in_zenoh_thread(self._on_matching))
-        self._publisher = publisher
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""
-        publisher: Any = self._publisher  # its type stub is wrong: see ZenohPublisher
+        publisher = self._publisher
         if publisher is not None:
-            self._set_wanted(publisher.matching_status.matching)
-
-    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
-        self._set_wanted(status.matching)
+            self._set_wanted(has_subscribers(publisher))
 
     def _set_wanted(self, wanted: bool) -> None:
         self.wanted = wanted
@@ -285,11 +283,7 @@ class JsonPublisher:
         """Undeclare the publisher."""
         publisher, self._publisher = self._publisher, None
         self.wanted = False
-        if publisher is not None:
-            try:
-                publisher.undeclare()
-            except zenoh.ZError as error:
-                logger.debug("undeclaring %s: %s", self._key, error)
+        undeclare(publisher, self._key)
 
 
 def _fields(**values: Any) -> str:
