@@ -126,7 +126,7 @@ class LcmReceiver:
         if isinstance(connection, LcmDatagrams):
             connection.close()
 
-    def _open(self) -> lcm.LCM | LcmDatagrams | None:
+    def _open(self) -> "lcm.LCM | LcmDatagrams | None":
         """Return what receives requests, with retries; None if ``close`` is called first."""
         while not self._closing.is_set():
             try:
@@ -139,7 +139,7 @@ class LcmReceiver:
             return connection
         return None
 
-    def _try_to_open(self) -> lcm.LCM | LcmDatagrams:
+    def _try_to_open(self) -> "lcm.LCM | LcmDatagrams":
         if scheme_of(self._url) == "udpm":
             return LcmDatagrams(self._url, self._handle)
         connection = open_lcm(self._url)

@@ -12,8 +12,8 @@ import pytest
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.ros2.output import Ros2Output
@@ -57,8 +57,8 @@ async def test_lcm_sends_and_receives_in_threads(threads: Callable[[], dict[str,
     output.serve_queries(SourceQueryService(dict, dict, "zenoh"))
     output.announce("lab")
     output.start()
+    await wait_until_async(lambda: {"lcm-send": True, "lcm-requests": True}.items() <= threads().items())
     await wait_until_async(lambda: output.health().connected and relay.subscribed)
-    assert {"lcm-send": True, "lcm-requests": True}.items() <= threads().items()
     await output.stop_queries()
     output.close()
     await wait_until_async(lambda: not {"lcm-send", "lcm-requests"} & set(threads()))
