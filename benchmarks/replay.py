@@ -17,7 +17,7 @@ from benchmarks.processes import Worker, run_measured
 from benchmarks.report import Goal, Progress, Table
 from gateway.messages.encode import Stamp, encode_content
 from gateway.outputs.lcm.connection import receiving_url
-from gateway.outputs.lcm.receiving import LcmSubscriber
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.takes.files.event_log import encode_event

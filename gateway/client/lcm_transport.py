@@ -25,7 +25,7 @@ from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.discovery import DISCOVERY_S, missing_source
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.receiving import LcmSubscriber, no_gateway_on_lcm
+from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
 
 _LISTEN_S: Final = 1.5
 """Every gateway sends a status within this time. If none is heard, this listens for DISCOVERY_S."""

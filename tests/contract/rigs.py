@@ -11,8 +11,8 @@ import zenoh
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.output import ZenohOutput

@@ -21,7 +21,7 @@ import lcm
 import zenoh
 
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.receiving import QUEUE_MESSAGES
+from gateway.outputs.lcm.subscriber import QUEUE_MESSAGES
 from tests.networks import wait_for_zenoh
 
 FRAME_COMPONENTS: Final = ("3d", "6d", "analog", "force")

@@ -15,7 +15,7 @@ import zenoh.ext
 from gateway.messages.decode import decode, prefix_of
 from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.lcm.receiving import LcmSubscriber
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.service.gateway import Gateway
 from gateway.simulator.faults.connection_faults import Rename
 from gateway.simulator.simulator import Simulator

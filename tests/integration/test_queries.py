@@ -15,7 +15,7 @@ import zenoh
 from gateway.config.settings import StreamSettings
 from gateway.messages.decode import decode, to_json
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.lcm.receiving import LcmSubscriber
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS

@@ -14,8 +14,8 @@ import pytest
 
 from gateway.config.settings import StreamSettings
 from gateway.messages.encode import ITEMS_OFFSET
-from gateway.outputs.lcm.receiving import LcmSubscriber, channel_pattern
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType

@@ -15,8 +15,8 @@ from gateway.config.settings import MetricsSettings, Settings
 from gateway.errors import ConfigError
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
 from gateway.service.daemon import Daemon

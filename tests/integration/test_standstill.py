@@ -16,7 +16,7 @@ import lcm
 import pytest
 
 from gateway.messages.decode import decode
-from gateway.outputs.lcm.receiving import LcmSubscriber
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator

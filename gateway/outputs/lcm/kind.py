@@ -6,8 +6,8 @@ from gateway.outputs.kind import DemoSide, OutputKind, Receive, Subscription
 from gateway.outputs.lcm.checks import CHECKS, check_lcm, leaves_host
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.receiving import LcmSubscriber, channel_pattern, subscribe
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern, subscribe
 
 
 def _demo(use_network: bool) -> DemoSide:

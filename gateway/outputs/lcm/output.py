@@ -16,7 +16,7 @@ from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters
-from gateway.outputs.lcm.receiving import LcmReceiver
+from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import (
     LONG_REPLY_BYTES,
     MAX_PENDING,
@@ -24,7 +24,7 @@ from gateway.outputs.lcm.requests import (
     LcmRequests,
     parameter_requests,
 )
-from gateway.outputs.lcm.sending import LcmPublisher, LcmSender, LcmThreadSender, new_sender
+from gateway.outputs.lcm.sender import LcmPublisher, LcmSender, LcmThreadSender, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.parameters_message import encode_parameters
 from gateway.workers import WorkerThread

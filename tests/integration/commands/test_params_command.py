@@ -15,8 +15,8 @@ import zenoh
 from gateway.messages.decode import json_bytes
 from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.command_in_process import run_in_process
 from tests.command_process import Completed, run
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh

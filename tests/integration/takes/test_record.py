@@ -24,7 +24,7 @@ from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.receiving import LcmSubscriber
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.statistics import take_statistics
 from tests.gateway_process import PROGRAM, program, simulator

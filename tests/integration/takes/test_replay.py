@@ -16,7 +16,7 @@ import zenoh
 
 from gateway.messages.decode import decode
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.lcm.receiving import LcmSubscriber
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.rtc3d.parameters_xml import encode_parameters

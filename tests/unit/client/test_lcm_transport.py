@@ -12,8 +12,8 @@ from gateway.client.reception import MAX_SOURCES
 from gateway.client.series import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.recorder.take_recording import TakeRecording
 from gateway.takes.recorder.target import FileSink, Target

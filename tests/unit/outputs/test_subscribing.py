@@ -12,8 +12,8 @@ from gateway.outputs.contract import Output
 from gateway.outputs.kind import DemoSide, Subscription, SubscriptionRequest
 from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.receiving import channel_pattern
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import channel_pattern
 from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput

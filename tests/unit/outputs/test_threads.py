@@ -12,8 +12,8 @@ import pytest
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.ros2.output import Ros2Output

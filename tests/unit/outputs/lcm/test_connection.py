@@ -12,7 +12,7 @@ import pytest
 from gateway.errors import OutputError
 from gateway.outputs.lcm import connection
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.receiving import NO_CHANNEL, LcmDatagrams, split_datagram
+from gateway.outputs.lcm.receiver import NO_CHANNEL, LcmDatagrams, split_datagram
 from tests.lcm_relay import LcmRelay
 from tests.networks import lcm_url
 from tests.waiting import wait_until

@@ -9,8 +9,8 @@ import rtc3d
 
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.receiving import LcmSubscriber
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.lcm_relay import LcmRelay
 from tests.unit.outputs.lcm.peer import XML, Service, request
 from tests.waiting import wait_until, wait_until_async
@@ -51,14 +51,14 @@ async def ask(relay: LcmRelay, request_id: int) -> list[str]:
 async def test_a_lost_relay_is_logged_and_requests_are_answered_again_when_it_is_back(
     relay: LcmRelay, output: LcmOutput, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.receiving")
+    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.receiver")
     await wait_until_async(lambda: output.health().connected)
     assert await ask(relay, 1) == [XML.decode()]
     relay.close()
     await wait_until_async(lambda: len(caplog.messages) >= 2 and not relay.subscribed)
     relay.open()
     assert await ask(relay, 2) == [XML.decode()]  # after the receiver has subscribed again
-    logged = [each.message for each in caplog.records if each.name.endswith("receiving")]
+    logged = [each.message for each in caplog.records if each.name.endswith("receiver")]
     failure, lost, *_, found = logged
     assert failure.startswith("receiving LCM requests: ")
     assert lost.startswith(f"lcm: no requests can be received: LCM did not send to {relay.url}: ")

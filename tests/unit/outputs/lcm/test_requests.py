@@ -14,9 +14,9 @@ from gateway.messages.decode import C3D, JSON
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.lcm import requests
 from gateway.outputs.lcm.output import LcmQueries
-from gateway.outputs.lcm.receiving import LcmReceiver
+from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
-from gateway.outputs.lcm.sending import LcmSender
+from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.token_bucket import TokenBucket
 from tests.settable_clock import Clock

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from gateway.errors import OutputError
-from gateway.outputs.lcm import sending
-from gateway.outputs.lcm.sending import CLOSED, NOT_OPEN, LcmThreadSender
+from gateway.outputs.lcm import sender as sender_module
+from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, LcmThreadSender
 from tests.waiting import wait_until
 
 pytestmark = pytest.mark.interpreted
@@ -49,9 +49,9 @@ class FakeLcm:
 @pytest.fixture
 def lcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeLcm]:
     fake = FakeLcm()
-    monkeypatch.setattr(sending, "open_lcm", fake.open)
-    monkeypatch.setattr(sending, "RETRY_S", 0.001)
-    monkeypatch.setattr(sending, "_JOIN_S", 0.01)
+    monkeypatch.setattr(sender_module, "open_lcm", fake.open)
+    monkeypatch.setattr(sender_module, "RETRY_S", 0.001)
+    monkeypatch.setattr(sender_module, "_JOIN_S", 0.01)
     yield fake
     fake.opens.set()
     fake.reads.set()
@@ -60,15 +60,15 @@ def lcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeLcm]:
 @pytest.fixture
 def sender(lcm: FakeLcm, monkeypatch: pytest.MonkeyPatch) -> Iterator[LcmThreadSender]:
     """Return an open sender of a short queue, whose ``close`` waits for the thread as long as it takes."""
-    monkeypatch.setattr(sending, "MAX_QUEUED_MESSAGES", 2)
-    monkeypatch.setattr(sending, "MAX_QUEUED_BYTES", 100)
+    monkeypatch.setattr(sender_module, "MAX_QUEUED_MESSAGES", 2)
+    monkeypatch.setattr(sender_module, "MAX_QUEUED_BYTES", 100)
     sender = LcmThreadSender(URL, lambda: None)
     sender.open()
     wait_until(lambda: not sender.problem)
     yield sender
     lcm.reads.set()
     lcm.error = None
-    monkeypatch.setattr(sending, "_JOIN_S", 10.0)
+    monkeypatch.setattr(sender_module, "_JOIN_S", 10.0)
     sender.close()
 
 
@@ -215,7 +215,7 @@ def test_opening_is_tried_again_until_it_succeeds(lcm: FakeLcm, caplog: pytest.L
 def test_closing_sends_what_is_queued(
     lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(sending, "_JOIN_S", 10.0)
+    monkeypatch.setattr(sender_module, "_JOIN_S", 10.0)
     block(lcm, sender)
     send(sender, b"second", b"third")
     threading.Timer(0.01, lcm.reads.set).start()

@@ -9,9 +9,9 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.outputs.lcm import connection as connection_module
-from gateway.outputs.lcm import sending as sender_module
+from gateway.outputs.lcm import sender as sender_module
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, multicast_problem, open_lcm, send_problem
-from gateway.outputs.lcm.sending import (
+from gateway.outputs.lcm.sender import (
     CLOSED,
     NOT_OPEN,
     RETRY_S,

@@ -1,4 +1,4 @@
-"""Receiving on LCM in threads: requests on channels that are added later, and messages for subscribers.
+"""Receiving on LCM in a thread, on channels that are added while it runs.
 
 The library trusts what it receives (lcm 1.5.3, lcm_udpm.c): a datagram without the NUL behind its channel,
 or a fragment whose place is behind the end of its message, makes it use memory that is not its own, and ends
@@ -6,10 +6,8 @@ the process. Anyone whose datagrams reach this computer can send them. docs/refe
 LCM's packets.
 """
 
-import contextlib
 import ipaddress
 import logging
-import re
 import socket
 import struct
 import threading
@@ -20,21 +18,80 @@ import lcm
 
 from gateway.errors import OutputError
 from gateway.logs.failures import FailureLog
-from gateway.messages.topics import lcm_channel
-from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.lcm.connection import (
     multicast_destination,
     multicast_problem,
     open_lcm,
-    receiving_url,
     reconnect,
     scheme_of,
     send_problem,
 )
-from gateway.outputs.lcm.sending import RETRY_S
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+from gateway.outputs.lcm.sender import RETRY_S
 from gateway.token_bucket import TokenBucket
 from gateway.workers import WorkerThread, thread_starts
+
+_MAGIC: Final = b"LC02"
+"""Begins a datagram with a whole message. Those with fragments of one are ignored."""
+
+NO_CHANNEL: Final = ""
+
+_HEADER_BYTES: Final = 8
+_MAX_DATAGRAM_BYTES: Final = 65_535
+
+
+def split_datagram(datagram: bytes) -> tuple[str, bytes] | None:
+    """Return the channel and the message in a datagram; None if it has no whole message."""
+    if not datagram.startswith(_MAGIC):
+        return None
+    channel, nul, message = datagram[_HEADER_BYTES:].partition(b"\0")
+    return (channel.decode("utf-8", "replace"), message) if nul else None
+
+
+class LcmDatagrams:
+    """Receives on a URL udpm://, and passes the channel and the bytes of each message to ``receive``.
+
+    A datagram that has no whole message counts as an empty message on NO_CHANNEL, because it takes as much
+    time. Raises OutputError if the group cannot be joined.
+    """
+
+    def __init__(self, url: str, receive: Callable[[str, bytes], None]) -> None:
+        self._receive = receive
+        destination = multicast_destination(url)
+        problem = multicast_problem(url) if destination else f"{url} has no multicast address; check lcm.url"
+        if destination is None or problem:
+            raise OutputError(problem, cause="not open")
+        try:
+            self._socket = _joined_socket(*destination)
+        except OSError as error:
+            raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
+
+    def handle_timeout(self, timeout_ms: int) -> None:
+        """Wait for one datagram, as ``lcm.LCM.handle_timeout`` for a message. Raises OSError."""
+        self._socket.settimeout(timeout_ms / 1000)
+        try:
+            datagram = self._socket.recv(_MAX_DATAGRAM_BYTES)
+        except TimeoutError:
+            return
+        self._receive(*(split_datagram(datagram) or (NO_CHANNEL, b"")))
+
+    def close(self) -> None:
+        """Leave the group."""
+        self._socket.close()
+
+
+def _joined_socket(group: str, port: int) -> socket.socket:
+    """Return a socket that receives what is sent to a multicast group. Raises OSError."""
+    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        joined.bind((group, port))
+        membership = struct.pack("=4s4s", ipaddress.IPv4Address(group).packed, bytes(4))
+        joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+    except OSError:
+        joined.close()
+        raise
+    return joined
+
 
 RECEIVED_PER_S: Final = 2000.0
 """How many messages a second are received. LCM or the kernel discards further ones, uncounted."""
@@ -126,7 +183,7 @@ class LcmReceiver:
         if isinstance(connection, LcmDatagrams):
             connection.close()
 
-    def _open(self) -> "lcm.LCM | LcmDatagrams | None":
+    def _open(self) -> lcm.LCM | LcmDatagrams | None:
         """Return what receives requests, with retries; None if ``close`` is called first."""
         while not self._closing.is_set():
             try:
@@ -139,7 +196,7 @@ class LcmReceiver:
             return connection
         return None
 
-    def _try_to_open(self) -> "lcm.LCM | LcmDatagrams":
+    def _try_to_open(self) -> lcm.LCM | LcmDatagrams:
         if scheme_of(self._url) == "udpm":
             return LcmDatagrams(self._url, self._handle)
         connection = open_lcm(self._url)
@@ -172,139 +229,3 @@ class LcmReceiver:
         self._received.take(1 if take else _OTHER_CHANNEL)
         if take:
             take(data)
-
-
-_MAGIC: Final = b"LC02"
-"""Begins a datagram with a whole message. Those with fragments of one are ignored."""
-
-NO_CHANNEL: Final = ""
-
-_HEADER_BYTES: Final = 8
-_MAX_DATAGRAM_BYTES: Final = 65_535
-
-
-def split_datagram(datagram: bytes) -> tuple[str, bytes] | None:
-    """Return the channel and the message in a datagram; None if it has no whole message."""
-    if not datagram.startswith(_MAGIC):
-        return None
-    channel, nul, message = datagram[_HEADER_BYTES:].partition(b"\0")
-    return (channel.decode("utf-8", "replace"), message) if nul else None
-
-
-class LcmDatagrams:
-    """Receives on a URL udpm://, and passes the channel and the bytes of each message to ``receive``.
-
-    A datagram that has no whole message counts as an empty message on NO_CHANNEL, because it takes as much
-    time. Raises OutputError if the group cannot be joined.
-    """
-
-    def __init__(self, url: str, receive: Callable[[str, bytes], None]) -> None:
-        self._receive = receive
-        destination = multicast_destination(url)
-        problem = multicast_problem(url) if destination else f"{url} has no multicast address; check lcm.url"
-        if destination is None or problem:
-            raise OutputError(problem, cause="not open")
-        try:
-            self._socket = _joined_socket(*destination)
-        except OSError as error:
-            raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
-
-    def handle_timeout(self, timeout_ms: int) -> None:
-        """Wait for one datagram, as ``lcm.LCM.handle_timeout`` for a message. Raises OSError."""
-        self._socket.settimeout(timeout_ms / 1000)
-        try:
-            datagram = self._socket.recv(_MAX_DATAGRAM_BYTES)
-        except TimeoutError:
-            return
-        self._receive(*(split_datagram(datagram) or (NO_CHANNEL, b"")))
-
-    def close(self) -> None:
-        """Leave the group."""
-        self._socket.close()
-
-
-def _joined_socket(group: str, port: int) -> socket.socket:
-    """Return a socket that receives what is sent to a multicast group. Raises OSError."""
-    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        joined.bind((group, port))
-        membership = struct.pack("=4s4s", ipaddress.IPv4Address(group).packed, bytes(4))
-        joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-    except OSError:
-        joined.close()
-        raise
-    return joined
-
-
-QUEUE_MESSAGES: Final = 10_000
-"""With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""
-
-
-def channel_pattern(prefix: str, source: str | None, component: str | None) -> str:
-    """Return the regular expression of the channels. None means all sources, or all components.
-
-    The pose of one tool is 6d/LABEL, those of all tools are 6d/*.
-    """
-    takes_all = component is None or component.endswith("/*")
-    path = [] if component is None else component.removesuffix("/*").split("/", 1)
-    if source is not None:
-        channels = re.escape(lcm_channel(prefix, source, *path))
-    elif path:
-        channels = f"{re.escape(prefix)}_.+{re.escape(lcm_channel('', *path))}"
-    else:
-        return f"{re.escape(prefix)}_.+"
-    return f"{channels}_.+" if takes_all else channels
-
-
-class LcmSubscriber:
-    """Subscribes to ``channels``, a regular expression, and receives messages in its own thread."""
-
-    def __init__(self, connection: lcm.LCM, channels: str, receive: Receive) -> None:
-        self._lcm = connection
-        self._subscription = connection.subscribe(channels, receive)
-        self._subscription.set_queue_capacity(QUEUE_MESSAGES)
-        self._is_connected = True
-        self._failures = FailureLog(logger, "lcm")
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._receive, name="lcm-subscriber", daemon=True)
-        self._thread.start()
-
-    def _receive(self) -> None:
-        while not self._stop.is_set():
-            try:
-                self._lcm.handle_timeout(_POLL_MS)
-            except OSError as error:
-                self._is_connected = False
-                self._failures.failed(f"the connection is lost, so no more messages arrive: {error}")
-                self._reconnect()
-
-    def _reconnect(self) -> None:
-        """Connect to the relay again, with retries, until ``close``."""
-        while not self._stop.wait(RETRY_S):
-            with contextlib.suppress(OSError):
-                reconnect(self._lcm, "RECONNECTED")
-                self._is_connected = True
-                self._failures.recovered("connected again")
-                return
-
-    def close(self) -> None:
-        """End the thread and unsubscribe."""
-        self._stop.set()
-        self._thread.join()
-        if self._is_connected:  # LCM would connect again first, and let no other thread run meanwhile
-            self._lcm.unsubscribe(self._subscription)
-
-
-def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
-    """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
-    channels = channel_pattern(request.prefix or DEFAULT_LCM_PREFIX, request.source, request.component)
-    return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)
-
-
-def no_gateway_on_lcm(name: str, url: str) -> str:
-    """Return why nothing may arrive; ``name`` is the prefix or what the channels of the source begin with."""
-    return (
-        f"no gateway found on LCM ({name}, {url}); check that it is running with this prefix and URL, and "
-        "that its ttl reaches this computer"
-    )

@@ -1,0 +1,92 @@
+"""Subscribing to a gateway's messages on LCM, for ``echo``, the demo and tests."""
+
+import contextlib
+import logging
+import re
+import threading
+from typing import Final
+
+import lcm
+
+from gateway.logs.failures import FailureLog
+from gateway.messages.topics import lcm_channel
+from gateway.outputs.kind import Receive, SubscriptionRequest
+from gateway.outputs.lcm.connection import open_lcm, receiving_url, reconnect
+from gateway.outputs.lcm.sender import RETRY_S
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+
+QUEUE_MESSAGES: Final = 10_000
+"""With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""
+
+_POLL_MS: Final = 100
+
+logger = logging.getLogger(__name__)
+
+
+def channel_pattern(prefix: str, source: str | None, component: str | None) -> str:
+    """Return the regular expression of the channels. None means all sources, or all components.
+
+    The pose of one tool is 6d/LABEL, those of all tools are 6d/*.
+    """
+    takes_all = component is None or component.endswith("/*")
+    path = [] if component is None else component.removesuffix("/*").split("/", 1)
+    if source is not None:
+        channels = re.escape(lcm_channel(prefix, source, *path))
+    elif path:
+        channels = f"{re.escape(prefix)}_.+{re.escape(lcm_channel('', *path))}"
+    else:
+        return f"{re.escape(prefix)}_.+"
+    return f"{channels}_.+" if takes_all else channels
+
+
+class LcmSubscriber:
+    """Subscribes to ``channels``, a regular expression, and receives messages in its own thread."""
+
+    def __init__(self, connection: lcm.LCM, channels: str, receive: Receive) -> None:
+        self._lcm = connection
+        self._subscription = connection.subscribe(channels, receive)
+        self._subscription.set_queue_capacity(QUEUE_MESSAGES)
+        self._is_connected = True
+        self._failures = FailureLog(logger, "lcm")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._receive, name="lcm-subscriber", daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._lcm.handle_timeout(_POLL_MS)
+            except OSError as error:
+                self._is_connected = False
+                self._failures.failed(f"the connection is lost, so no more messages arrive: {error}")
+                self._reconnect()
+
+    def _reconnect(self) -> None:
+        """Connect to the relay again, with retries, until ``close``."""
+        while not self._stop.wait(RETRY_S):
+            with contextlib.suppress(OSError):
+                reconnect(self._lcm, "RECONNECTED")
+                self._is_connected = True
+                self._failures.recovered("connected again")
+                return
+
+    def close(self) -> None:
+        """End the thread and unsubscribe."""
+        self._stop.set()
+        self._thread.join()
+        if self._is_connected:  # LCM would connect again first, and let no other thread run meanwhile
+            self._lcm.unsubscribe(self._subscription)
+
+
+def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
+    """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
+    channels = channel_pattern(request.prefix or DEFAULT_LCM_PREFIX, request.source, request.component)
+    return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)
+
+
+def no_gateway_on_lcm(name: str, url: str) -> str:
+    """Return why nothing may arrive; ``name`` is the prefix or what the channels of the source begin with."""
+    return (
+        f"no gateway found on LCM ({name}, {url}); check that it is running with this prefix and URL, and "
+        "that its ttl reaches this computer"
+    )
