@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import functools
 import os
 import sys
 import threading
@@ -48,46 +49,91 @@ thread_starts: Final = ThreadStarts()
 """The threads of this process start here, so that its health can say when one could not."""
 
 
+MAX_CALLS: Final = 4096
+MAX_BYTES: Final = 64 * 1024 * 1024
+"""How many calls that may be given up wait for a thread, and how many bytes they hold."""
+
+
+class QueueRoom:
+    """The room of a queue, which has room for a call of any size when it is empty.
+
+    The owner's lock protects it.
+    """
+
+    def __init__(self, max_calls: int = MAX_CALLS, max_bytes: int = MAX_BYTES) -> None:
+        self.num_calls = 0
+        """How many calls are in the queue."""
+        self._num_bytes = 0  # that they hold
+        self._max_calls = max_calls
+        self._max_bytes = max_bytes
+
+    def take(self, num_bytes: int) -> bool:
+        """Take room for a call that holds ``num_bytes``; return False if there is not enough."""
+        is_full = self.num_calls >= self._max_calls or self._num_bytes + num_bytes > self._max_bytes
+        if is_full and self.num_calls:
+            return False
+        self.num_calls += 1
+        self._num_bytes += num_bytes
+        return True
+
+    def free(self, num_bytes: int) -> None:
+        """Free the room of a call."""
+        self.num_calls -= 1
+        self._num_bytes -= num_bytes
+
+
 class WorkerThread:
     """Makes calls one after the other in its own thread, which exists only while there are calls.
 
+    Two queues: calls that must be made (``submit``, ``run``) go first, and their callers bound them. Calls
+    that may be given up (``offer``) are refused while too many wait, or too many bytes.
+
     A concurrent.futures.ThreadPoolExecutor does not fit: Python waits for its threads at exit, so a disk that
-    does not respond would delay the end of the gateway. The queue is not bounded: the caller has to know how
-    much it submits.
+    does not respond, or a peer that does not read, would delay the end of the gateway.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, max_calls: int = MAX_CALLS, max_bytes: int = MAX_BYTES) -> None:
         self._name = name
+        self._changed = threading.Condition()  # of everything below
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
-        self._changed = threading.Condition()
+        self._offered: deque[tuple[int, Callable[[], None]]] = deque()
+        self._room = QueueRoom(max_calls, max_bytes)
         self._is_running = False
+        self._is_closed = False
         self._began_s: float | None = None  # the present call, on the monotonic clock
 
     def submit(self, call: Callable[[], _Result]) -> Future[_Result]:
         """Queue ``call``; the returned future has its result or exception. It can be cancelled before.
 
-        The exception is an OSError if no thread can be started.
+        The exception is an OSError if no thread can be started. After ``close``, the future is cancelled.
         """
         done: Future[_Result] = Future()
         with self._changed:
+            if self._is_closed:
+                done.cancel()
+                return done
             self._calls.append((done, call))
-            if self._is_running:
-                self._changed.notify()
-            else:
-                self._start()
+            problem = self._wake()
+            if problem is not None:
+                self._calls.pop()
+                done.set_exception(OSError(errno.EAGAIN, str(problem)))
         return done
-
-    def _start(self) -> None:
-        try:
-            thread_starts.start(threading.Thread(target=self._run, name=self._name, daemon=True))
-            self._is_running = True
-        except RuntimeError as error:
-            done, _ = self._calls.pop()
-            done.set_exception(OSError(errno.EAGAIN, str(error)))
 
     async def run(self, call: Callable[[], _Result]) -> _Result:
         """Return the result of ``call``, or raise its exception."""
         return await asyncio.wrap_future(self.submit(call))
+
+    def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
+        """Queue ``call``, which holds ``num_bytes``; return False if there is no room, or after ``close``.
+
+        ``call`` must not raise. If no thread can be started, it waits for the next call to start one.
+        """
+        with self._changed:
+            if self._is_closed or not self._room.take(num_bytes):
+                return False
+            self._offered.append((num_bytes, call))
+            self._wake()
+        return True
 
     @property
     def call_age_s(self) -> float:
@@ -95,18 +141,82 @@ class WorkerThread:
         began_s = self._began_s
         return 0.0 if began_s is None else time.monotonic() - began_s
 
+    def close(self, last: Callable[[], None] = lambda: None) -> None:
+        """Make no further calls but ``last``; a call in progress continues."""
+        with self._changed:
+            if self._is_closed:
+                return
+            self._is_closed = True
+            dropped = self._calls.copy(), self._offered.copy()
+            self._calls.clear()
+            self._offered.clear()
+            # What the others hold is freed in the thread, because to free a query of Zenoh can block.
+            self._calls.append((Future(), functools.partial(_end, last, *dropped)))
+            self._wake()
+
+    def finish(self, timeout_s: float) -> bool:
+        """Make the calls that wait, and no others. Those that take longer than ``timeout_s`` are dropped.
+
+        Returns whether all were made.
+        """
+        with self._changed:
+            self._is_closed = True
+            if self._calls or self._offered or self._is_running:
+                self._wake()
+            if self._changed.wait_for(lambda: not self._is_running, timeout_s):
+                return True
+            for done, _ in self._calls:
+                done.cancel()
+            self._calls.clear()
+            self._offered.clear()
+        return False
+
+    def _wake(self) -> RuntimeError | None:
+        """Let the thread see that something has changed; return why it cannot be started."""
+        if not self._is_running:
+            try:
+                thread_starts.start(threading.Thread(target=self._run, name=self._name, daemon=True))
+            except RuntimeError as problem:
+                return problem
+            self._is_running = True
+        self._changed.notify_all()
+        return None
+
+    # In the thread.
+
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: bool(self._calls), _IDLE_S)
-                if not self._calls:
-                    self._is_running = False
-                    return
-                done, call = self._calls.popleft()
+        while (call := self._next()) is not None:
             self._began_s = time.monotonic()
-            make_call(done, call)
+            call()
             self._began_s = None
-            del done, call  # or they would stay in memory until the next call
+            del call  # or what it holds would stay in memory until the next call
+
+    def _next(self) -> Callable[[], None] | None:
+        """Wait for the next call; None if there is none, so that the thread ends."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._calls or self._offered or self._is_closed, _IDLE_S)
+            if self._calls:
+                return functools.partial(make_call, *self._calls.popleft())
+            if self._offered:
+                num_bytes, offered = self._offered.popleft()
+                self._room.free(num_bytes)
+                return offered
+            self._is_running = False
+            self._changed.notify_all()
+            return None
+
+
+def _end(
+    last: Callable[[], None],
+    calls: deque[tuple[Future[Any], Callable[[], Any]]],
+    offered: deque[tuple[int, Callable[[], None]]],
+) -> None:
+    """Make the last call of a thread, and drop those that waited."""
+    last()
+    for done, _ in calls:
+        done.cancel()
+    calls.clear()
+    offered.clear()
 
 
 async def result_of(call: Future[_Result]) -> _Result:

@@ -57,7 +57,7 @@ def record(
     described = details.checked()
     from gateway.cli.record_output import RecordProgress, print_summary
     from gateway.client.client import GatewayClient
-    from gateway.client.lcm_subscriber import START_S
+    from gateway.client.lcm_transport import START_S
     from gateway.client.transport import close_in_time
     from gateway.takes.recorder import FileWriter, TakeRecording, Target
 

@@ -16,8 +16,8 @@
 - ``transport`` is what ``zenoh_transport`` and ``lcm_transport`` have in common: they find sources, ask
   until there is a reply, and subscribe.
 - ``found_sources`` reads what gateways report about their sources; ``take_transfer`` copies takes.
-- ``zenoh_subscriber`` and ``lcm_subscriber`` sort what arrives by source and key, for a ``reception``, which
-  keeps it in bounds. ``series`` counts what is missing.
+- A subscriber sorts what arrives by source and key, for a ``reception``, which keeps it in bounds.
+  ``series`` counts it, and what is missing.
 """
 
 from typing import TYPE_CHECKING, Any

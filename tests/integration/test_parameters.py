@@ -13,7 +13,7 @@ import zenoh
 import zenoh.ext
 
 from gateway.messages.decode import decode, prefix_of
-from gateway.outputs.lcm import queries as lcm_parameters
+from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.service.gateway import Gateway

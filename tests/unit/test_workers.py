@@ -5,13 +5,30 @@ import gc
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from gateway.workers import WorkerThread, module_environment, result_of
+from gateway.workers import MAX_BYTES, MAX_CALLS, QueueRoom, WorkerThread, module_environment, result_of
 from tests.waiting import wait_until_async
+
+
+@pytest.fixture
+def blocked() -> Iterator[tuple[WorkerThread, threading.Event]]:
+    """A thread that waits for the event."""
+    worker, go, began = WorkerThread("blocked"), threading.Event(), threading.Event()
+
+    def wait() -> None:
+        began.set()
+        go.wait(10)
+
+    worker.submit(wait)
+    assert began.wait(10)
+    yield worker, go
+    go.set()
+    worker.close()
 
 
 async def test_calls_are_made_in_their_order_in_another_thread() -> None:
@@ -48,6 +65,83 @@ async def test_the_age_of_a_call_is_that_of_the_one_in_progress() -> None:
     await wait_until_async(lambda: worker.call_age_s == 0)
 
 
+def test_a_call_that_is_cancelled_before_its_turn_is_not_made(
+    blocked: tuple[WorkerThread, threading.Event],
+) -> None:
+    worker, go = blocked
+    made: list[str] = []
+    cancelled = worker.submit(lambda: made.append("cancelled"))
+    last = worker.submit(lambda: made.append("last"))
+    cancelled.cancel()
+    go.set()
+    last.result(10)
+    assert made == ["last"]
+
+
+def test_offered_calls_are_made_in_order_after_those_that_must_be_made(
+    blocked: tuple[WorkerThread, threading.Event],
+) -> None:
+    worker, go = blocked
+    made: list[str] = []
+    assert worker.offer(lambda: made.append("offered"))
+    assert worker.offer(lambda: made.append("later"))
+    worker.submit(lambda: made.append("submitted"))
+    go.set()
+    assert worker.finish(10)
+    assert made == ["submitted", "offered", "later"]
+
+
+def test_offered_calls_are_bounded_and_leave_room_when_they_are_made(
+    blocked: tuple[WorkerThread, threading.Event],
+) -> None:
+    """A peer that does not read must not fill the memory."""
+    worker, go = blocked
+    assert worker.offer(lambda: None, MAX_BYTES + 1)  # a call of any size, alone
+    assert not worker.offer(lambda: None)
+    worker.submit(lambda: None)  # never refused
+    go.set()
+    made = threading.Event()
+    worker.submit(made.set).result(10)
+    while not worker.offer(lambda: None, MAX_BYTES):  # until the large one is made
+        worker.submit(lambda: None).result(10)
+
+
+def test_a_queue_has_room_for_some_calls_and_bytes() -> None:
+    room = QueueRoom()
+    assert [room.take(0) for _ in range(MAX_CALLS + 1)] == [True] * MAX_CALLS + [False]
+    room.free(0)
+    assert not room.take(MAX_BYTES + 1)
+    assert room.take(MAX_BYTES)
+
+
+def test_after_close_only_the_last_call_is_begun(blocked: tuple[WorkerThread, threading.Event]) -> None:
+    """Nobody waits for ever for a call that was still queued, or came later."""
+    worker, go = blocked
+    made: list[str] = []
+    ended = threading.Event()
+    queued = worker.submit(lambda: made.append("queued"))
+    worker.offer(lambda: made.append("offered"))
+    worker.close(lambda: made.append("last"))
+    worker.close(ended.set)
+    later = worker.submit(lambda: made.append("later"))
+    assert not worker.offer(lambda: made.append("refused"))
+    go.set()
+    assert worker.finish(10)
+    assert (made, queued.cancelled(), later.cancelled()) == (["last"], True, True)
+    assert not ended.is_set()
+
+
+def test_what_takes_too_long_at_the_end_is_dropped(blocked: tuple[WorkerThread, threading.Event]) -> None:
+    worker, go = blocked
+    made: list[str] = []
+    queued = worker.submit(lambda: made.append("queued"))
+    worker.offer(lambda: made.append("offered"))
+    assert not worker.finish(0)
+    go.set()
+    assert worker.finish(10)
+    assert (made, queued.cancelled(), worker.submit(lambda: None).cancelled()) == ([], True, True)
+
+
 @pytest.mark.parametrize("gives_up", [True, False])
 async def test_an_error_after_the_caller_has_given_up_is_no_defect(gives_up: bool) -> None:
     released = threading.Event()
@@ -73,6 +167,7 @@ async def test_an_error_after_the_caller_has_given_up_is_no_defect(gives_up: boo
 
 
 async def test_an_idle_thread_ends_and_the_next_call_starts_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of outputs and sources have a thread each, which most of them need once."""
     monkeypatch.setattr("gateway.workers._IDLE_S", 0.0)
     worker = WorkerThread("test")
     first = await worker.run(threading.current_thread)

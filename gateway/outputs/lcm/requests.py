@@ -19,11 +19,12 @@ from gateway.logs.failures import log_fields
 from gateway.logs.losses import Losses
 from gateway.logs.safe_text import quoted
 from gateway.messages.decode import JSON
+from gateway.messages.texts import xml_text
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.query_admission import QueryAdmission, QueryDefects, QueryLimits, Refusal
-from gateway.outputs.threads import SendThread
+from gateway.workers import WorkerThread
 
 MAX_PENDING: Final = 64
 """The maximum number of requests in progress. Further ones are dropped and counted."""
@@ -71,7 +72,7 @@ class LcmRequests:
         loop: asyncio.AbstractEventLoop,
         kinds: Sequence[RequestKind],
         send: Callable[[str, bytes], None],
-        long_sender: SendThread,
+        long_sender: WorkerThread,
     ) -> None:
         self._prefix = settings.prefix
         self._service = service
@@ -222,6 +223,21 @@ def _decoded(kind: RequestKind, data: bytes) -> Any | None:
     except Exception:  # noqa: BLE001 - lcm-gen's decoders raise anything
         return None
     return request if len(request.requester.encode()) <= MAX_REQUESTER_BYTES else None
+
+
+def parameter_requests(service: QueryService) -> RequestKind:
+    """Return the requests for parameters, which ``service`` answers."""
+
+    async def answer(source: str, request: Any) -> ReplyContent:
+        parameters = await service.parameters(source, request.sections, fresh=request.fresh)
+
+        def fill(reply: Any) -> None:
+            reply.xml, reply.age_s = xml_text(parameters.xml), parameters.age_s
+            reply.parameters_version = parameters.version
+
+        return ReplyContent(len(parameters.xml), fill)
+
+    return RequestKind("PARAMETERS", rtc3d.parameters_request_t, rtc3d.parameters_reply_t, answer)
 
 
 MAX_REMEMBERED: Final = 64

@@ -1,16 +1,26 @@
-"""Sending on LCM from the event loop."""
+"""Sending on LCM: from the event loop, or from a thread for the schemes that block (tcpq and file)."""
 
+import functools
 import logging
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, Final
 
 import lcm
 
 from gateway.errors import OutputError
 from gateway.logs.failures import HOLD_S, FailureLog
-from gateway.outputs.lcm.connection import open_lcm_to_send, send_problem
+from gateway.outputs.lcm.connection import (
+    BLOCKING_SCHEMES,
+    open_lcm,
+    open_lcm_to_send,
+    scheme_of,
+    send_problem,
+)
+from gateway.workers import WorkerThread
 
 _NEVER: Final = float("inf")
 RETRY_S: Final = 1.0
@@ -19,7 +29,22 @@ RETRY_S: Final = 1.0
 NOT_OPEN: Final = "LCM is not open; start the output first"
 CLOSED: Final = "LCM is closed; start the gateway again"
 
+MAX_QUEUED_BYTES: Final = 8 * 1024 * 1024
+MAX_QUEUED_MESSAGES: Final = 10_000
+"""The limits of the queue of the thread. Further messages are dropped and counted as "queue full"."""
+
+_JOIN_S: Final = 0.5
+
 logger = logging.getLogger(__name__)
+
+
+def new_sender(
+    url: str, shared: lcm.LCM | None, on_open: Callable[[], None], what: str = "messages"
+) -> "LcmSender | LcmThreadSender":
+    """Return the sender for the scheme of ``url``, not yet open. Blocking schemes do not use ``shared``."""
+    if scheme_of(url) in BLOCKING_SCHEMES:
+        return LcmThreadSender(url, on_open, what)
+    return LcmSender(url, shared, on_open, what)
 
 
 class LcmSender:
@@ -84,6 +109,127 @@ class LcmSender:
         self.problem = CLOSED
         self._retry_at_s = _NEVER
         return Counter()
+
+
+class LcmThreadSender:
+    """Opens LCM and publishes in a thread, from a bounded queue. It has the methods of LcmSender.
+
+    A peer that accepts the connection but never reads blocks only this thread. After a failure, the thread
+    sends the same message again, and ``send`` refuses new messages meanwhile. ``on_open`` is called in the
+    thread after LCM has opened. ``what`` names the messages in the log.
+    """
+
+    def __init__(self, url: str, on_open: Callable[[], None], what: str = "messages") -> None:
+        self._url = url
+        self._what = what
+        self._on_open = on_open
+        self._problem = NOT_OPEN
+        self._is_open = False
+        self._full = f"{url} does not take messages fast enough; check the peer of lcm.url"
+        self._is_full = False  # the queue, when the last message came
+        self._lcm: lcm.LCM
+        self._worker = WorkerThread("lcm-send", MAX_QUEUED_MESSAGES, MAX_QUEUED_BYTES)
+        self._opened: Future[None] | None = None
+        self._lock = threading.Lock()  # of the next two, and of what ``close`` sets last
+        self._waiting: Counter[str] = Counter()  # messages that LCM has not accepted yet, by source
+        self._closing = threading.Event()
+        self._has_given_up = False
+        self._opening = FailureLog(logger, "lcm")
+        self._sending = FailureLog(logger, "lcm", HOLD_S)
+        self._queueing = FailureLog(logger, "lcm", HOLD_S)
+
+    @property
+    def problem(self) -> str:
+        """Why nothing can be sent now, and what to do; "" if it can."""
+        return self._problem or (self._full if self._is_full else "")
+
+    def open(self) -> None:
+        """Start the thread, which opens LCM and retries until it succeeds or ``close`` is called."""
+        self._problem = f"LCM has not opened {self._url} yet; check lcm.url"
+        self._opened = self._worker.submit(self._open)
+
+    def send(self, channel: str, message: bytes, source: str = "") -> None:
+        """Queue a message about ``source``.
+
+        Raises OutputError if LCM is not open, sending fails or the queue is full.
+        """
+        if not self._is_open:
+            raise OutputError(self._problem, cause="not open")
+        if problem := self._problem:
+            raise OutputError(problem, cause="send failed")
+        self._count_waiting(source, 1)
+        publish = functools.partial(self._publish, channel, message, source)
+        self._is_full = not self._worker.offer(publish, len(message))
+        if self._is_full:
+            self._count_waiting(source, -1)
+            self._queueing.failed(self._full)
+            raise OutputError(self._full, cause="queue full")
+        self._queueing.recovered("the peer reads again")
+
+    def _count_waiting(self, source: str, number: int) -> None:
+        with self._lock:
+            self._waiting[source] += number
+
+    def maintain(self) -> None:
+        """Open LCM again if no thread could be started; otherwise, the thread retries by itself."""
+        opened = self._opened
+        if opened is not None and opened.done() and not opened.cancelled() and opened.exception() is not None:
+            self.open()
+
+    def close(self) -> Counter[str]:
+        """Send the queued messages and end the thread. If a peer blocks it, wait only for _JOIN_S.
+
+        Returns how many messages about each source were not sent.
+        """
+        with self._lock:
+            self._is_open = False  # send() now raises
+            self._closing.set()
+        self._worker.finish(_JOIN_S)
+        with self._lock:
+            self._problem = CLOSED
+            return +self._waiting
+
+    # In the thread.
+
+    def _open(self) -> None:
+        """Open LCM, with retries until ``close`` is called."""
+        while not self._closing.is_set():
+            try:
+                self._lcm = open_lcm(self._url)
+            except OutputError as error:
+                self._set_problem(str(error))
+                self._opening.failed(str(error))
+                self._closing.wait(RETRY_S)
+                continue
+            with self._lock:
+                if self._closing.is_set():
+                    return
+                self._problem = ""
+                self._is_open = True
+            self._opening.succeeded(f"sending {self._what} to {self._url}")
+            self._on_open()
+            return
+
+    def _publish(self, channel: str, message: bytes, source: str) -> None:
+        """Publish a message, with retries; give up when that fails after ``close`` was called."""
+        while not self._has_given_up:
+            try:
+                self._lcm.publish(channel, message)
+            except OSError as error:
+                problem = send_problem(self._url, error)
+                self._set_problem(problem)
+                self._sending.failed(problem)
+                self._has_given_up = self._closing.wait(RETRY_S)
+            else:
+                self._count_waiting(source, -1)
+                self._set_problem("")
+                self._sending.recovered(f"sending {self._what} to {self._url}")
+                return
+
+    def _set_problem(self, problem: str) -> None:
+        with self._lock:
+            if not self._closing.is_set():  # close() sets the last one
+                self._problem = problem
 
 
 class LcmPublisher:

@@ -28,7 +28,8 @@ from gateway.outputs.lsl.publisher import LslFramePublisher, SuspendedTime
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.source_streams import SourceStreams
 from gateway.outputs.lsl.supervisor import LslProcesses
-from gateway.outputs.threads import SendThread, in_this_loop
+from gateway.outputs.threads import in_this_loop
+from gateway.workers import WorkerThread
 
 MIN_PAUSE_S: Final = 0.005
 """The thread that sends pauses at least so long, so that frames at a high rate are sent several at a time."""
@@ -56,7 +57,7 @@ class LslOutput(Output):
             )
         self._settings = settings
         self._processes = LslProcesses(settings, self._wanted_changed)
-        self._thread = SendThread("lsl-send")
+        self._thread = WorkerThread("lsl-send")
         self._numbers = itertools.count(1)
         self._computer = socket.gethostname()
         self._publishers: dict[str, LslFramePublisher] = {}  # by source

@@ -27,9 +27,10 @@ from gateway.outputs.ros2.messages import DIAGNOSTIC_ARRAY, TF_MESSAGE
 from gateway.outputs.ros2.settings import MAX_PART_CHARS, Ros2Settings, ros_name
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosNode, RosTopic
-from gateway.outputs.threads import SendThread, in_this_loop
+from gateway.outputs.threads import in_this_loop
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
+from gateway.workers import WorkerThread
 
 REMEDY: Final = "start it with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or correct ros2.connect"
 
@@ -89,7 +90,7 @@ class Ros2Output(Output):
     def __init__(self, settings: Ros2Settings) -> None:
         self.settings = settings
         self._router = router_session(settings.connect, self._declare_in_thread)
-        self._sender: SendThread | None = None  # from start to close
+        self._sender: WorkerThread | None = None  # from start to close
         self._tf = RosTopic("/tf", TF_MESSAGE, self._on_tf_wanted)
         self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
         self._node: RosNode | None = None  # only in the sending thread
@@ -99,7 +100,7 @@ class Ros2Output(Output):
 
     def start(self) -> None:
         """Start the thread that sends, and the one that opens the session."""
-        self._sender = SendThread("ros2-send")
+        self._sender = WorkerThread("ros2-send")
         self._router.start()
 
     def _declare_in_thread(self, session: zenoh.Session) -> None:

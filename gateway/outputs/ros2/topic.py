@@ -7,14 +7,15 @@ and publishers visible: ``ros2 topic list`` shows what they say. ROS drops a mes
 import logging
 import struct
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import xxhash
 import zenoh
 
 from gateway.outputs.ros2.messages import RosType
 from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
+from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.session import declare_publisher, has_subscribers
 
 _ADMIN_SPACE: Final = "@ros2_lv"
 _NODE: Final = "NN"
@@ -154,16 +155,13 @@ class RosNode:
         """Declare the publisher of a topic. ``on_matching`` is called in one of Zenoh's threads."""
         settings = self._settings
         type_hash = topic.type.hash_in(settings.distribution)
-        publisher = self._session.declare_publisher(
+        publisher = declare_publisher(
+            self._session,
             data_key(settings.domain_id, topic.name, topic.type, type_hash),
+            on_matching,
             congestion_control=zenoh.CongestionControl.DROP,
             reliability=zenoh.Reliability.RELIABLE if self._is_reliable else zenoh.Reliability.BEST_EFFORT,
         )
-
-        def on_status(status: zenoh.MatchingStatus) -> None:
-            on_matching(status.matching)
-
-        publisher.declare_matching_listener(in_zenoh_thread(on_status))
         self._last_entity_id += 1
         qos = QoS(self._is_reliable, settings.depth)
         token = self._node.publisher_token(self._last_entity_id, topic.name, topic.type, type_hash, qos)
@@ -214,9 +212,7 @@ class RosTopic:
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""
         if self._declared is not None:
-            # Zenoh's type stub says that matching_status is a bool, but it is a MatchingStatus.
-            status: Any = self._declared.publisher.matching_status
-            self._on_matching(status.matching)
+            self._on_matching(has_subscribers(self._declared.publisher))
 
     def put(self, cdr: bytes, now_ns: int) -> None:
         """Publish a message. Nobody gets it if the topic is not declared."""

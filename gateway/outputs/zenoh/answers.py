@@ -31,7 +31,7 @@ from gateway.messages.decode import TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, KeyPath, QueryService
 from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, Refusal
-from gateway.outputs.threads import SendThread
+from gateway.workers import WorkerThread
 
 MAX_PENDING: Final = 4096
 """The maximum number of queries in progress. Further ones get the error busy."""
@@ -96,7 +96,7 @@ class ZenohAnswers:
         service: QueryService,
         loop: asyncio.AbstractEventLoop,
         admission: QueryAdmission,
-        sender: SendThread,
+        sender: WorkerThread,
         losses: defaultdict[str, Losses],
     ) -> None:
         self._prefix = prefix
@@ -104,7 +104,7 @@ class ZenohAnswers:
         self._loop = loop
         self._admission = admission
         self._sender = sender
-        self._long_sender = SendThread("zenoh-send-long")
+        self._long_sender = WorkerThread("zenoh-send-long")
         self._losses = losses
         self._lock = threading.Lock()  # of the next three, shared with Zenoh's threads
         self._open: dict[tuple[str, str, Options], _Question] = {}

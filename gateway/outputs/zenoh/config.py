@@ -4,9 +4,9 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import zenoh
 
@@ -66,21 +66,9 @@ link at a time.
 """
 
 
-_Event = TypeVar("_Event")
-
-
 def prepare_threads() -> None:
     """Let Zenoh have _THREADS, unless the environment says otherwise. Call it before the first session."""
     os.environ.setdefault("ZENOH_RUNTIME", _THREADS)
-
-
-def in_zenoh_thread(callback: Callable[[_Event], object]) -> "zenoh.handlers.Callback[_Event]":
-    """Return a handler that calls ``callback`` in one of Zenoh's own threads, so it must not block.
-
-    A plain function gets one more thread for each declaration: 256 tools had 572 threads, and 50 sources 50
-    more than one.
-    """
-    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:

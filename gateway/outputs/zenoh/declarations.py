@@ -19,10 +19,11 @@ from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, QueryService, ServerParameters
 from gateway.outputs.query_admission import QueryAdmission, QueryLimits
-from gateway.outputs.threads import SendThread
 from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
-from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
+from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.session import declare_publisher, in_zenoh_thread
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.workers import WorkerThread
 
 # Parameters must arrive, even if that takes longer, and messages of streams have priority.
 _RELIABLE: Final = zenoh.CongestionControl.BLOCK
@@ -73,7 +74,7 @@ class SourceDeclarations:
         self._due: set[str] = set()  # sources whose parameters will be published for a new subscriber
         self._published_s: dict[str, float] = {}  # when that was done last
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
-        self._sender = SendThread("zenoh-send")
+        self._sender = WorkerThread("zenoh-send")
         self._admission = QueryAdmission(
             QueryLimits(
                 output="zenoh",
@@ -129,16 +130,18 @@ class SourceDeclarations:
         def on_query(query: zenoh.Query) -> None:
             self._answers.receive(source, query)
 
-        def on_matching(status: zenoh.MatchingStatus) -> None:
-            if status.matching:
+        def on_matching(is_matched: bool) -> None:
+            if is_matched:
                 self._call_in_loop(self._publish_soon, source)
 
         queryable = session.declare_queryable(f"{key}/**", in_zenoh_thread(on_query))
         parameters = f"{key}/parameters"
-        publisher = session.declare_publisher(
-            parameters, encoding=XML, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
+        publisher = declare_publisher(
+            *(session, parameters, on_matching),
+            encoding=XML,
+            congestion_control=_RELIABLE,
+            priority=_LOW_PRIORITY,
         )
-        publisher.declare_matching_listener(in_zenoh_thread(on_matching))
 
         # A late AdvancedSubscriber finds this token and asks this key for what it has missed, as it does with
         # an AdvancedPublisher of Zenoh. The answer counts against the limits of queries; one from the cache
@@ -207,7 +210,7 @@ class SourceDeclarations:
             if self._is_closed or source not in self._declared or source not in self._parameters:
                 return None
             sent = self._unsent.get(source)
-            if sent is None:
+            if sent is None or sent.done():  # no thread could be started
                 sent = self._sender.submit(functools.partial(self._put_parameters, source))
                 self._unsent[source] = sent
             return sent

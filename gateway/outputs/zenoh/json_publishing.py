@@ -11,6 +11,7 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, Final
 
 import zenoh
@@ -21,11 +22,12 @@ from gateway.messages.decode import JSON, MAX_JSON_SOURCE_BYTES, decode, json_te
 from gateway.messages.topics import JSON_NAME, Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.threads import SendThread
-from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
+from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.session import declare_publisher, has_subscribers, undeclare
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.token_bucket import TokenBucket
+from gateway.workers import QueueRoom, WorkerThread
 
 MAX_DESCRIPTION_CHARACTERS: Final = 256 * 1024
 """Longer lists of labels and units are left out: they come from the server, and are in every text."""
@@ -57,7 +59,8 @@ class JsonConverter:
         self._lock = threading.Lock()
         self._waiting: defaultdict[str, _Waiting] = defaultdict(_Waiting)  # by the source's name
         self._used_s = 0.0  # what the source had used that was served last
-        self._thread: SendThread | None = None
+        self._thread = WorkerThread("zenoh-json")
+        self._converting: Future[None] | None = None  # the call of the thread that converts what waits
         self._closing = threading.Event()
 
     def publisher(self, topic: Topic, key: str, on_wanted: Callable[[], None]) -> "JsonPublisher | None":
@@ -86,48 +89,44 @@ class JsonConverter:
         self._losses[source].lost(cause, text, frames=0)
 
     def offer(self, source: str, convert: Callable[[], None], num_bytes: int) -> bool:
-        """Have the thread make a call, which holds ``num_bytes``; return False if too many wait.
-
-        A call of any size finds a place if the source has none waiting.
-        """
+        """Have the thread make a call, which holds ``num_bytes``; return False if too many wait."""
         with self._lock:
             waiting = self._waiting[source]
             if self._closing.is_set():
                 return True  # a message more or less
-            if waiting.calls and (
-                len(waiting.calls) >= _MAX_WAITING or waiting.num_bytes + num_bytes > _MAX_WAITING_BYTES
-            ):
+            if not waiting.room.take(num_bytes):
                 return False
             if not waiting.calls:
                 # What it did not use while nothing waited does not let it use more now.
                 waiting.used_s = max(waiting.used_s, self._used_s)
             waiting.calls.append((convert, num_bytes))
-            waiting.num_bytes += num_bytes
-            if self._thread is None:
-                self._thread = SendThread("zenoh-json")
-        self._thread.submit(self._convert_next)
+            if self._converting is None or self._converting.done():  # done: no thread could be started
+                self._converting = self._thread.submit(self._convert_waiting)
         return True
 
-    def _convert_next(self) -> None:
-        """Make the next call of the source that has used the least time."""
-        with self._lock:
-            all_waiting = [each for each in self._waiting.values() if each.calls]
-            waiting = min(all_waiting, key=lambda each: each.used_s)
-            convert, num_bytes = waiting.calls.popleft()
-            waiting.num_bytes -= num_bytes
-            self._used_s = waiting.used_s
-        began_s = time.monotonic()
-        convert()
-        duration_s = time.monotonic() - began_s
-        waiting.used_s += duration_s
-        self._closing.wait(_REST * duration_s)
+    def _convert_waiting(self) -> None:
+        """Make the calls that wait, each time one of the source that has used the least time."""
+        while not self._closing.is_set():
+            with self._lock:
+                all_waiting = [each for each in self._waiting.values() if each.calls]
+                if not all_waiting:
+                    self._converting = None
+                    return
+                waiting = min(all_waiting, key=lambda each: each.used_s)
+                convert, num_bytes = waiting.calls.popleft()
+                waiting.room.free(num_bytes)
+                self._used_s = waiting.used_s
+            began_s = time.monotonic()
+            convert()
+            duration_s = time.monotonic() - began_s
+            waiting.used_s += duration_s
+            self._closing.wait(_REST * duration_s)
 
     def close(self) -> None:
         """End the thread."""
         with self._lock:
             self._closing.set()
-            if self._thread is not None:
-                self._thread.close()
+        self._thread.close()
 
 
 class _Waiting:
@@ -135,7 +134,7 @@ class _Waiting:
 
     def __init__(self) -> None:
         self.calls: deque[tuple[Callable[[], None], int]] = deque()
-        self.num_bytes = 0
+        self.room = QueueRoom(_MAX_WAITING, _MAX_WAITING_BYTES)
         self.used_s = 0.0
 
 
@@ -187,20 +186,17 @@ class JsonPublisher:
 
     def declare(self, session: zenoh.Session) -> None:
         """Declare the publisher on an open session."""
-        publisher = session.declare_publisher(
-            self._key, encoding=JSON, congestion_control=zenoh.CongestionControl.DROP
+        self._publisher = declare_publisher(
+            *(session, self._key, self._set_wanted),
+            encoding=JSON,
+            congestion_control=zenoh.CongestionControl.DROP,
         )
-        publisher.declare_matching_listener(in_zenoh_thread(self._on_matching))
-        self._publisher = publisher
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""
-        publisher: Any = self._publisher  # its type stub is wrong: see ZenohPublisher
+        publisher = self._publisher
         if publisher is not None:
-            self._set_wanted(publisher.matching_status.matching)
-
-    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
-        self._set_wanted(status.matching)
+            self._set_wanted(has_subscribers(publisher))
 
     def _set_wanted(self, wanted: bool) -> None:
         self.wanted = wanted
@@ -287,11 +283,7 @@ class JsonPublisher:
         """Undeclare the publisher."""
         publisher, self._publisher = self._publisher, None
         self.wanted = False
-        if publisher is not None:
-            try:
-                publisher.undeclare()
-            except zenoh.ZError as error:
-                logger.debug("undeclaring %s: %s", self._key, error)
+        undeclare(publisher, self._key)
 
 
 def _fields(**values: Any) -> str:

@@ -153,7 +153,9 @@ class ZenohOutput(Output):
     def announce(self, source: str) -> None:
         """Declare the liveliness token PREFIX/SOURCE/alive, and answer queries about ``source``."""
         self._show(self._alive, source, "alive", True)
-        self._serve_source(source)
+        with self._lock:
+            if self._declarations is not None and self.session is not None:
+                self._declarations.add(source)
 
     def withdraw(self, source: str) -> None:
         """Undeclare the liveliness token PREFIX/SOURCE/alive, and stop answering queries about ``source``."""
@@ -176,11 +178,6 @@ class ZenohOutput(Output):
                     token.undeclare()
             elif source not in tokens:
                 tokens[source] = None if self.session is None else self._token(self.session, source, name)
-
-    def _serve_source(self, source: str) -> None:
-        with self._lock:
-            if self._declarations is not None and self.session is not None:
-                self._declarations.add(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""

@@ -1,6 +1,5 @@
 """The publisher of one Zenoh key."""
 
-import logging
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -9,8 +8,9 @@ import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.decode import LCM
-from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
+from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.json_publishing import JsonPublisher
+from gateway.outputs.zenoh.session import declare_publisher, has_subscribers, undeclare
 
 BURST_BYTES: Final = 128 * 1024
 BURST_S: Final = 0.002
@@ -20,8 +20,6 @@ Zenoh itself hardly waits for a subscriber (config.py), because it would wait fo
 without this pace, frames that arrive as fast as TCP delivers them would overflow the queue of a subscriber
 that reads as fast as it can: 55 to 65 % were lost. This way it is nothing, or 1 % on a busy computer.
 """
-
-logger = logging.getLogger(__name__)
 
 
 class ZenohLink:
@@ -73,16 +71,12 @@ class ZenohPublisher:
 
     def declare(self, session: zenoh.Session) -> None:
         """Declare the publisher on an open session. Any thread may do so."""
-        publisher = session.declare_publisher(
-            self._key,
+        self._publisher = declare_publisher(
+            *(session, self._key, self._on_matching),
             encoding=zenoh.Encoding(LCM).with_schema(self._type_name),
             congestion_control=zenoh.CongestionControl.DROP,
             express=self._express,
         )
-        publisher.declare_matching_listener(
-            in_zenoh_thread(self._on_matching)
-        )  # also reports existing subscribers
-        self._publisher = publisher
         if self.json is not None:
             self.json.declare(session)
         if self._is_closed:  # by another thread
@@ -90,17 +84,15 @@ class ZenohPublisher:
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""
-        # Zenoh's type stub says that matching_status is a bool, but it is a MatchingStatus.
-        publisher: Any = self._publisher
+        publisher = self._publisher
         if self.json is not None:
             self.json.check_subscribers()
         if publisher is not None:
-            self._is_matched = publisher.matching_status.matching
-            self.update_wanted()
+            self._on_matching(has_subscribers(publisher))
 
-    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
+    def _on_matching(self, is_matched: bool) -> None:
         # Runs in Zenoh's thread, so it only sets flags.
-        self._is_matched = status.matching
+        self._is_matched = is_matched
         self.update_wanted()
 
     def update_wanted(self) -> None:
@@ -141,8 +133,4 @@ class ZenohPublisher:
         if self.json is not None:
             self.json.close()
         publisher, self._publisher = self._publisher, None
-        if publisher is not None:
-            try:
-                publisher.undeclare()
-            except zenoh.ZError as error:
-                logger.debug("undeclaring %s: %s", self._key, error)
+        undeclare(publisher, self._key)

@@ -1,4 +1,4 @@
-"""The Zenoh session of an output: it opens in a thread, and everything is declared on it there.
+"""The Zenoh session of an output, which opens in a thread, and what the outputs declare on sessions.
 
 ``zenoh.open`` blocks; docs/design.md has the measurements.
 """
@@ -7,14 +7,14 @@ import json
 import logging
 import threading
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
 
 from gateway.errors import OutputError
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.outputs.contract import OutputHealth
-from gateway.outputs.zenoh.config import in_zenoh_thread, prepare_threads, zenoh_reason
+from gateway.outputs.zenoh.config import prepare_threads, zenoh_reason
 from gateway.workers import thread_starts
 
 _RETRY_S: Final = 1.0
@@ -213,3 +213,47 @@ def _close(session: zenoh.Session, output: str) -> None:
         logger.debug("%s: closing the session: %s", output, zenoh_reason(error))
     finally:
         _closers.discard(threading.current_thread())
+
+
+_Event = TypeVar("_Event")
+
+
+def in_zenoh_thread(callback: Callable[[_Event], object]) -> "zenoh.handlers.Callback[_Event]":
+    """Return a handler that calls ``callback`` in one of Zenoh's own threads, so it must not block.
+
+    A plain function gets one more thread for each declaration: 256 tools had 572 threads, and 50 sources 50
+    more than one.
+    """
+    return zenoh.handlers.Callback(callback, indirect=False)
+
+
+def declare_publisher(
+    session: zenoh.Session, key: str, on_matching: Callable[[bool], None], **options: Any
+) -> zenoh.Publisher:
+    """Declare a publisher with Zenoh's ``options``.
+
+    ``on_matching`` is called in one of Zenoh's threads with True when a subscriber matches the key, which may
+    be at once, and with False when none does any more.
+    """
+    publisher = session.declare_publisher(key, **options)
+
+    def on_status(status: zenoh.MatchingStatus) -> None:
+        on_matching(status.matching)
+
+    publisher.declare_matching_listener(in_zenoh_thread(on_status))
+    return publisher
+
+
+def has_subscribers(publisher: zenoh.Publisher) -> bool:
+    """Return whether a subscriber matches the key now: a notification may have been missed."""
+    status: Any = publisher.matching_status  # a MatchingStatus, although Zenoh's type stub says bool
+    return bool(status.matching)
+
+
+def undeclare(declared: zenoh.Publisher | None, key: str) -> None:
+    """Undeclare a publisher, if there is one; its session may be closed already."""
+    if declared is not None:
+        try:
+            declared.undeclare()
+        except zenoh.ZError as error:
+            logger.debug("undeclaring %s: %s", key, zenoh_reason(error))

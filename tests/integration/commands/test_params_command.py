@@ -13,7 +13,7 @@ import rtc3d
 import zenoh
 
 from gateway.messages.decode import json_bytes
-from gateway.outputs.lcm import queries as lcm_parameters
+from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber

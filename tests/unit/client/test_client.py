@@ -2,12 +2,14 @@
 
 import contextlib
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from gateway.client import GatewayAddress, GatewayClient, Messages
 from gateway.client.series import FINGERPRINTS
-from gateway.client.transport import Replies, Reply
+from gateway.client.transport import Replies, Reply, silence_text
+from gateway.display.live.live_data import LiveData
 from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
 from gateway.outputs.contract import ServerParameters
@@ -60,3 +62,18 @@ def test_messages_are_passed_on_with_their_source_and_key() -> None:
             sender.publish(f"MOCAP_LAB_{channel}", message)
         wait_until(lambda: len(received) == 2)
     assert received == [("lab", "3d", frame), ("lab", "parameters", parameters)]
+
+
+@pytest.mark.parametrize(
+    ("reason", "sources", "text"),
+    [
+        ("no gateway found", [], "no gateway found"),
+        ("", ["hall", "lab"], "a gateway serves hall, lab, but nothing arrives from it; try again"),
+        ("", [], "a gateway serves this source, but nothing arrives from it; try again"),
+    ],
+)
+def test_silence_has_a_reason_also_if_a_gateway_is_found(reason: str, sources: list[str], text: str) -> None:
+    live = LiveData()
+    for source in sources:
+        live.source(source, source.upper(), is_known=True)
+    assert silence_text(Mock(silence=lambda: reason), live) == text

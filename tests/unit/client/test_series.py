@@ -1,4 +1,6 @@
-"""The messages of one key, counted."""
+"""The messages of one key, counted, and when gateways are queried about their sources."""
+
+import pytest
 
 from gateway.client.series import Series, Source
 from gateway.messages.encode import NOT_PUBLISHED, PREFIX
@@ -11,3 +13,17 @@ def test_messages_without_a_number_are_counted_and_show_no_loss() -> None:
         series.count(bytes(8) + PREFIX.pack(utime, utime, number, 3, 1))
     assert (series.num_messages, series.check.num_lost, series.check.num_gaps) == (4, 1, 1)
     assert (series.first_utime, series.last_utime, series.check.session) == (10, 30, 3)
+
+
+def test_queries_without_a_reply_become_rarer(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 1000.0
+    monkeypatch.setattr("gateway.client.series.time.monotonic", lambda: now_s)
+    source = Source("lab", "MOCAP_LAB")
+    due_s = []
+    for tick in range(36_000):  # an hour
+        now_s = 1000.0 + tick / 10
+        if source.begin_query():
+            due_s.append(tick / 10)
+    assert sum(time_s < 1 for time_s in due_s) >= 3
+    assert 360 < len(due_s) < 450
+    assert due_s[-1] > 3580

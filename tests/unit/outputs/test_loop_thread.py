@@ -8,8 +8,8 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from gateway.outputs import threads
 from gateway.outputs.threads import LoopThread, in_this_loop
+from gateway.workers import MAX_BYTES
 
 
 async def nothing() -> None: ...
@@ -25,9 +25,7 @@ def test_calls_are_made_in_order_in_the_thread() -> None:
     thread.close(nothing, 5)
 
 
-def test_the_queue_is_bounded_by_calls_and_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "MAX_CALLS", 3)
-    monkeypatch.setattr(threads, "MAX_BYTES", 100)
+def test_the_queue_is_bounded() -> None:
     thread = LoopThread("test")
     entered, go_on = threading.Event(), threading.Event()
 
@@ -38,11 +36,11 @@ def test_the_queue_is_bounded_by_calls_and_bytes(monkeypatch: pytest.MonkeyPatch
     thread.offer(wait)
     assert entered.wait(30)
     made: list[int] = []
-    assert thread.offer(lambda: made.append(0), 1000)  # of any size, because the queue is empty
+    assert thread.offer(lambda: made.append(0), MAX_BYTES + 1)  # of any size, because the queue is empty
     assert not thread.offer(lambda: made.append(1), 1)
     go_on.set()
     thread.run(nothing()).result(5)
-    assert thread.offer(lambda: made.append(2), 60)
+    assert thread.offer(lambda: made.append(2), MAX_BYTES)
     thread.run(nothing()).result(5)
     assert made == [0, 2]
     thread.close(nothing, 5)

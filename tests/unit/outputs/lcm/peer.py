@@ -13,8 +13,7 @@ from gateway.logs.failures import current_log_fields
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, decode, json_bytes
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
-from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.queries import LcmQueries
+from gateway.outputs.lcm.output import LcmOutput, LcmQueries
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.losses import amounts
 from tests.waiting import wait_until_async

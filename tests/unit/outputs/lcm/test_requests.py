@@ -13,7 +13,7 @@ from gateway.errors import QueryError
 from gateway.messages.decode import C3D, JSON
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.lcm import requests
-from gateway.outputs.lcm.queries import LcmQueries
+from gateway.outputs.lcm.output import LcmQueries
 from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
 from gateway.outputs.lcm.sender import LcmSender
@@ -110,7 +110,7 @@ async def test_a_long_reply_is_sent_by_a_thread(lab: Lab, monkeypatch: pytest.Mo
     """It would keep the frames of all sources waiting."""
     monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
     may_send = threading.Event()
-    lab.queries._long_sender.submit(may_send.wait)  # type: ignore[arg-type]  # what it returns is ignored
+    lab.queries._long_sender.submit(may_send.wait)
     lab.send(request(1))
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
     lab.deliver()

@@ -11,8 +11,15 @@ from gateway.errors import OutputError
 from gateway.outputs.lcm import connection as connection_module
 from gateway.outputs.lcm import sender as sender_module
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, multicast_problem, open_lcm, send_problem
-from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmPublisher, LcmSender
-from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
+from gateway.outputs.lcm.sender import (
+    CLOSED,
+    NOT_OPEN,
+    RETRY_S,
+    LcmPublisher,
+    LcmSender,
+    LcmThreadSender,
+    new_sender,
+)
 from tests.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
 from tests.settable_clock import Clock
 

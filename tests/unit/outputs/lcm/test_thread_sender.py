@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import pytest
 
 from gateway.errors import OutputError
-from gateway.outputs.lcm import thread_sender
-from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN
-from gateway.outputs.lcm.thread_sender import LcmThreadSender
+from gateway.outputs.lcm import sender as sender_module
+from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, LcmThreadSender
 from tests.waiting import wait_until
+
+pytestmark = pytest.mark.interpreted
 
 URL = "tcpq://192.0.2.9:7700"
 FULL = f"{URL} does not take messages fast enough; check the peer of lcm.url"
@@ -48,9 +49,9 @@ class FakeLcm:
 @pytest.fixture
 def lcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeLcm]:
     fake = FakeLcm()
-    monkeypatch.setattr(thread_sender, "open_lcm", fake.open)
-    monkeypatch.setattr(thread_sender, "RETRY_S", 0.001)
-    monkeypatch.setattr(thread_sender, "_JOIN_S", 0.01)
+    monkeypatch.setattr(sender_module, "open_lcm", fake.open)
+    monkeypatch.setattr(sender_module, "RETRY_S", 0.001)
+    monkeypatch.setattr(sender_module, "_JOIN_S", 0.01)
     yield fake
     fake.opens.set()
     fake.reads.set()
@@ -58,14 +59,16 @@ def lcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeLcm]:
 
 @pytest.fixture
 def sender(lcm: FakeLcm, monkeypatch: pytest.MonkeyPatch) -> Iterator[LcmThreadSender]:
-    """Return an open sender, whose ``close`` waits for the thread as long as it takes."""
+    """Return an open sender of a short queue, whose ``close`` waits for the thread as long as it takes."""
+    monkeypatch.setattr(sender_module, "MAX_QUEUED_MESSAGES", 2)
+    monkeypatch.setattr(sender_module, "MAX_QUEUED_BYTES", 100)
     sender = LcmThreadSender(URL, lambda: None)
     sender.open()
     wait_until(lambda: not sender.problem)
     yield sender
     lcm.reads.set()
     lcm.error = None
-    monkeypatch.setattr(thread_sender, "_JOIN_S", 10.0)
+    monkeypatch.setattr(sender_module, "_JOIN_S", 10.0)
     sender.close()
 
 
@@ -84,8 +87,13 @@ def messages(lcm: FakeLcm) -> list[bytes]:
     return [message for _, message in lcm.published]
 
 
+def is_sent(sender: LcmThreadSender) -> bool:
+    return not +sender._waiting
+
+
 def block(lcm: FakeLcm, sender: LcmThreadSender) -> None:
-    """Block the thread in its first message, which stays queued."""
+    """Block the thread in its first message."""
+    lcm.is_publishing.clear()
     lcm.reads.clear()
     send(sender, b"first")
     assert lcm.is_publishing.wait(10)
@@ -95,62 +103,54 @@ def test_messages_are_published_in_order_on_their_channels(lcm: FakeLcm, sender:
     sent = [(f"CHANNEL_{number}", bytes([number])) for number in range(50)]
     for channel, message in sent:
         sender.send(channel, message)
-    wait_until(lambda: len(lcm.published) == 50)
+        wait_until(lambda: is_sent(sender))
     assert lcm.published == sent
 
 
 # The queue -----------------------------------------------------------------------------------
 
 
-def test_the_queue_is_limited_in_bytes(
-    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(thread_sender, "MAX_QUEUED_BYTES", 100)
-    block(lcm, sender)
-    send(sender, bytes(95))
-    assert refusal(sender, b"x").cause == "queue full"
-    lcm.reads.set()
-    wait_until(lambda: len(lcm.published) == 2)
-    wait_until(lambda: not sender._queue)
-    send(sender, bytes(100))  # the bytes of published messages no longer count
-    assert refusal(sender, bytes(101)).cause == "queue full"
+def test_the_queue_is_limited_in_bytes(lcm: FakeLcm, sender: LcmThreadSender) -> None:
+    for _ in range(2):  # the bytes of published messages no longer count
+        block(lcm, sender)
+        send(sender, bytes(95))
+        assert refusal(sender, bytes(6)).cause == "queue full"
+        lcm.reads.set()
+        wait_until(lambda: is_sent(sender))
 
 
 @pytest.mark.usefixtures("no_hold")
 def test_messages_beyond_the_queue_are_refused_until_the_peer_reads_again_and_logged_once(
-    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    lcm: FakeLcm, sender: LcmThreadSender, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
-    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
     block(lcm, sender)
+    send(sender, b"second", b"third")
     assert sender.problem == ""
     for _ in range(3):
         error = refusal(sender)
         assert (error.cause, str(error)) == ("queue full", FULL)
     assert sender.problem == FULL
     lcm.reads.set()
-    wait_until(lambda: not sender._queue)
-    send(sender, b"second")
+    wait_until(lambda: is_sent(sender))
+    send(sender, b"fourth")
     assert sender.problem == ""
-    wait_until(lambda: not sender._queue)
-    send(sender, b"third")
-    wait_until(lambda: messages(lcm) == [b"first", b"second", b"third"])
+    wait_until(lambda: messages(lcm) == [b"first", b"second", b"third", b"fourth"])
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
     assert caplog.messages[0] == f"lcm: {FULL}"
     assert caplog.messages[1].startswith("lcm: the peer reads again, after ")
 
 
 def test_a_queue_that_is_often_full_is_logged_once(
-    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    lcm: FakeLcm, sender: LcmThreadSender, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
-    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
     for _ in range(2):
-        lcm.is_publishing.clear()
         block(lcm, sender)
+        send(sender, b"second", b"third")
         refusal(sender)
         lcm.reads.set()
-        wait_until(lambda: not sender._queue)
+        wait_until(lambda: is_sent(sender))
     assert caplog.messages == [f"lcm: {FULL}"]
 
 
@@ -185,7 +185,7 @@ def test_failures_in_quick_succession_are_logged_as_one(
         send(sender, b"message")
         wait_until(lambda: sender.problem)
         lcm.error = None
-        wait_until(lambda: not sender._queue)
+        wait_until(lambda: is_sent(sender))
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
 
 
@@ -215,7 +215,7 @@ def test_opening_is_tried_again_until_it_succeeds(lcm: FakeLcm, caplog: pytest.L
 def test_closing_sends_what_is_queued(
     lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(thread_sender, "_JOIN_S", 10.0)
+    monkeypatch.setattr(sender_module, "_JOIN_S", 10.0)
     block(lcm, sender)
     send(sender, b"second", b"third")
     threading.Timer(0.01, lcm.reads.set).start()
@@ -233,7 +233,7 @@ def test_closing_does_not_wait_for_a_blocked_peer_and_returns_the_loss(
     sender.send("CHANNEL", b"second", "lab")
     assert sender.close() == {"": 1, "lab": 1}
     lcm.reads.set()
-    wait_until(lambda: not sender._thread.is_alive())
+    assert sender._worker.finish(10)
     assert (messages(lcm), sender.problem) == ([b"first"], CLOSED)
 
 
@@ -242,7 +242,7 @@ def test_closing_ends_the_attempts_to_send_again(lcm: FakeLcm, sender: LcmThread
     send(sender, b"first")
     wait_until(lambda: sender.problem)
     sender.close()
-    wait_until(lambda: not sender._thread.is_alive())
+    assert sender._worker.finish(10)
     assert sender.problem == CLOSED
 
 
@@ -255,6 +255,6 @@ def test_while_lcm_opens_the_problem_names_the_url_and_closing_is_final(lcm: Fak
     assert sender.problem == f"LCM has not opened {URL} yet; check lcm.url"
     sender.close()
     lcm.opens.set()
-    wait_until(lambda: not sender._thread.is_alive())
+    assert sender._worker.finish(10)
     assert (opened, sender.problem) == ([], CLOSED)
     assert refusal(sender).cause == "not open"

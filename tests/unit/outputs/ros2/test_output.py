@@ -26,7 +26,7 @@ class Output:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_open: bool = True, **settings: Any) -> None:
         self.node, self.sender = Node(), Sender()
         monkeypatch.setattr(output_module, "router_session", Router)
-        monkeypatch.setattr(output_module, "SendThread", lambda _: self.sender)
+        monkeypatch.setattr(output_module, "WorkerThread", lambda _: self.sender)
         monkeypatch.setattr(output_module, "RosNode", lambda *_: self.node)
         self.output = Ros2Output(Ros2Settings(enabled=True, **settings))
         self.router: Any = self.output._router

@@ -59,9 +59,9 @@ def test_a_burst_begins_two_milliseconds_after_the_one_before_it(clock: WaitingC
 def test_the_thread_for_json_rests_four_times_as_long_as_a_conversion_took(clock: WaitingClock) -> None:
     """So a web page costs the gateway a fifth of a core at most."""
     keys = JsonConverter(100)
-    keys._closing = SimpleNamespace(wait=clock.wait)  # type: ignore[assignment]  # a threading.Event
+    keys._closing = SimpleNamespace(wait=clock.wait, is_set=lambda: False)  # type: ignore[assignment]  # a threading.Event
     keys._waiting["lab"].calls.append((lambda: clock.wait(0.01), 1))
-    keys._convert_next()
+    keys._convert_waiting()
     assert clock.waits_s == pytest.approx([0.01, 0.04])
 
 
