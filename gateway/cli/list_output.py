@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gateway.client.found_sources import FoundSource, FoundSources, FoundStream
+from gateway.client.found_sources import FoundSources
 from gateway.display.terminal.lists import list_table, write_records
 from gateway.logs.safe_text import safe_json
-from gateway.stream.status_text import Level, source_text, stream_level
+from gateway.messages.source_report import Level, SourceReport, StreamReport
 
 _COLOURS: Final = {Level.GOOD: "green", Level.WAITING: "yellow", Level.BAD: "red"}
 _NARROW: Final = range(80, 110)
@@ -52,7 +52,7 @@ def notes(found: FoundSources) -> list[str]:
     return texts
 
 
-def _table(sources: Sequence[FoundSource], *, is_narrow: bool) -> Table:
+def _table(sources: Sequence[SourceReport], *, is_narrow: bool) -> Table:
     table = list_table()
     for heading in ("source", "state", "components", "server", "host", "version"):
         width = _NARROW_WIDTHS.get(heading) if is_narrow else None
@@ -69,18 +69,17 @@ def _table(sources: Sequence[FoundSource], *, is_narrow: bool) -> Table:
     return table
 
 
-def _state(stream: FoundStream) -> Text:
-    return Text(stream.text, _COLOURS[stream_level(stream.state, stream.problem)])
+def _state(stream: StreamReport) -> Text:
+    return Text(stream.text, _COLOURS[stream.level])
 
 
-def _record(source: FoundSource) -> tuple[str, ...]:
+def _record(source: SourceReport) -> tuple[str, ...]:
     components = ", ".join(stream.components for stream in source.streams)
-    state = source_text([(stream.components, stream.text) for stream in source.streams])
-    texts = ", ".join(filter(None, (state, source.problem)))
+    texts = ", ".join(filter(None, (source.text, source.problem)))
     return source.name, texts, components, source.server, source.host, source.version
 
 
-def _source_json(source: FoundSource) -> dict[str, Any]:
+def _source_json(source: SourceReport) -> dict[str, Any]:
     return {
         "source": source.name,
         "gateway": source.gateway or None,
@@ -92,12 +91,12 @@ def _source_json(source: FoundSource) -> dict[str, Any]:
     }
 
 
-def _stream_json(stream: FoundStream) -> dict[str, Any]:
+def _stream_json(stream: StreamReport) -> dict[str, Any]:
     return {
         "components": stream.components.split(),
         "text": stream.text,
         "state": stream.state,
         "problem": stream.problem,
-        "rate_hz": round(stream.rate_hz, 3) if math.isfinite(stream.rate_hz) else None,
+        "rate_hz": round(stream.frame_rate_hz, 3) if math.isfinite(stream.frame_rate_hz) else None,
         "tries": stream.tries,
     }

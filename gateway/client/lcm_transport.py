@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -157,8 +158,8 @@ def _add(found: FoundSources, prefix: str, wanted: str | None, channel: str, mes
         return
     source = read_status(message, "")
     if not source.name:
-        source = source._replace(
-            name=safe_text(_CHANNEL.split(channel)[0].removeprefix(f"{prefix}_").lower())
+        source = replace(
+            source, name=safe_text(_CHANNEL.split(channel)[0].removeprefix(f"{prefix}_").lower())
         )
     channels = lcm_channel(prefix, source.name)
     if channel.startswith(channels):

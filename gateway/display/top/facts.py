@@ -1,30 +1,23 @@
 """What is known about a source, from what its gateway publishes: values without numpy, for tables and JSON.
 
-The names of the fields are those of ``top --json``. Texts from networks are cut and escaped, and there is a
-limit to how many entries of a status are taken.
+The names of the fields are those of ``top --json``. What the status says is in ``source.report``.
 """
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import islice
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final
 
 from gateway.client.series import POSE
 from gateway.descriptions.labels import describe
 from gateway.display.live.component import LiveComponent, Percentiles
 from gateway.display.live.live_data import LiveSource
 from gateway.logs.safe_text import safe_text
+from gateway.messages.source_report import Level, SourceReport
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.stream.status_text import Level, message_texts, source_text, stream_level
-
-_MAX_ENTRIES: Final = 50
-"""How many streams, outputs, causes and results of a status are taken, of each kind."""
 
 _MAX_LABEL: Final = 64
-_MAX_SENTENCE: Final = 500
-
-_Entry = TypeVar("_Entry")
+"""How much is shown of a marker's or tool's label, and of its unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,28 +67,6 @@ class ItemFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class StreamFacts:
-    """One stream of a source, as its status describes it."""
-
-    components: str
-    state: str
-    problem: str
-    session: int
-    byte_order: str
-    rate: str
-    frame_rate_hz: float
-    lag_ms: float
-    num_reconnects: int
-    num_restarts: int
-    has_clock: bool
-    clock_drift_ppm: float
-    clock_uncertainty_us: float
-    limitations: list[str]
-    last_error: str
-    last_error_utime: int
-
-
-@dataclass(frozen=True, slots=True)
 class LossFacts:
     """What was lost for one cause, since the start of ``where``."""
 
@@ -103,17 +74,6 @@ class LossFacts:
     cause: str
     num_messages: int
     num_frames: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class OutputFacts:
-    """One output of the gateway. ``messages`` are by component, ``queries`` by result."""
-
-    output: str
-    is_connected: bool
-    problem: str
-    messages: dict[str, int]
-    queries: dict[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,34 +85,17 @@ class EventFacts:
     parameters: str
 
 
-class Names(NamedTuple):
-    """Where a source comes from: the server, the gateway's computer and its version; "" if not known."""
-
-    server: str
-    host: str
-    version: str
-
-
-def source_names(source: LiveSource) -> Names:
-    """Return where a source comes from, as its status says."""
-    status = source.newest_status
-    if status is None:
-        return Names("", "", "")
-    return Names(_label(status.server), _label(status.host), _label(status.gateway_version))
-
-
 def state(source: LiveSource) -> StateFacts:
     """Return the state of a source, in the words of the status line."""
     if source.is_silent:
         age_s = source.status_age_s
         since = "yet" if age_s is None else f"for {age_s:.0f} s"
         return StateFacts(f"no status of its gateway {since}; is it running?", "error")
-    status = source.newest_status
-    if status is None:
+    if source.report is None:
         return StateFacts("waiting for the status of its gateway", "warning")
-    text = _sentence(source_text(message_texts(status))) or "its gateway reports no stream"
+    text = safe_text(source.report.text) or "its gateway reports no stream"
     stopped = [each.key for each in WIRE_ORDER if _is_stopped(source, each)]
-    levels = {stream_level(stream.state, stream.problem) for stream in status.streams}
+    levels = {stream.level for stream in source.report.streams}
     if Level.BAD in levels:
         return StateFacts(text, "error")
     if stopped:
@@ -167,8 +110,7 @@ def _is_stopped(source: LiveSource, kind: ComponentType) -> bool:
 
 def components(source: LiveSource) -> list[ComponentFacts]:
     """Return the components that have come or that the streams request, in the order of frames."""
-    wanted = {key for stream in streams(source) for key in stream.components.split()}
-    wanted.update([*source.components])
+    wanted = {*source.components, *(source.report.components if source.report else ())}
     found = [_component(source, each) for each in WIRE_ORDER if each.key in wanted]
     poses = [series for series in source.series if series.key.startswith(POSE)]
     return [*found, _poses(poses)] if poses else found
@@ -273,41 +215,13 @@ def _items(component: LiveComponent | None) -> list[ItemFacts]:
     ]
 
 
-def streams(source: LiveSource) -> list[StreamFacts]:
-    """Return the streams of the newest status."""
-    status = source.newest_status
-    return [] if status is None else [_stream(stream) for stream in _first(status.streams)]
-
-
-def _stream(stream: Any) -> StreamFacts:
-    return StreamFacts(
-        components=_label(stream.components),
-        state=_label(stream.state),
-        problem=_sentence(stream.problem),
-        session=stream.session,
-        byte_order=_label(stream.byte_order),
-        rate=_label(stream.rate),
-        frame_rate_hz=stream.frame_rate_hz,
-        lag_ms=stream.lag_ms,
-        num_reconnects=stream.reconnects,
-        num_restarts=stream.restarts,
-        has_clock=bool(stream.clock.has_clock),
-        clock_drift_ppm=stream.clock.drift_ppm,
-        clock_uncertainty_us=stream.clock.uncertainty_us,
-        limitations=[_sentence(text) for text in _first(stream.limitations)],
-        last_error=_sentence(stream.last_error),
-        last_error_utime=stream.last_error_utime,
-    )
-
-
 def losses(source: LiveSource) -> list[LossFacts]:
     """Return what was lost: before the outputs, on each of them, and on the way here."""
-    status = source.newest_status
     found = []
-    for stream in _first(() if status is None else status.streams):
-        found += [_loss(f"stream {_label(stream.components)}", drop) for drop in _first(stream.drops)]
-    for output in _first(() if status is None else status.outputs):
-        found += [_loss(f"output {_label(output.name)}", drop) for drop in _first(output.drops)]
+    if source.report is not None:
+        routes = [(f"stream {each.components}", each.losses) for each in source.report.streams]
+        routes += [(f"output {each.output}", each.losses) for each in source.report.outputs]
+        found = [LossFacts(where, *loss) for where, losses in routes for loss in losses]
     checks = [(series.key, series.check) for series in source.series]
     here = {
         "missing in the sequence of messages": sum(check.num_lost for _, check in checks),
@@ -319,41 +233,43 @@ def losses(source: LiveSource) -> list[LossFacts]:
     return found + [LossFacts("received here", cause, count, None) for cause, count in here.items() if count]
 
 
-def _loss(where: str, drop: Any) -> LossFacts:
-    return LossFacts(where, _label(drop.cause), drop.messages, drop.frames)
-
-
-def outputs(source: LiveSource) -> list[OutputFacts]:
-    """Return the outputs of the newest status."""
-    status = source.newest_status
-    return [
-        OutputFacts(
-            output=_label(output.name),
-            is_connected=bool(output.connected),
-            problem=_sentence(output.problem),
-            messages=_counts(output.messages),
-            queries=_counts(output.queries),
-        )
-        for output in _first(() if status is None else status.outputs)
-    ]
-
-
 def events(source: LiveSource) -> list[EventFacts]:
     """Return the last events, the newest one first."""
     return [
-        EventFacts(event.capture_utime, _label(event.text.label), _sentence(event.text.description))
+        EventFacts(event.capture_utime, safe_text(event.text.label), safe_text(event.text.description))
         for event in reversed(source.events)
     ]
 
 
+_STREAM_FIELDS: Final = (
+    "components",
+    "state",
+    "problem",
+    "session",
+    "byte_order",
+    "rate",
+    "frame_rate_hz",
+    "lag_ms",
+    "num_reconnects",
+    "num_restarts",
+    "has_clock",
+    "clock_drift_ppm",
+    "clock_uncertainty_us",
+    "limitations",
+    "last_error",
+    "last_error_utime",
+)
+_OUTPUT_FIELDS: Final = ("output", "is_connected", "problem", "messages", "queries")
+
+
 def source_facts(source: LiveSource) -> dict[str, Any]:
     """Return everything about a source, for JSON."""
-    found, names = state(source), source_names(source)
+    found, report = state(source), source.report or SourceReport(source.name)
     return {
-        "source": _label(source.name),
-        "server": names.server,
-        "host": names.host,
-        "gateway_version": names.version,
+        "source": safe_text(source.name),
+        "server": report.server,
+        "host": report.host,
+        "gateway_version": report.version,
         "state": found.text,
         "level": found.level,
         "status_age_s": source.status_age_s,
@@ -364,27 +280,15 @@ def source_facts(source: LiveSource) -> dict[str, Any]:
         "components": components(source),
         "markers": markers(source),
         "tools": tools(source),
-        "streams": streams(source),
+        "streams": [_fields(stream, _STREAM_FIELDS) for stream in report.streams],
         "losses": losses(source),
-        "outputs": outputs(source),
+        "outputs": [_fields(output, _OUTPUT_FIELDS) for output in report.outputs],
         "events": events(source),
     }
 
 
-def _first(entries: Iterable[_Entry]) -> list[_Entry]:
-    return [*islice(entries, _MAX_ENTRIES)]
-
-
-def _counts(counts: Iterable[Any]) -> dict[str, int]:
-    return {_label(each.name): each.count for each in _first(counts)}
-
-
-def _label(text: str) -> str:
-    return safe_text(text, _MAX_LABEL)
-
-
-def _sentence(text: str) -> str:
-    return safe_text(text, _MAX_SENTENCE)
+def _fields(report: object, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(report, name) for name in names}
 
 
 def _finite(value: float | None) -> float | None:

@@ -10,6 +10,7 @@ from gateway.display.terminal.screen import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
 from gateway.logs.safe_text import safe_text
+from gateway.messages.source_report import OutputReport
 
 TWO_GATEWAYS: Final = (
     "two gateways publish a source of this name, so lost messages are not counted exactly: give one of them "
@@ -179,12 +180,11 @@ def server(sources: Sequence[LiveSource]) -> Table:
 
 
 def _server_of(source: LiveSource) -> Section:
-    status = source.newest_status
-    found = facts.source_names(source)
-    where = "" if status is None else f" from {found.server} by {found.host} (version {found.version})"
+    report = source.report
+    where = "" if report is None else f" from {report.server} by {report.host} (version {report.version})"
     state = facts.state(source)
     rows, notes = [], []
-    for stream in facts.streams(source):
+    for stream in report.streams if report else ():
         drift_ppm = stream.clock_drift_ppm if stream.has_clock else None
         uncertainty_us = stream.clock_uncertainty_us if stream.has_clock else None
         rows.append(
@@ -247,7 +247,7 @@ def outputs(sources: Sequence[LiveSource]) -> Table:
     )
     rows, notes = [], []
     for source in sources:
-        for output in facts.outputs(source):
+        for output in _outputs(source):
             is_fine = output.is_connected and not output.problem
             rows.append(
                 (
@@ -281,7 +281,7 @@ def questions(sources: Sequence[LiveSource]) -> Table:
             number_cell(count),
         )
         for source in sources
-        for output in facts.outputs(source)
+        for output in _outputs(source)
         for result, count in output.queries.items()
     ]
     return Table(columns, [Section(rows)] if rows else [], "nobody has asked anything so far")
@@ -327,8 +327,11 @@ def event_time(utime: int) -> str:
 
 
 def _output_problems(source: LiveSource) -> list[str]:
-    found = facts.outputs(source)
-    return [f"{_name(source)} to {each.output}: {each.problem}" for each in found if each.problem]
+    return [f"{_name(source)} to {each.output}: {each.problem}" for each in _outputs(source) if each.problem]
+
+
+def _outputs(source: LiveSource) -> Sequence[OutputReport]:
+    return source.report.outputs if source.report else ()
 
 
 def _name(source: LiveSource) -> str:

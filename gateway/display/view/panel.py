@@ -14,7 +14,7 @@ from gateway.display.view.server import ShownLatency, set_theme
 from gateway.display.view.source_text import State, data_state, gateway_states, ignored_html, source_html
 from gateway.display.view.texts import clock_text, counted, events_html, html_text, items_html
 from gateway.display.view.world import UP_AXES, UpAxis
-from gateway.stream.status_text import Level
+from gateway.messages.source_report import Level
 
 _SCRIPT: Final = """
 if (!window.gatewayScript) {

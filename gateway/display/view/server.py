@@ -79,8 +79,8 @@ class RunningTakes:
             return
         self._due_s = now_s + self._period_s
         for source in self._live.sources_now:
-            outputs = source.newest_status.outputs if source.newest_status else ()
-            if any(output.name == "takes" for output in outputs):
+            outputs = source.report.outputs if source.report else ()
+            if any(output.output == "takes" for output in outputs):
                 self._subscriber.query_takes(source)
 
 

@@ -156,6 +156,6 @@ def test_sources_are_sorted_and_know_their_status() -> None:
         live.publish(name, "status", status.encode())
     lab, stage = live.update()
     assert (lab.name, stage.name) == ("lab", "stage")
-    assert lab.newest_status is not None
-    assert lab.newest_status.source == "lab"
+    assert lab.report is not None
+    assert lab.report.name == "lab"
     assert not lab.is_silent

@@ -216,12 +216,6 @@ def test_texts_from_networks_are_cut_and_escaped() -> None:
     assert len(text) < 20_000
 
 
-def test_a_status_with_very_many_entries_is_cut() -> None:
-    lab = LiveLab()
-    lab.status(*[stream(str(number)) for number in range(1000)])
-    assert len(facts.streams(lab.source())) == 50
-
-
 def test_everything_about_a_source_is_json() -> None:
     lab = LiveLab(LiveData(), "stage")
     lab.status(stream("3d event", lag_ms=float("nan")), outputs=(output(),))
