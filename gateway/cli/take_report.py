@@ -9,7 +9,7 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gateway.display.terminal.lists import print_list
+from gateway.display.terminal import print_list
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.component_statistics import ComponentStatistics, MessageStatistics

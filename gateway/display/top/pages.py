@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 from gateway.display.live.component import SLOW_SHARE, visible_percent
 from gateway.display.live.live_data import LiveSource
-from gateway.display.terminal.screen import Style
+from gateway.display.terminal import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
 from gateway.logs.safe_text import safe_text

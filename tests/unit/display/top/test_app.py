@@ -3,7 +3,7 @@
 import pytest
 from rich.cells import cell_len
 
-from gateway.display.terminal.screen import Line, Style
+from gateway.display.terminal import Line, Style
 from gateway.display.top.app import Display
 from gateway.display.top.pages import PAGES
 from gateway.display.top.table import (
