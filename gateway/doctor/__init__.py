@@ -2,9 +2,8 @@
 
 ``all_checks`` runs the checks in the order in which a fault has consequences, and each gives a ``Finding``
 (what was checked, whether it is right, what was found, what to do). ``report`` prints them, for people or as
-JSON.
+JSON. The check of this computer's clock is there, too.
 
-- ``computer_checks``: this computer's clock and receive buffer.
 - ``source_checks``: one server, from its name to its frames. It connects as the gateway does and listens for
   some seconds: ``observation`` collects what arrives, ``frame_checks`` judges it.
 - ``gateway_checks``: the running gateway, by its own health page.

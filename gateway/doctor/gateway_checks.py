@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from gateway.config.settings import MetricsSettings
 from gateway.logs.losses import counts_text, route_name
-from gateway.outputs.findings import Finding, Subject, as_sentence
+from gateway.outputs.findings import Finding, Subject
 from gateway.outputs.listen_address import from_this_computer, host_in_url
 from gateway.stream.state import StreamState
 from gateway.workers import WorkerThread
@@ -152,8 +152,7 @@ def check_gateway(
         return
     yield _gateway.passing("health", f"a gateway answers on {where}")
     for problem in report.process:
-        found, _, remedy = problem.partition("; ")
-        yield _gateway.failing("health", found, as_sentence(remedy))
+        yield _gateway.problem("health", problem)
     served = {stream.source for stream in report.streams}
     for source in sources:
         if source not in served:
@@ -166,11 +165,12 @@ def check_gateway(
     for stream in report.streams:
         yield from _check_stream(stream, connects=connects)
     for output in report.outputs:
-        yield _check_output(output)
+        yield _check_output(output.output, output.problem)
     if not report.losses:
         yield _gateway.passing("loss", "nothing has been lost since the gateway started")
     for loss in report.losses:
-        yield _check_loss(loss)
+        finding = _gateway.warning if loss.messages_last_minute else _gateway.note
+        yield finding("loss", loss.found, f"The newest was: {loss.text}")
 
 
 def _no_gateway(report: NoReport, *, connects: bool) -> Finding:
@@ -220,19 +220,7 @@ def _check_stream(stream: RunningStream, *, connects: bool) -> Iterator[Finding]
         yield _gateway.note("stream", f"{stream.name}: {limitation}")
 
 
-def _check_output(output: RunningOutput) -> Finding:
-    if not output.problem:
-        return _gateway.passing("output", f"{output.output}: connected")
-    found, _, remedy = output.problem.partition("; ")
-    return _gateway.failing(
-        "output",
-        f"{output.output}: {found}",
-        as_sentence(remedy) if remedy else f"See the checks of {output.output} below.",
-    )
-
-
-def _check_loss(loss: RunningLoss) -> Finding:
-    what_to_do = f"The newest was: {loss.text}"
-    if loss.messages_last_minute:
-        return _gateway.warning("loss", loss.found, what_to_do)
-    return _gateway.note("loss", loss.found, what_to_do)
+def _check_output(name: str, problem: str) -> Finding:
+    if problem:
+        return _gateway.problem("output", f"{name}: {problem}", f"See the checks of {name} below.")
+    return _gateway.passing("output", f"{name}: connected")

@@ -7,12 +7,18 @@ from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.descriptions.source_frame import source_frame, unknown_unit_text
-from gateway.doctor.computer_checks import check_receive_buffer
-from gateway.doctor.frame_checks import check_byte_order, check_frames, check_rate, check_visibility
+from gateway.doctor.frame_checks import (
+    check_byte_order,
+    check_frames,
+    check_rate,
+    check_receive_buffer,
+    check_visibility,
+)
 from gateway.doctor.gateway_checks import HealthReport
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.logs.safe_text import quoted
+from gateway.messages.summary import described_items
 from gateway.outputs.findings import Finding, MessageLoad, Result, Subject, as_sentence
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
@@ -59,17 +65,15 @@ class SourceChecks:
 
     async def run(self) -> AsyncIterator[Finding]:
         """Run the checks in order, yield their findings, and close the connections."""
-        remaining = list(CHECKS)
-        for check in (self._check_name, self._check_tcp, self._check_protocol):
+        for number, check in enumerate((self._check_name, self._check_tcp, self._check_protocol), start=1):
             if check == self._check_tcp and await self._gateway_is_connected():
                 yield self._second_connection()
             finding = await check()
-            yield finding
-            remaining.remove(finding.check)
             if finding.result is Result.FAILING:
-                for name in remaining:
-                    yield self._subject.not_tested(name, f"it needs {finding.check}, which failed")
+                for each in self._subject.failing_first(finding, CHECKS[number:]):
+                    yield each
                 break
+            yield finding
         else:
             yield self._check_parameters()
             await asyncio.sleep(self._seconds)
@@ -220,7 +224,8 @@ class SourceChecks:
         if first.parsed is not None:
             parameters = first.parsed.parameters
             repaired = f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
-            found = _summary(parameters) + repaired
+            found = described_items(parameters, event="event type") or "the server's parameters are empty"
+            found += repaired
             if source_frame(self._source, parameters).metres_per_unit is None:
                 problem, _, remedy = unknown_unit_text(parameters, "positions in metres").partition("; ")
                 return self._subject.warning("parameters", f"{found}; {problem}", as_sentence(remedy))
@@ -238,23 +243,3 @@ class SourceChecks:
             "The gateway publishes data without names and units. Look for unusual characters in the names of "
             "markers and tools on the server, or update the server's software.",
         )
-
-
-def _summary(parameters: Parameters) -> str:
-    """Return for example "24 markers, 4 tools"."""
-    parts = []
-    if parameters.markers is not None:
-        parts.append(_count(len(parameters.markers.markers), "marker"))
-    if parameters.tools is not None:
-        parts.append(_count(len(parameters.tools.tools), "tool"))
-    if parameters.analog is not None:
-        parts.append(_count(len(parameters.analog.channels), "analog channel"))
-    if parameters.force is not None:
-        parts.append(_count(len(parameters.force.plates), "force plate"))
-    if parameters.events is not None:
-        parts.append(_count(len(parameters.events.events), "event type"))
-    return ", ".join(parts) or "the server's parameters are empty"
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -10,6 +10,7 @@ from gateway.errors import ParametersError
 from gateway.logs.losses import counts_text
 from gateway.messages.source_report import LossReport, OutputReport, SourceReport, StreamReport, source_report
 from gateway.messages.texts import xml_bytes
+from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4
@@ -65,19 +66,24 @@ def summarise_xml(xml: bytes) -> str:
         parameters = parse_parameters(xml).parameters
     except ParametersError:
         return f"{size} that cannot be read as parameters"
+    return f"{size}: {described_items(parameters) or 'no markers, tools, channels, plates or events'}"
+
+
+def described_items(parameters: Parameters, event: str = "event") -> str:
+    """Return what parameters describe, such as "24 markers, 1 tool"; ``event`` is the word for events."""
     sections = (
         ("marker", parameters.markers, "markers"),
         ("tool", parameters.tools, "tools"),
         ("analog channel", parameters.analog, "channels"),
         ("force plate", parameters.force, "plates"),
-        ("event", parameters.events, "events"),
+        (event, parameters.events, "events"),
     )
     texts = []
     for name, section, items in sections:
         if section is not None:
             count = len(getattr(section, items))
             texts.append(f"{count} {name}{'' if count == 1 else 's'}")
-    return f"{size}: {', '.join(texts) or 'no markers, tools, channels, plates or events'}"
+    return ", ".join(texts)
 
 
 def _frame_content(message: Any, units: Sequence[str]) -> str:

@@ -1,5 +1,6 @@
 """Results of checks; the doctor reports them."""
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Final, NamedTuple
 
@@ -73,6 +74,19 @@ class Subject(NamedTuple):
         """Return a failing finding and what to do about it."""
         return Finding(self.name, check, Result.FAILING, found, remedy, self.stream)
 
+    def problem(self, check: str, text: str, default_remedy: str = "") -> Finding:
+        """Return a failing finding for the text of an error: what is wrong, "; ", and what to do about it.
+
+        Without what to do, it is ``default_remedy``.
+        """
+        found, _, remedy = text.partition("; ")
+        return self.failing(check, found, as_sentence(remedy) if remedy else default_remedy)
+
+    def failing_first(self, failing: Finding, later: Iterable[str]) -> list[Finding]:
+        """Return a failing finding, and that the ``later`` checks are not made because of it."""
+        reason = f"it needs {failing.check}, which failed"
+        return [failing, *(self.not_tested(check, reason) for check in later)]
+
     def not_tested(self, check: str, reason: str) -> Finding:
         """Return a finding for a check that could not be made."""
         return Finding(self.name, check, Result.NOT_TESTED, reason, "", self.stream)
@@ -80,6 +94,11 @@ class Subject(NamedTuple):
     def disabled(self, check: str) -> Finding:
         """Return a finding for a check of an output that the configuration does not enable."""
         return self.not_tested(check, f"{self.name}.enabled is false")
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things, such as "1 router" or "2 routers"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def as_sentence(text: str) -> str:

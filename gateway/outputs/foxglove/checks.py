@@ -27,14 +27,9 @@ def check_foxglove(
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
-            return [
-                _foxglove.failing(
-                    "package",
-                    f"the package {name} is not installed",
-                    "Install it with: pip install 'rtc3d-gateway[foxglove]'",
-                ),
-                _foxglove.not_tested("port", "it needs package, which failed"),
-            ]
+            remedy = "Install it with: pip install 'rtc3d-gateway[foxglove]'"
+            failing = _foxglove.failing("package", f"the package {name} is not installed", remedy)
+            return _foxglove.failing_first(failing, CHECKS[1:])
     found = ", ".join(f"{name} {number}" for name, number in versions.items())
     return [_foxglove.passing("package", found), _check_port(settings, sources)]
 

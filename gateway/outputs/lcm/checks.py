@@ -6,7 +6,7 @@ from typing import Final
 from urllib.parse import parse_qs
 
 from gateway.errors import OutputError
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.lcm.connection import (
     MULTICAST_SCHEMES,
     multicast_interface,
@@ -72,8 +72,7 @@ def _ttl(url: str) -> str:
 def _check_route(url: str) -> Finding:
     problem = multicast_problem(url)
     if problem:
-        found, _, remedy = problem.partition("; ")
-        return _lcm.failing("route", found, as_sentence(remedy))
+        return _lcm.problem("route", problem)
     try:
         open_lcm(url)
     except OutputError as error:

@@ -12,7 +12,7 @@ from gateway.errors import ConfigError, OutputError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import lsl_environment
@@ -35,8 +35,7 @@ def check_lsl(
     try:
         output = LslOutput(settings)
     except ConfigError as error:
-        found, _, remedy = str(error).partition("; ")
-        return _not_open(found, remedy)
+        return _not_open(str(error))
     try:
         publisher = output.frame_publisher(_TEST_SOURCE)
         output.start()
@@ -45,8 +44,7 @@ def check_lsl(
             time.sleep(_POLL_S)
         problem = output.health().problem
         if problem:
-            found, _, remedy = problem.partition("; ")
-            return _not_open(found, remedy)
+            return _not_open(problem)
         parameters = Parameters(events=ParametersEvents())
         output.publish_parameters(
             _TEST_SOURCE, ServerParameters(b"", 1, 1, parsed=parameters, frame=CoordinateFrame(_TEST_SOURCE))
@@ -56,7 +54,7 @@ def check_lsl(
             streams = _find_streams(settings, max(seconds / 2, _MIN_SEARCH_S))
         except OutputError as error:
             failing = _lsl.failing("found", str(error), "Check lsl.config, or the file lsl_api.cfg.")
-            return [opens, failing, _lsl.not_tested("gateway", "it needs found, which failed")]
+            return [opens, *_lsl.failing_first(failing, ["gateway"])]
         publisher.close()
     finally:
         output.close()
@@ -90,10 +88,9 @@ def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]
     return found
 
 
-def _not_open(found: str, remedy: str) -> list[Finding]:
-    remedy = as_sentence(remedy) if remedy else "Correct lsl in the configuration."
-    others = [_lsl.not_tested(check, "it needs opens, which failed") for check in CHECKS[1:]]
-    return [_lsl.failing("opens", found, remedy), *others]
+def _not_open(problem: str) -> list[Finding]:
+    failing = _lsl.problem("opens", problem, "Correct lsl in the configuration.")
+    return _lsl.failing_first(failing, CHECKS[1:])
 
 
 def _found(names: set[tuple[str, str]]) -> Finding:

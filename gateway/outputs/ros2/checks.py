@@ -35,10 +35,8 @@ def check_ros2(
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        return [
-            _ros2.failing("router", f"no Zenoh router at {settings.connect}: {zenoh_reason(error)}", _REMEDY),
-            *(_ros2.not_tested(check, "it needs router, which failed") for check in CHECKS[1:]),
-        ]
+        found = f"no Zenoh router at {settings.connect}: {zenoh_reason(error)}"
+        return _ros2.failing_first(_ros2.failing("router", found, as_sentence(REMEDY)), CHECKS[1:])
     try:
         replies = session.liveliness().get(tokens_of(settings.domain_id), timeout=seconds)
         first = itertools.islice(replies, _MAX_TOKENS)
@@ -49,9 +47,6 @@ def check_ros2(
     names = sorted({each.node for each in seen if not each.topic})
     reached = _ros2.passing("router", f"connected to the router at {settings.connect}")
     return [reached, _gateway(names, settings), _nodes(names, settings), _types(seen, settings)]
-
-
-_REMEDY: Final = as_sentence(REMEDY)
 
 
 def _gateway(names: Sequence[str], settings: Ros2Settings) -> Finding:

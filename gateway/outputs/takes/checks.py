@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.folder import check_directory
 from gateway.outputs.takes.settings import TakesSettings
@@ -36,12 +36,7 @@ def check_takes(
         with _probe(directory):
             pass
     except OSError as error:
-        found, _, remedy = disk_problem(directory, error).partition("; ")
-        reason = "it needs folder, which failed"
-        return [
-            _takes.failing("folder", found, as_sentence(remedy)),
-            *(_takes.not_tested(check, reason) for check in CHECKS[1:]),
-        ]
+        return _takes.failing_first(_takes.problem("folder", disk_problem(directory, error)), CHECKS[1:])
     writable = _takes.passing("folder", f"{directory} can be written")
     return [writable, _check_space(settings, loads), _check_links(settings)]
 

@@ -16,7 +16,7 @@ import zenoh
 from gateway.config.secrets import mask_secrets_in_text
 from gateway.errors import ConfigError
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Finding, MessageLoad, Subject, counted
 from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
@@ -96,10 +96,7 @@ def _doctor_config(settings: ZenohSettings, seconds: float) -> zenoh.Config:
 
 
 def _no_link(found: str, remedy: str) -> list[Finding]:
-    return [
-        _zenoh.failing("link", found, remedy),
-        _zenoh.not_tested("gateway", "it needs link, which failed"),
-    ]
+    return _zenoh.failing_first(_zenoh.failing("link", found, remedy), ["gateway"])
 
 
 def _find_gateways(session: zenoh.Session, keys: dict[str, str], seconds: float) -> list[str]:
@@ -128,12 +125,8 @@ def _listen_problem(config: zenoh.Config, listen: Sequence[str]) -> str:
 
 
 def _link(mode: str, routers: int, peers: int) -> Finding:
-    others = "a router" if mode == "client" else f"{_count(routers, 'router')} and {_count(peers, 'peer')}"
+    others = "a router" if mode == "client" else f"{counted(routers, 'router')} and {counted(peers, 'peer')}"
     return _zenoh.passing("link", f"the session is open and connected to {others}")
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _gateway(served: Sequence[str], sources: Sequence[str]) -> Finding:

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import pytest
 
-from gateway.doctor import computer_checks, frame_checks, gateway_checks, source_checks
-from gateway.doctor.computer_checks import check_receive_buffer
+from gateway.doctor import all_checks, frame_checks, gateway_checks, source_checks
+from gateway.doctor.frame_checks import check_receive_buffer
 from gateway.doctor.gateway_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.observation import ObservedStream
 from gateway.outputs.findings import Finding, Result, Subject
@@ -22,7 +22,7 @@ from gateway.rtc3d.parameters import Parameters
 
 def test_the_clock_is_read() -> None:
     """The structure that the kernel fills has the right size and order."""
-    is_synchronised, max_error_us = computer_checks.read_clock()
+    is_synchronised, max_error_us = all_checks.read_clock()
     assert isinstance(is_synchronised, bool)
     assert max_error_us >= 0
 
@@ -39,8 +39,8 @@ def test_a_clock_matters_to_messages_that_leave(
     monkeypatch: pytest.MonkeyPatch, clock: tuple[bool, int], leaving: list[str], result: Result, found: str
 ) -> None:
     """Programs on this computer use the same clock; others compare utime with theirs."""
-    monkeypatch.setattr(computer_checks, "read_clock", lambda: clock)
-    finding = computer_checks.check_clock(leaving)
+    monkeypatch.setattr(all_checks, "read_clock", lambda: clock)
+    finding = all_checks.check_clock(leaving)
     assert finding.result is result
     assert finding.found.endswith(found)
     assert ("chrony" in finding.remedy) is (result is not Result.PASSING)
@@ -52,8 +52,8 @@ def test_a_clock_whose_state_is_not_reported_is_not_tested(monkeypatch: pytest.M
     def refuse() -> tuple[bool, int]:
         raise OSError(1, "adjtimex is not allowed")
 
-    monkeypatch.setattr(computer_checks, "read_clock", refuse)
-    finding = computer_checks.check_clock(["zenoh"])
+    monkeypatch.setattr(all_checks, "read_clock", refuse)
+    finding = all_checks.check_clock(["zenoh"])
     assert finding.result is Result.NOT_TESTED
     assert finding.found == "the kernel does not report it: adjtimex is not allowed"
 
