@@ -8,12 +8,12 @@ import viser
 
 from gateway.descriptions.force_plates import METRES_PER_NEWTON
 from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.view.laboratory import UP_AXES, UpAxis
 from gateway.display.view.markers_and_tools import SourceColor
 from gateway.display.view.plots import Plots
 from gateway.display.view.server import ShownLatency, set_theme
 from gateway.display.view.source_text import State, data_state, gateway_states, ignored_html, source_html
 from gateway.display.view.texts import clock_text, counted, events_html, html_text, items_html
-from gateway.display.view.world import UP_AXES, UpAxis
 from gateway.messages.source_report import Level
 
 _SCRIPT: Final = """
@@ -148,10 +148,10 @@ class Switches:
         self._tab = tab
         with tab:
             button = server.gui.add_button("Fit view", hint="Turn the camera so that it sees all data.")
-            self._marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
-            self._tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
-            self._trails = server.gui.add_checkbox("Marker trails", initial_value=False)
-            self._floor = server.gui.add_checkbox("Floor", initial_value=True)
+            self.marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
+            self.tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
+            self.trails = server.gui.add_checkbox("Marker trails", initial_value=False)
+            self.floor = server.gui.add_checkbox("Floor", initial_value=True)
             self._up = server.gui.add_dropdown(
                 "Up axis", UP_AXES, initial_value="z", hint="The axis of the laboratory that points up."
             )
@@ -174,26 +174,6 @@ class Switches:
         def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
             if event.client is not None:
                 set_theme(event.client.gui, dark=themes.value == "dark")
-
-    @property
-    def marker_labels(self) -> bool:
-        """Whether markers have labels."""
-        return self._marker_labels.value
-
-    @property
-    def tool_labels(self) -> bool:
-        """Whether tools have labels."""
-        return self._tool_labels.value
-
-    @property
-    def trails(self) -> bool:
-        """Whether markers have trails."""
-        return self._trails.value
-
-    @property
-    def floor(self) -> bool:
-        """Whether the floor is shown."""
-        return self._floor.value
 
     @property
     def up(self) -> UpAxis:
