@@ -4,13 +4,13 @@ The names of the fields are those of ``top --json``. What the status says is in 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gateway.client.series import POSE
+from gateway.client.series import POSE, Series
 from gateway.descriptions.labels import describe
-from gateway.display.live.component import LiveComponent, Percentiles
+from gateway.display.live.component import LiveComponent
 from gateway.display.live.live_data import LiveSource
 from gateway.logs.safe_text import safe_text
 from gateway.messages.source_report import Level, SourceReport
@@ -40,16 +40,16 @@ class ComponentFacts:
     num_gaps: int
     num_restarts: int
     has_two_gateways: bool
-    capture_to_gateway_p50_ms: float | None
-    capture_to_gateway_p99_ms: float | None
-    gateway_to_here_p50_ms: float | None
-    gateway_to_here_p99_ms: float | None
-    num_items: int | None
-    num_visible: int | None
-    age_s: float | None
-    is_stopped: bool
-    num_skipped: int
-    num_malformed: int
+    capture_to_gateway_p50_ms: float | None = None
+    capture_to_gateway_p99_ms: float | None = None
+    gateway_to_here_p50_ms: float | None = None
+    gateway_to_here_p99_ms: float | None = None
+    num_items: int | None = None
+    num_visible: int | None = None
+    age_s: float | None = None
+    is_stopped: bool = False
+    num_skipped: int = 0
+    num_malformed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,29 +113,28 @@ def components(source: LiveSource) -> list[ComponentFacts]:
     wanted = {*source.components, *(source.report.components if source.report else ())}
     found = [_component(source, each) for each in WIRE_ORDER if each.key in wanted]
     poses = [series for series in source.series if series.key.startswith(POSE)]
-    return [*found, _poses(poses)] if poses else found
+    if poses:
+        found.append(ComponentFacts(f"{POSE}*", None, None, *_message_counts(poses), num_items=len(poses)))
+    return found
 
 
 def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     component = source.components.get(kind.key) or LiveComponent(kind)
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
-    announced = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
+    announced_hz = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
     can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
-    to_gateway, to_here = component.latency.to_gateway, component.latency.to_here
+    to_gateway_p50_ms, to_gateway_p99_ms = component.latency.to_gateway or (None, None)
+    to_here_p50_ms, to_here_p99_ms = component.latency.to_here or (None, None)
     return ComponentFacts(
-        component=kind.key,
-        rate_hz=0.0 if component.is_stopped else component.rate_hz,
-        announced_rate_hz=_finite(announced),
-        num_messages=0 if series is None else series.num_messages,
-        num_lost=0 if series is None else series.check.num_lost,
-        num_gaps=0 if series is None else series.check.num_gaps,
-        num_restarts=0 if series is None else series.check.num_restarts,
-        has_two_gateways=series is not None and series.check.has_two_publishers,
-        capture_to_gateway_p50_ms=_p50_ms(to_gateway),
-        capture_to_gateway_p99_ms=_p99_ms(to_gateway),
-        gateway_to_here_p50_ms=_p50_ms(to_here),
-        gateway_to_here_p99_ms=_p99_ms(to_here),
+        kind.key,
+        0.0 if component.is_stopped else component.rate_hz,
+        announced_hz if announced_hz is not None and math.isfinite(announced_hz) else None,
+        *_message_counts([] if series is None else [series]),
+        to_gateway_p50_ms,
+        to_gateway_p99_ms,
+        to_here_p50_ms,
+        to_here_p99_ms,
         num_items=len(component.newest_items) if has_come else None,
         num_visible=int(component.is_visible.sum()) if can_be_seen else None,
         age_s=component.age_s,
@@ -145,28 +144,15 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     )
 
 
-def _poses(series: Iterable[Any]) -> ComponentFacts:
-    poses = [*series]
-    checks = [each.check for each in poses]
-    return ComponentFacts(
-        component=f"{POSE}*",
-        rate_hz=None,
-        announced_rate_hz=None,
-        num_messages=sum(each.num_messages for each in poses),
-        num_lost=sum(check.num_lost for check in checks),
-        num_gaps=sum(check.num_gaps for check in checks),
-        num_restarts=max(check.num_restarts for check in checks),
-        has_two_gateways=any(check.has_two_publishers for check in checks),
-        capture_to_gateway_p50_ms=None,
-        capture_to_gateway_p99_ms=None,
-        gateway_to_here_p50_ms=None,
-        gateway_to_here_p99_ms=None,
-        num_items=len(poses),
-        num_visible=None,
-        age_s=None,
-        is_stopped=False,
-        num_skipped=0,
-        num_malformed=0,
+def _message_counts(series: Sequence[Series]) -> tuple[int, int, int, int, bool]:
+    """Return how many messages came, were lost, in how many gaps; restarts; whether two gateways publish."""
+    checks = [each.check for each in series]
+    return (
+        sum(each.num_messages for each in series),
+        sum(check.num_lost for check in checks),
+        sum(check.num_gaps for check in checks),
+        max((check.num_restarts for check in checks), default=0),
+        any(check.has_two_publishers for check in checks),
     )
 
 
@@ -175,44 +161,29 @@ def has_two_gateways(source: LiveSource) -> bool:
     return any(series.check.has_two_publishers for series in source.series)
 
 
-def markers(source: LiveSource) -> list[ItemFacts]:
-    """Return the markers, in the order of the server."""
-    return _items(source.components.get("3d"))
-
-
-def tools(source: LiveSource) -> list[ItemFacts]:
-    """Return the tools, in the order of the server."""
-    return _items(source.components.get("6d"))
-
-
-def _items(component: LiveComponent | None) -> list[ItemFacts]:
+def items(source: LiveSource, kind: ComponentType) -> list[ItemFacts]:
+    """Return the markers or the tools, in the order of the server."""
+    component = source.components.get(kind.key)
     if component is None:
         return []
-    items = component.newest_items
-    shares = component.visible_shares.tolist() or [None] * len(items)
-    errors = items["error"].tolist() if "error" in (items.dtype.names or ()) else [None] * len(items)
+    newest = component.newest_items
+    shares = component.visible_shares.tolist() or [None] * len(newest)
+    errors = newest["error"].tolist() if "error" in (newest.dtype.names or ()) else [None] * len(newest)
     columns = zip(
         component.description.labels,
         component.description.units,
         shares,
         component.is_visible.tolist(),
-        *(items[name].tolist() for name in "xyz"),
+        *(newest[name].tolist() for name in "xyz"),
         errors,
         strict=True,
     )
-    return [
-        ItemFacts(
-            safe_text(label, _MAX_LABEL),
-            share,
-            is_seen,
-            x if is_seen else None,
-            y if is_seen else None,
-            z if is_seen else None,
-            safe_text(unit, _MAX_LABEL),
-            error if is_seen else None,
-        )
-        for label, unit, share, is_seen, x, y, z, error in columns
-    ]
+    found = []
+    for label, unit, share, is_seen, *values in columns:
+        x, y, z, error = values if is_seen else (None, None, None, None)
+        name, unit_name = safe_text(label, _MAX_LABEL), safe_text(unit, _MAX_LABEL)
+        found.append(ItemFacts(name, share, is_seen, x, y, z, unit_name, error))
+    return found
 
 
 def losses(source: LiveSource) -> list[LossFacts]:
@@ -278,8 +249,8 @@ def source_facts(source: LiveSource) -> dict[str, Any]:
         "has_two_gateways": has_two_gateways(source),
         "parameters_version": source.parameters_version,
         "components": components(source),
-        "markers": markers(source),
-        "tools": tools(source),
+        "markers": items(source, ComponentType.MARKERS),
+        "tools": items(source, ComponentType.TOOLS),
         "streams": [_fields(stream, _STREAM_FIELDS) for stream in report.streams],
         "losses": losses(source),
         "outputs": [_fields(output, _OUTPUT_FIELDS) for output in report.outputs],
@@ -289,15 +260,3 @@ def source_facts(source: LiveSource) -> dict[str, Any]:
 
 def _fields(report: object, names: Iterable[str]) -> dict[str, Any]:
     return {name: getattr(report, name) for name in names}
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-def _p50_ms(latency: Percentiles | None) -> float | None:
-    return None if latency is None else latency.p50_ms
-
-
-def _p99_ms(latency: Percentiles | None) -> float | None:
-    return None if latency is None else latency.p99_ms

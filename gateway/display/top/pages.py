@@ -11,6 +11,7 @@ from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
 from gateway.logs.safe_text import safe_text
 from gateway.messages.source_report import OutputReport
+from gateway.rtc3d.components import ComponentType
 
 TWO_GATEWAYS: Final = (
     "two gateways publish a source of this name, so lost messages are not counted exactly: give one of them "
@@ -107,58 +108,46 @@ def _latency_cell(p50_ms: float | None, p99_ms: float | None) -> Cell:
 
 def markers(sources: Sequence[LiveSource]) -> Table:
     """How often each marker was visible, and where it is."""
-    columns = (
-        Column("marker"),
-        Column("visible in 10 s", is_number=True),
-        Column("now"),
-        *_position_columns(),
-        Column("source", rank=1),
-    )
-    rows = [
-        (*_item_cells(item), text_cell(_name(source))) for source in sources for item in facts.markers(source)
-    ]
-    return Table(columns, [Section(rows)] if rows else [], "no markers so far", Order("visible in 10 s"))
+    return _items(sources, ComponentType.MARKERS, "marker")
 
 
 def tools(sources: Sequence[LiveSource]) -> Table:
     """How often each tool was visible, its error, and where it is."""
+    return _items(sources, ComponentType.TOOLS, "tool")
+
+
+def _items(sources: Sequence[LiveSource], kind: ComponentType, noun: str) -> Table:
+    has_error = kind is ComponentType.TOOLS
     columns = (
-        Column("tool"),
+        Column(noun),
         Column("visible in 10 s", is_number=True),
         Column("now"),
-        Column("error", is_number=True),
-        *_position_columns(),
+        *([Column("error", is_number=True)] if has_error else []),
+        *(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"),
+        Column("unit", rank=3),
         Column("source", rank=1),
     )
-    rows = []
-    for source in sources:
-        for item in facts.tools(source):
-            name, share, now, *position = _item_cells(item)
-            error = number_cell(item.error, 3)
-            rows.append((name, share, now, error, *position, text_cell(_name(source))))
-    return Table(columns, [Section(rows)] if rows else [], "no tools so far", Order("visible in 10 s"))
-
-
-def _position_columns() -> list[Column]:
-    return [*(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"), Column("unit", rank=3)]
-
-
-def _item_cells(item: facts.ItemFacts) -> list[Cell]:
-    share = item.visible_share
-    style = Style.FAINT if share is None else _share_style(share)
-    return [
-        text_cell(item.label, Style.PLAIN if item.is_visible else Style.BAD),
-        Cell("") if share is None else Cell(f"{visible_percent(share):.1f} %", style, share),
-        text_cell("visible") if item.is_visible else text_cell("missing", Style.BAD),
-        *(number_cell(value, 1) for value in (item.x, item.y, item.z)),
-        text_cell(item.unit, Style.FAINT),
+    rows = [
+        (
+            text_cell(item.label, Style.PLAIN if item.is_visible else Style.BAD),
+            _share_cell(item.visible_share),
+            text_cell("visible") if item.is_visible else text_cell("missing", Style.BAD),
+            *([number_cell(item.error, 3)] if has_error else []),
+            *(number_cell(value, 1) for value in (item.x, item.y, item.z)),
+            text_cell(item.unit, Style.FAINT),
+            text_cell(_name(source)),
+        )
+        for source in sources
+        for item in facts.items(source, kind)
     ]
+    return Table(columns, [Section(rows)], f"no {noun}s so far", Order("visible in 10 s"))
 
 
-def _share_style(share: float) -> Style:
-    if share < _SELDOM_SHARE:
-        return Style.BAD
-    return Style.WARNING if share < 1 else Style.PLAIN
+def _share_cell(share: float | None) -> Cell:
+    if share is None:
+        return Cell("")
+    style = Style.BAD if share < _SELDOM_SHARE else _warning_if(share < 1)
+    return Cell(f"{visible_percent(share):.1f} %", style, share)
 
 
 def server(sources: Sequence[LiveSource]) -> Table:
@@ -233,7 +222,7 @@ def drops(sources: Sequence[LiveSource]) -> Table:
         for source in sources
         for loss in facts.losses(source)
     ]
-    return Table(columns, [Section(rows)] if rows else [], "nothing was lost")
+    return Table(columns, [Section(rows)], "nothing was lost")
 
 
 def outputs(sources: Sequence[LiveSource]) -> Table:
@@ -262,7 +251,7 @@ def outputs(sources: Sequence[LiveSource]) -> Table:
                 )
             )
         notes += [(text, Style.BAD) for text in _output_problems(source)]
-    return Table(columns, [Section(rows, (), notes)] if rows else [], "no output so far")
+    return Table(columns, [Section(rows, (), notes)], "no output so far")
 
 
 def questions(sources: Sequence[LiveSource]) -> Table:
@@ -284,7 +273,7 @@ def questions(sources: Sequence[LiveSource]) -> Table:
         for output in _outputs(source)
         for result, count in output.queries.items()
     ]
-    return Table(columns, [Section(rows)] if rows else [], "nobody has asked anything so far")
+    return Table(columns, [Section(rows)], "nobody has asked anything so far")
 
 
 def events(sources: Sequence[LiveSource]) -> Table:
@@ -301,7 +290,7 @@ def events(sources: Sequence[LiveSource]) -> Table:
         )
         for source, event in found
     ]
-    return Table(columns, [Section(rows)] if rows else [], "no events so far")
+    return Table(columns, [Section(rows)], "no events so far")
 
 
 PAGES: Final = (

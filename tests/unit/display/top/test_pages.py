@@ -10,6 +10,7 @@ from gateway.display.top import facts
 from gateway.display.top.pages import PAGES, TWO_GATEWAYS, Page, event_time
 from gateway.display.top.table import laid_out, sorted_by
 from gateway.messages.decode import json_text
+from gateway.rtc3d.components import ComponentType
 from tests.statuses import count, loss, output, stream
 from tests.unit.display.live_lab import Lab
 
@@ -152,7 +153,7 @@ def test_data_that_stop_are_stopped_at_once(monkeypatch: pytest.MonkeyPatch) -> 
     assert component.is_stopped
     assert (component.rate_hz, component.num_visible) == (0, 0)
     assert facts.state(source) == facts.StateFacts("streaming 200.0 Hz; stopped: 3d", "error")
-    [marker] = facts.markers(source)
+    [marker] = facts.items(source, ComponentType.MARKERS)
     assert not marker.is_visible
     assert marker.x is None
 
