@@ -11,7 +11,7 @@ from gateway.doctor.gateway_checks import CHECKS as GATEWAY_CHECKS
 from gateway.doctor.gateway_checks import HealthReport, address_text, check_gateway, read_health
 from gateway.doctor.source_checks import CHECKS, SourceChecks
 from gateway.errors import ConfigError
-from gateway.outputs.findings import NO_CONFIGURATION, Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import NO_CONFIGURATION, Check, Finding, MessageLoad, as_sentence
 from gateway.outputs.kind import OPENS, OutputKind
 from gateway.outputs.registry import OUTPUTS, UNUSABLE
 from gateway.workers import WorkerThread
@@ -31,8 +31,8 @@ def check_output(
     ``sources`` are the names of all sources, ``loads`` the messages that they make.
     """
     if not settings.enabled:
-        subject = Subject(kind.name)
-        return [subject.disabled(check) for check in kind.checks]
+        reason = f"{kind.name}.enabled is false"
+        return [Check(kind.name, check).not_tested(reason) for check in kind.checks]
     if kind.run_checks is not None:
         return kind.run_checks(settings, sources, loads, seconds)
     return [_check_opens(kind, settings, seconds)]
@@ -40,12 +40,12 @@ def check_output(
 
 def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> Finding:
     """Check that the output opens, as in the gateway, within ``seconds``; then close it."""
-    subject = Subject(kind.name)
+    check = Check(kind.name, OPENS)
     default_remedy = f"Correct {kind.name} in the configuration."
     try:
         output = kind.create(settings)
     except ConfigError as error:
-        return subject.failing(OPENS, str(error), default_remedy)
+        return check.failing(str(error), default_remedy)
     output.start()
     deadline_s = time.monotonic() + seconds
     while not output.health().connected and time.monotonic() < deadline_s:
@@ -54,11 +54,11 @@ def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> 
     health = output.health()
     output.close()
     if health.connected:
-        return subject.passing(OPENS, "the output opens")
-    return subject.problem(OPENS, health.problem, default_remedy)
+        return check.passing("the output opens")
+    return check.problem(health.problem, default_remedy)
 
 
-_configuration = Subject("configuration")
+_FILE: Final = Check("configuration", "file")
 
 
 async def run_checks(
@@ -80,7 +80,7 @@ async def run_checks(
     """
     enabled = [name for name, section in settings.outputs.items() if section.enabled]
     names = [source.name for source in settings.sources]
-    yield _configuration.passing("file", f"{origin}: {', '.join(names)} to {', '.join(enabled)}")
+    yield _FILE.passing(f"{origin}: {', '.join(names)} to {', '.join(enabled)}")
     report = await read_health(settings.metrics)
     for finding in check_gateway(report, address_text(settings.metrics), names, connects=connects):
         yield finding
@@ -97,16 +97,14 @@ async def run_checks(
             yield finding
     for name, text in UNUSABLE.items():
         found, _, remedy = text.rpartition("; ")
-        yield Subject(name).warning("package", found, as_sentence(remedy))
+        yield Check(name, "package").warning(found, as_sentence(remedy))
     leaving = [name for name in enabled if OUTPUTS[name].leaves_host(settings.outputs[name])]
     yield check_clock(leaving)
 
 
 def run_checks_without_settings(error: ConfigError) -> Iterator[Finding]:
     """Yield ``error`` as a finding, and run the checks that need no settings."""
-    yield _configuration.failing(
-        "file", str(error), "Correct these lines; config/gateway.yaml explains every key."
-    )
+    yield _FILE.failing(str(error), "Correct these lines; config/gateway.yaml explains every key.")
     subjects = {
         "running gateway": GATEWAY_CHECKS,
         "source": CHECKS,
@@ -114,13 +112,13 @@ def run_checks_without_settings(error: ConfigError) -> Iterator[Finding]:
     }
     for subject, checks in subjects.items():
         for check in checks:
-            yield Subject(subject).not_tested(check, NO_CONFIGURATION)
+            yield Check(subject, check).not_tested(NO_CONFIGURATION)
     yield check_clock([])
 
 
 _STA_UNSYNC: Final = 0x40  # linux/timex.h
 
-_computer: Final = Subject("this computer")
+_CLOCK: Final = Check("this computer", "clock")
 
 
 class _Timex(ctypes.Structure):
@@ -160,11 +158,9 @@ def check_clock(leaving: Sequence[str]) -> Finding:
     try:
         is_synchronised, max_error_us = read_clock()
     except OSError as error:
-        return _computer.not_tested("clock", f"the kernel does not report it: {error.strerror or error}")
+        return _CLOCK.not_tested(f"the kernel does not report it: {error.strerror or error}")
     if is_synchronised:
-        return _computer.passing(
-            "clock", f"synchronised, with an error of at most {max_error_us / 1000:.1f} ms"
-        )
+        return _CLOCK.passing(f"synchronised, with an error of at most {max_error_us / 1000:.1f} ms")
     found = (
         "this computer's clock is not synchronised, so utime cannot be compared with the clocks of other "
         "computers"
@@ -174,5 +170,5 @@ def check_clock(leaving: Sequence[str]) -> Finding:
         "shows the state. In a container, do this on the host."
     )
     if leaving:
-        return _computer.failing("clock", f"{found}, which {' and '.join(leaving)} can reach", remedy)
-    return _computer.warning("clock", f"{found}; so far, all messages stay on this computer", remedy)
+        return _CLOCK.failing(f"{found}, which {' and '.join(leaving)} can reach", remedy)
+    return _CLOCK.warning(f"{found}; so far, all messages stay on this computer", remedy)

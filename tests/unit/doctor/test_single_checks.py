@@ -12,7 +12,7 @@ from gateway.doctor import all_checks, frame_checks, gateway_checks, source_chec
 from gateway.doctor.frame_checks import check_receive_buffer
 from gateway.doctor.gateway_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.observation import ObservedStream
-from gateway.outputs.findings import Finding, Result, Subject
+from gateway.outputs.findings import Check, Finding, Result
 from gateway.outputs.kind import OPENS
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
@@ -116,7 +116,7 @@ def rate_finding(
     settings = SimpleNamespace(rate=rate)
     stream: Any = SimpleNamespace(observed=observed, settings=settings, shares_connection=False)
     return frame_checks.check_rate(
-        Subject("lab"), cast("ObservedStream", stream), cast("Parameters", object())
+        Check("lab", "rate"), cast("ObservedStream", stream), cast("Parameters", object())
     )
 
 
@@ -164,7 +164,7 @@ LINUX = "4096\t131072\t6291456\n"
 def buffer_finding(folder: Path, tcp_rmem: str, load_bytes_per_s: float) -> Finding:
     path = folder / "tcp_rmem"
     path.write_text(tcp_rmem)
-    return check_receive_buffer(Subject("lab"), load_bytes_per_s, path)
+    return check_receive_buffer(Check("lab", "buffer"), load_bytes_per_s, path)
 
 
 def test_a_buffer_for_two_seconds_passes(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_an_unknown_size_or_load_is_not_tested(tmp_path: Path) -> None:
         finding = buffer_finding(tmp_path, tcp_rmem, 1000)
         assert finding.result is Result.NOT_TESTED
         assert finding.found.startswith(f"{tmp_path}/tcp_rmem cannot be read: ")
-    finding = check_receive_buffer(Subject("lab"), 1000, tmp_path / "missing")  # as without Linux
+    finding = check_receive_buffer(Check("lab", "buffer"), 1000, tmp_path / "missing")  # as without Linux
     assert finding.result is Result.NOT_TESTED
     assert buffer_finding(tmp_path, LINUX, 0.0).found == "no frames arrived"
 
