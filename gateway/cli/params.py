@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Literal, NamedTuple, TextIO
 
@@ -157,12 +157,16 @@ def _write_tables(by_source: dict[str, _SourceParameters], out: TextIO) -> None:
 
     console = Console(file=out)
     for source, merged in by_source.items():
-        for section in section_lists(merged.parameters):
-            records = [[_text(value, console) for value in row] for row in section.rows]
+        for key, section in SECTIONS.items():
+            content = section.of(merged.parameters)
+            if content is None:
+                continue
+            title, headings, rows = _LISTS[key](content)
+            records = [[_text(value, console) for value in row] for row in rows]
             if console.is_terminal:
-                print_list(console, section.headings, records, title=f"{source}: {section.title}")
+                print_list(console, headings, records, title=f"{source}: {title}")
             else:
-                write_records(out, [(source, section.key, *record) for record in records])
+                write_records(out, [(source, key, *record) for record in records])
         if merged.age_s is not None:
             notes = console if console.is_terminal else Console(stderr=True)
             notes.print(Text(safe_text(f"{source}: parameters are {merged.age_s:.1f} s old")))
@@ -175,35 +179,11 @@ def _text(value: object, console: "Console") -> str:
     return safe_text(f"{value:g}" if isinstance(value, float) else "" if value is None else str(value))
 
 
-_Rows = Sequence[Sequence[object]]
+_List = tuple[str, Sequence[str], Sequence[Sequence[object]]]
+"""A section of the parameters: its title, headings and rows. A value may be a tuple."""
 
 
-class SectionList(NamedTuple):
-    """A section of the parameters: its key, such as "3d", and its items. A value may be a tuple."""
-
-    key: str
-    title: str
-    headings: Sequence[str]
-    rows: _Rows
-
-
-def section_lists(parameters: Parameters) -> Iterator[SectionList]:
-    """Yield a list for each section in ``parameters``."""
-    describe: dict[str, Callable[[Any], tuple[str, Sequence[str], _Rows]]] = {
-        "general": _general,
-        "3d": _markers,
-        "6d": _tools,
-        "analog": _channels,
-        "force": _plates,
-        "events": _events,
-    }
-    for key, section in SECTIONS.items():
-        content = section.of(parameters)
-        if content is not None:
-            yield SectionList(key, *describe[key](content))
-
-
-def _general(general: General) -> tuple[str, Sequence[str], _Rows]:
+def _general(general: General) -> _List:
     rows = (
         ("name", general.name),
         ("version", general.version),
@@ -215,7 +195,7 @@ def _general(general: General) -> tuple[str, Sequence[str], _Rows]:
     return "general", ("server", ""), rows
 
 
-def _markers(section: Parameters3D) -> tuple[str, Sequence[str], _Rows]:
+def _markers(section: Parameters3D) -> _List:
     title = f"3D, {_count(section.markers, 'marker')}{_rate(section.frequency_hz)}, {section.unit}"
     rows = [
         (number, marker.id, marker.label, marker.description)
@@ -224,7 +204,7 @@ def _markers(section: Parameters3D) -> tuple[str, Sequence[str], _Rows]:
     return title, ("marker", "id", "label", "description"), rows
 
 
-def _tools(section: Parameters6D) -> tuple[str, Sequence[str], _Rows]:
+def _tools(section: Parameters6D) -> _List:
     rows = [
         (number, tool.id, tool.label, tool.description, " ".join(tool.marker_ids))
         for number, tool in enumerate(section.tools, start=1)
@@ -233,7 +213,7 @@ def _tools(section: Parameters6D) -> tuple[str, Sequence[str], _Rows]:
     return title, ("tool", "id", "label", "description", "ids of its markers"), rows
 
 
-def _channels(section: ParametersAnalog) -> tuple[str, Sequence[str], _Rows]:
+def _channels(section: ParametersAnalog) -> _List:
     rows = [
         (number, channel.id, channel.label, channel.description, channel.unit, channel.frequency_hz)
         for number, channel in enumerate(section.channels, start=1)
@@ -255,7 +235,7 @@ _PLATE_HEADINGS: Final = (
 )
 
 
-def _plates(section: ParametersForce) -> tuple[str, Sequence[str], _Rows]:
+def _plates(section: ParametersForce) -> _List:
     rows = [
         (
             number,
@@ -285,7 +265,7 @@ def _calibration(plate: Plate) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _events(section: ParametersEvents) -> tuple[str, Sequence[str], _Rows]:
+def _events(section: ParametersEvents) -> _List:
     rows = [
         (event.id, event.label, event.description, tuple(map(_event_parameter, event.parameters)))
         for event in section.events
@@ -308,3 +288,14 @@ def _count(items: Sequence[object], noun: str) -> str:
 
 def _rate(frequency_hz: float | None) -> str:
     return "" if frequency_hz is None else f", {frequency_hz:g} Hz"
+
+
+_LISTS: Final[dict[str, Callable[[Any], _List]]] = {
+    "general": _general,
+    "3d": _markers,
+    "6d": _tools,
+    "analog": _channels,
+    "force": _plates,
+    "events": _events,
+}
+"""How each section is listed, by its key."""

@@ -30,6 +30,13 @@ class Level(Enum):
     BAD = "bad"
 
 
+class State(NamedTuple):
+    """A state in words, and how well something works."""
+
+    level: Level
+    text: str
+
+
 _STATES: Final = {
     "streaming": (Level.GOOD, "streaming {rate_hz:.1f} Hz"),
     "idle": (Level.WAITING, "connected to {server}, no frames requested"),
@@ -121,6 +128,14 @@ class SourceReport:
     def text(self) -> str:
         """What the status line says about all streams; "" without any."""
         return streams_text((stream.components, stream.text) for stream in self.streams)
+
+    @property
+    def level(self) -> Level:
+        """The worst level of a stream; WAITING without any."""
+        levels = {stream.level for stream in self.streams}
+        if Level.BAD in levels:
+            return Level.BAD
+        return Level.GOOD if levels == {Level.GOOD} else Level.WAITING
 
     @property
     def components(self) -> list[str]:

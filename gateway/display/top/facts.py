@@ -13,19 +13,11 @@ from gateway.descriptions.labels import describe
 from gateway.display.live.component import LiveComponent
 from gateway.display.live.live_data import LiveSource
 from gateway.logs.safe_text import safe_text
-from gateway.messages.source_report import Level, SourceReport
+from gateway.messages.source_report import Level, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 
 _MAX_LABEL: Final = 64
 """How much is shown of a marker's or tool's label, and of its unit."""
-
-
-@dataclass(frozen=True, slots=True)
-class StateFacts:
-    """The state of a source. ``level`` is ok, warning or error."""
-
-    text: str
-    level: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,27 +77,20 @@ class EventFacts:
     parameters: str
 
 
-def state(source: LiveSource) -> StateFacts:
+def state(source: LiveSource) -> State:
     """Return the state of a source, in the words of the status line."""
     if source.is_silent:
         age_s = source.status_age_s
         since = "yet" if age_s is None else f"for {age_s:.0f} s"
-        return StateFacts(f"no status of its gateway {since}; is it running?", "error")
+        return State(Level.BAD, f"no status of its gateway {since}; is it running?")
     if source.report is None:
-        return StateFacts("waiting for the status of its gateway", "warning")
-    text = safe_text(source.report.text) or "its gateway reports no stream"
-    stopped = [each.key for each in WIRE_ORDER if _is_stopped(source, each)]
-    levels = {stream.level for stream in source.report.streams}
-    if Level.BAD in levels:
-        return StateFacts(text, "error")
-    if stopped:
-        return StateFacts(f"{text}; stopped: {' '.join(stopped)}", "error")
-    return StateFacts(text, "ok" if levels == {Level.GOOD} else "warning")
-
-
-def _is_stopped(source: LiveSource, kind: ComponentType) -> bool:
-    component = source.components.get(kind.key)
-    return component is not None and component.is_stopped
+        return State(Level.WAITING, "waiting for the status of its gateway")
+    level, text = source.report.level, safe_text(source.report.text) or "its gateway reports no stream"
+    stopped = [key for key, each in [*source.components.items()] if each.is_stopped]
+    if stopped and level is not Level.BAD:
+        in_order = [each.key for each in WIRE_ORDER if each.key in stopped]
+        return State(Level.BAD, f"{text}; stopped: {' '.join(in_order)}")
+    return State(level, text)
 
 
 def components(source: LiveSource) -> list[ComponentFacts]:
@@ -230,6 +215,7 @@ _STREAM_FIELDS: Final = (
     "last_error",
     "last_error_utime",
 )
+_LEVELS: Final = {Level.GOOD: "ok", Level.WAITING: "warning", Level.BAD: "error"}
 _OUTPUT_FIELDS: Final = ("output", "is_connected", "problem", "messages", "queries")
 
 
@@ -242,7 +228,7 @@ def source_facts(source: LiveSource) -> dict[str, Any]:
         "host": report.host,
         "gateway_version": report.version,
         "state": found.text,
-        "level": found.level,
+        "level": _LEVELS[found.level],
         "status_age_s": source.status_age_s,
         "age_s": source.age_s,
         "is_stopped": source.is_stopped,

@@ -10,14 +10,14 @@ from gateway.display.terminal import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
 from gateway.logs.safe_text import safe_text
-from gateway.messages.source_report import OutputReport
+from gateway.messages.source_report import Level, OutputReport
 from gateway.rtc3d.components import ComponentType
 
 TWO_GATEWAYS: Final = (
     "two gateways publish a source of this name, so lost messages are not counted exactly: give one of them "
     "another name"
 )
-_LEVEL_STYLES: Final = {"ok": Style.GOOD, "warning": Style.WARNING, "error": Style.BAD}
+_LEVEL_STYLES: Final = {Level.GOOD: Style.GOOD, Level.WAITING: Style.WARNING, Level.BAD: Style.BAD}
 _MAX_NAME: Final = 40
 _SELDOM_SHARE: Final = 0.9
 """A marker or tool that is visible in a smaller share of the frames is worth a look."""

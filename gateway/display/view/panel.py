@@ -12,9 +12,9 @@ from gateway.display.view.laboratory import UP_AXES, UpAxis
 from gateway.display.view.markers_and_tools import SourceColor
 from gateway.display.view.plots import Plots
 from gateway.display.view.server import ShownLatency, set_theme
-from gateway.display.view.source_text import State, data_state, gateway_states, ignored_html, source_html
+from gateway.display.view.source_text import data_state, gateway_states, ignored_html, source_html
 from gateway.display.view.texts import clock_text, counted, events_html, html_text, items_html
-from gateway.messages.source_report import Level
+from gateway.messages.source_report import Level, State
 
 _SCRIPT: Final = """
 if (!window.gatewayScript) {

@@ -1,7 +1,7 @@
 """What the panel says about one source, as HTML: state, rates, latency, losses."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 from gateway.display.live.component import LiveComponent, Percentiles
 from gateway.display.live.live_data import LiveData, LiveSource
@@ -17,18 +17,11 @@ from gateway.display.view.texts import (
     table,
 )
 from gateway.logs.losses import counts_text
-from gateway.messages.source_report import Level, LossReport, SourceReport
+from gateway.messages.source_report import Level, LossReport, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.stream.status import FRAME_REJECTED, NOT_SENT, SKIPPED
 
 _MAX_CHARACTERS: Final = 300
-
-
-class State(NamedTuple):
-    """A state in words, and how well it works."""
-
-    level: Level
-    text: str
 
 
 def data_state(source: LiveSource) -> State:

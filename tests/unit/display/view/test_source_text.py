@@ -11,7 +11,6 @@ from gateway.display.live.component import LiveComponent, Percentiles
 from gateway.display.live.live_data import LiveSource
 from gateway.display.view.panel import MAX_SOURCES, banner_html
 from gateway.display.view.source_text import (
-    State,
     data_state,
     gateway_states,
     ignored_html,
@@ -20,7 +19,7 @@ from gateway.display.view.source_text import (
 )
 from gateway.display.view.texts import clock_text
 from gateway.messages.host_time import now_utime
-from gateway.messages.source_report import Level
+from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
 from tests.statuses import loss, output, stream
 from tests.unit.display.live_lab import Lab, text_of, wait
