@@ -1,16 +1,16 @@
 """The command line: one module per command, and the modules that print its results.
 
 ``main`` has the table of commands and imports the module of a command only when it is needed: help and
-completion must be quick. The module of a command therefore has its options and little else, and imports what
-it needs to do its work within the function; ``options`` has the options that several commands share.
+completion must be quick. The module of a command therefore imports what it needs to do its work within the
+function; ``options`` has the options that several commands share.
 
-- Running: ``run``, ``simulate``, ``demo`` (with ``demo_lab``), ``doctor``, ``config``.
+- Running: ``run``, ``simulate`` (also ``demo``, with ``demo_lab``), ``doctor``, ``config``.
 - Listening: ``list_gateways``, ``echo``, ``top``, ``view``, ``params``.
 - Takes: ``record``, ``replay``, ``export``, ``take``. ``take_list`` and
   ``take_report`` print which there are, and what is in one.
 
 Everything that is asked of running gateways goes through ``gateway.client``.
 
-Modules named after a command (``echo_rates``, ``params_output``, ``record_output``, ``replay_run``) do its
-work. The exit statuses are in docs/reference/commands.md.
+Modules named after a command (``echo_output``, ``record_output``, ``replay_run``) do its work.
+The exit statuses are in docs/reference/commands.md.
 """

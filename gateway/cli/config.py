@@ -1,16 +1,22 @@
-"""``rtc3d-gateway config``: check or show a configuration, or print the JSON schema."""
+"""``rtc3d-gateway config``, and the configuration that the options of a command choose."""
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gateway.cli.options import ConfigOption, ServerOption
+from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.errors import ConfigError
 from gateway.logs.safe_text import safe_json
+from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
+
+if TYPE_CHECKING:
+    from gateway.config.loading import Configuration
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
 
@@ -28,7 +34,6 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Check a configuration file and print every mistake with its line. Starts nothing."""
-    from gateway.cli.configuration import chosen_file
     from gateway.config.loading import read
     from gateway.outputs.registry import settings_type
 
@@ -62,7 +67,6 @@ def _print_json(path: Path | None, *, sources: Sequence[str] = (), mistakes: Seq
 @app.command()
 def show(config: ConfigOption = None, server: ServerOption = None) -> None:
     """Print the effective configuration and where each value comes from. Secrets are masked."""
-    from gateway.cli.configuration import configuration_from_options
     from gateway.config.show import shown_configuration
 
     print(shown_configuration(configuration_from_options(config, server)), end="")
@@ -75,3 +79,54 @@ def schema() -> None:
     from gateway.outputs.registry import settings_type
 
     print(schema_text(settings_type()), end="")
+
+
+def chosen_file(
+    config: Path | None, server: str | None, *, wanted: str = "either --config FILE or --server HOST[:PORT]"
+) -> Path | None:
+    """Return the configuration file to read: that of ``--config``, or the default if there is neither option.
+
+    None means ``--server``, or that environment variables alone are the configuration. Raises BadParameter if
+    both options are given, or if there is nothing to read; ``wanted`` is what should have been given.
+    """
+    if config is not None and server is not None:
+        raise typer.BadParameter(f"give {wanted}")
+    if config is not None or server is not None:
+        return config
+    if DEFAULT_CONFIG.exists():
+        return DEFAULT_CONFIG
+    if not any(name.startswith(VARIABLE_PREFIX) for name in os.environ):
+        raise typer.BadParameter(f"give {wanted}; the default, {DEFAULT_CONFIG}, does not exist")
+    return None
+
+
+def configuration_from_options(config: Path | None, server: str | None) -> "Configuration":
+    """Return the configuration from ``--config``, ``--server`` or the default file, and the environment.
+
+    Raises ConfigError if it is not valid; BadParameter as ``chosen_file`` does.
+    """
+    from gateway.config.loading import read, read_server
+    from gateway.outputs.registry import settings_type
+
+    file = chosen_file(config, server)
+    if server is not None:
+        return read_server(*_host_and_port(server), settings_type())
+    return read(file, settings_type())
+
+
+def _host_and_port(server: str) -> tuple[str, int]:
+    """Split HOST, HOST:PORT or [IPV6]:PORT; the default port is that of First Principles."""
+    if server.startswith("["):
+        host, _, rest = server[1:].partition("]")
+        port = rest.removeprefix(":")
+    elif server.count(":") == 1:
+        host, _, port = server.partition(":")
+    else:
+        host, port = server, ""
+    if not host:
+        raise typer.BadParameter(f"{server!r}: the host is missing; give HOST or HOST:PORT")
+    if not port:
+        return host, FIRST_PRINCIPLES_PORT
+    if not (port.isdecimal() and 0 < int(port) < 65536):
+        raise typer.BadParameter(f"{server!r}: the port must be a number from 1 to 65535")
+    return host, int(port)

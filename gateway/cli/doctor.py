@@ -77,7 +77,7 @@ async def _report_findings(
     zenoh_config: Path | None,
     as_json: bool,
 ) -> None:
-    from gateway.cli.configuration import chosen_file, configuration_from_options
+    from gateway.cli.config import chosen_file, configuration_from_options
     from gateway.doctor.all_checks import run_checks, run_checks_without_settings
     from gateway.doctor.source_checks import CONNECTION
 

@@ -8,7 +8,7 @@ import typer
 from gateway.cli.options import AddressOptions, ComponentOption, SourceOption, with_options
 
 if TYPE_CHECKING:
-    from gateway.cli.echo_messages import Subscribe
+    from gateway.cli.echo_output import Subscribe
 
 
 @with_options
@@ -40,7 +40,7 @@ def echo(
     if where.zenoh_config is not None and name != "zenoh":
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
 
-    from gateway.cli.echo_messages import Limits, print_messages
+    from gateway.cli.echo_output import Limits, print_messages, print_rates
     from gateway.cli.echo_sources import Silence, Units
     from gateway.cli.main import exit_with
     from gateway.errors import QueryError
@@ -54,8 +54,6 @@ def echo(
     subscribe = _subscribe_function(name)
     try:
         if hz:
-            from gateway.cli.echo_rates import print_rates
-
             num_received = print_rates(subscribe, request, limits, silence, sys.stdout, as_json=as_json)
         else:
             units = Units(name, request)

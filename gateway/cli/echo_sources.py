@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.found_sources import FoundSource, FoundSources
+from gateway.client.found_sources import FoundSources
 from gateway.config.words import join_or
 from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError
 from gateway.logs.safe_text import quoted, safe_lines, safe_text
 from gateway.messages.encode import MESSAGE_TYPES
+from gateway.messages.source_report import SourceReport
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
@@ -22,7 +23,6 @@ from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.stream.status_text import source_text
 
 QUERY_S: Final = 2.0
 """How long ``echo`` waits for parameters."""
@@ -202,7 +202,7 @@ class Silence:
         return list(labels)
 
 
-def _check_component(key: str, sources: Sequence[FoundSource]) -> None:
+def _check_component(key: str, sources: Sequence[SourceReport]) -> None:
     """Raise QueryError if ``key`` is a component of measured data, and no source has it."""
     existing = list(dict.fromkeys(key for source in sources for key in source.components))
     if key in COMPONENTS_BY_KEY and key not in existing:
@@ -214,5 +214,5 @@ def _check_component(key: str, sources: Sequence[FoundSource]) -> None:
         )
 
 
-def _state(source: FoundSource) -> str:
-    return source.problem or source_text([(stream.components, stream.text) for stream in source.streams])
+def _state(source: SourceReport) -> str:
+    return source.problem or source.text

@@ -20,7 +20,6 @@ import typer
 import typer.core
 
 from gateway import version_text
-from gateway.cli.completion import is_completion
 from gateway.errors import ConfigError, GatewayError, QueryError, SelectionError
 from gateway.logs.safe_text import safe_lines
 from gateway.service.process_end import end_process
@@ -29,7 +28,7 @@ COMMANDS: Final = {
     "run": "gateway.cli.run:run",
     "doctor": "gateway.cli.doctor:doctor",
     "simulate": "gateway.cli.simulate:simulate",
-    "demo": "gateway.cli.demo:demo",
+    "demo": "gateway.cli.simulate:demo",
     "list": "gateway.cli.list_gateways:list_gateways",
     "view": "gateway.cli.view:view",
     "echo": "gateway.cli.echo:echo",
@@ -46,6 +45,9 @@ COMMANDS: Final = {
 Their modules must be quick to import: ``--help`` shows the first sentence of each function, and shells that
 complete a line do not wait. So a function imports what it needs when it runs. A test checks this.
 """
+
+COMPLETION_VARIABLE: Final = "_RTC3D_GATEWAY_COMPLETE"
+"""The environment variable by which a shell asks for completions."""
 
 ALIASES: Final = {"check": "gateway.cli.config:check"}
 """Other names of commands, which are not listed: ``check`` is ``config check``."""
@@ -170,7 +172,7 @@ def _print_os_error(error: OSError) -> None:
 
 
 def _print_error(text: str) -> None:
-    if is_completion():  # it would be in the middle of the command line
+    if COMPLETION_VARIABLE in os.environ:  # it would be in the middle of the command line
         return
     with contextlib.suppress(OSError):
         print(safe_lines(text), file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Options that several commands share, and objects of options that belong together.
+"""Options that several commands share: their checks, their completion, and objects of several options.
 
 This module imports nothing that takes long, so that ``COMMAND --help`` is quick: the checks of values import
 what they need.
@@ -6,15 +6,18 @@ what they need.
 
 import functools
 import inspect
+import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
+from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 import typer
 
-from gateway.cli.completion import one_of, source_names
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
@@ -54,32 +57,8 @@ ServerOption = Annotated[
 NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress, only problems.")]
 
 
-def _host() -> Any:
-    from gateway.config.values import Host
-
-    return Host
-
-
-def _source_name() -> Any:
-    from gateway.config.values import SourceName
-
-    return SourceName
-
-
-def _key_prefix() -> Any:
-    from gateway.outputs.zenoh.settings import KeyPrefix
-
-    return KeyPrefix
-
-
-def _lcm_url() -> Any:
-    from gateway.outputs.lcm.settings import LcmUrl
-
-    return LcmUrl
-
-
-def _checked(kind: Callable[[], Any]) -> Callable[[str | None], str | None]:
-    """Return a callback for an option whose value must be valid as a type of the configuration."""
+def _checked(module: str, name: str) -> Callable[[str | None], str | None]:
+    """Return a callback for an option whose value must be valid as this type of the configuration."""
 
     def check(text: str | None) -> str | None:
         if text is None:
@@ -87,21 +66,21 @@ def _checked(kind: Callable[[], Any]) -> Callable[[str | None], str | None]:
         from pydantic import TypeAdapter, ValidationError
 
         try:
-            return str(TypeAdapter(kind()).validate_python(text))
+            return str(TypeAdapter(getattr(import_module(module), name)).validate_python(text))
         except ValidationError as error:
             raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
 
     return check
 
 
-checked_host = _checked(_host)
+checked_host = _checked("gateway.config.values", "Host")
 """Checks that an option is a host name or an IP address."""
 
-checked_key_prefix = _checked(_key_prefix)
+checked_key_prefix = _checked("gateway.outputs.zenoh.settings", "KeyPrefix")
 """Checks that an option is the beginning of a Zenoh key."""
 
-_checked_source = _checked(_source_name)
-_checked_lcm_url = _checked(_lcm_url)
+_checked_source = _checked("gateway.config.values", "SourceName")
+_checked_lcm_url = _checked("gateway.outputs.lcm.settings", "LcmUrl")
 
 
 def _one_of(components: Sequence[str]) -> Callable[[str | None], str | None]:
@@ -156,6 +135,55 @@ def _checked_endpoint(text: str | None) -> str | None:
     if text is not None and not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
         raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")
     return text
+
+
+# What a shell offers for the values of options when the user presses Tab. It must answer at once and print
+# nothing else. So it reads files, but never asks on the network: that takes up to a second.
+
+_MAX_EVENTS: Final = 2000
+"""How many events of a take are searched for the names of its sources, which are at its beginning."""
+
+
+def one_of(words: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return the completion of an option that has one of these values."""
+    known = list(words)
+    return lambda incomplete: [word for word in known if word.startswith(incomplete)]
+
+
+def source_names(context: typer.Context, incomplete: str) -> list[str]:
+    """Complete the name of a source: of the take on the command line, or of the default configuration."""
+    names: list[Any] = []
+    with suppress(Exception):  # whatever it is, the command itself will say it
+        take = _take_on_the_line(context)
+        names = _configured_sources() if take is None else _sources_of_take(take)
+    # The shell may evaluate the text, and a take may come from anywhere.
+    return [name for name in names if re.fullmatch("[A-Za-z0-9_-]+", name) and name.startswith(incomplete)]
+
+
+def _take_on_the_line(context: typer.Context) -> Path | None:
+    """Return the take that the command is to read; None if there is none."""
+    # Arguments before an option without a value, which is being completed, are not parsed yet.
+    words = (context.params.get("take"), context.params.get("file"), *context.args)
+    return next((Path(word) for word in words if word is not None and Path(word).exists()), None)
+
+
+def _sources_of_take(path: Path) -> list[str]:
+    from gateway.takes.files.event_log import EventLogReader
+    from gateway.takes.files.reader import SourceNames, log_paths
+
+    events = EventLogReader(log_paths(path)[0]).events()
+    return SourceNames(islice(events, _MAX_EVENTS)).names
+
+
+def _configured_sources() -> list[str]:
+    from gateway.config.environment import apply_overrides
+    from gateway.config.files import read_file
+    from gateway.config.yaml_document import read_yaml
+
+    text = read_file(DEFAULT_CONFIG).decode() if DEFAULT_CONFIG.exists() else "{}"
+    document = read_yaml(text, str(DEFAULT_CONFIG))
+    apply_overrides(document, os.environ)
+    return [str(source["name"]) for source in document.values["sources"]]
 
 
 SourceOption = Annotated[
@@ -357,35 +385,3 @@ class LogOptions:
         if self.verbose + self.quiet + (self.log_level is not LogLevel.INFO) > 1:
             raise typer.BadParameter("give only one of --log-level, --verbose and --quiet")
         return LogLevel.DEBUG if self.verbose else LogLevel.WARNING if self.quiet else self.log_level
-
-
-@dataclass(frozen=True)
-class SceneOptions:
-    """The scene of a simulated server."""
-
-    markers: Annotated[int, typer.Option(min=0, max=10_000, help="Markers in the synthetic scene.")] = 24
-    tools: Annotated[int, typer.Option(min=0, max=1_000, help="6D tools in the synthetic scene.")] = 4
-    analog: Annotated[
-        int, typer.Option(min=0, max=10_000, help="Analog channels in the synthetic scene.")
-    ] = 16
-    plates: Annotated[int, typer.Option(min=0, max=100, help="Force plates in the synthetic scene.")] = 2
-    rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")] = (
-        200.0
-    )
-    analog_rate: Annotated[
-        float, typer.Option(min=0.1, max=100_000, help="Analog and force samples per second, in Hz.")
-    ] = 2000.0
-    c3d: Annotated[
-        Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
-    ] = None
-
-    def settings(self) -> dict[str, Any]:
-        """Return the settings of the synthetic scene by their names."""
-        return {
-            "markers": self.markers,
-            "tools": self.tools,
-            "analog": self.analog,
-            "plates": self.plates,
-            "rate_hz": self.rate,
-            "analog_rate_hz": self.analog_rate,
-        }

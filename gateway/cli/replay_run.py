@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.display.terminal.screen import keys
+from gateway.display.terminal import keys
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.takes.files.reader import TakeReader

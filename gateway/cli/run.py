@@ -61,7 +61,7 @@ def run(
     level = log.chosen_level()
     import uvloop
 
-    from gateway.cli.configuration import chosen_file, configuration_from_options
+    from gateway.cli.config import chosen_file, configuration_from_options
     from gateway.logs.log_format import LogLimit
     from gateway.service.daemon import serve
 

@@ -1,22 +1,57 @@
-"""``rtc3d-gateway simulate``: simulate an RTC3D server."""
+"""``rtc3d-gateway simulate`` and ``demo``: a simulated server, alone or with a gateway and subscribers."""
 
 import gc
 import signal
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gateway.cli.completion import source_names
-from gateway.cli.options import LogOptions, SceneOptions, check_exists, checked_host, with_options
+from gateway.cli.options import LogOptions, check_exists, checked_host, source_names, with_options
 from gateway.cli.run import SWITCH_INTERVAL_S
-from gateway.logs.log_format import set_up_log
+from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 
 if TYPE_CHECKING:
+    from gateway.cli.demo_lab import ViewProcess
+    from gateway.rtc3d_server.scene import Scene
     from gateway.simulator.simulator import Scenario, Simulator
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """The scene of a simulated server."""
+
+    markers: Annotated[int, typer.Option(min=0, max=10_000, help="Markers in the synthetic scene.")] = 24
+    tools: Annotated[int, typer.Option(min=0, max=1_000, help="6D tools in the synthetic scene.")] = 4
+    analog: Annotated[
+        int, typer.Option(min=0, max=10_000, help="Analog channels in the synthetic scene.")
+    ] = 16
+    plates: Annotated[int, typer.Option(min=0, max=100, help="Force plates in the synthetic scene.")] = 2
+    rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")] = (
+        200.0
+    )
+    analog_rate: Annotated[
+        float, typer.Option(min=0.1, max=100_000, help="Analog and force samples per second, in Hz.")
+    ] = 2000.0
+    c3d: Annotated[
+        Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
+    ] = None
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of the synthetic scene by their names."""
+        return {
+            "markers": self.markers,
+            "tools": self.tools,
+            "analog": self.analog,
+            "plates": self.plates,
+            "rate_hz": self.rate,
+            "analog_rate_hz": self.analog_rate,
+        }
 
 
 def _list_faults(context: typer.Context, wanted: bool) -> None:
@@ -93,7 +128,6 @@ def simulate(
     level = log.chosen_level()
     import uvloop
 
-    from gateway.rtc3d_server.scene import Scene
     from gateway.simulator.c3d_scene import C3dScene
     from gateway.simulator.faults.control import parse_fault
     from gateway.simulator.simulator import Scenario, Simulator, load_scenario
@@ -137,3 +171,62 @@ async def _run_simulator(simulator: "Simulator", scenario: "Scenario", seconds: 
         simulator.faults.play(scenario.faults, seed=scenario.seed, scene=scenario.scene)
         with suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), seconds)
+
+
+@with_options
+def demo(
+    *,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="How many seconds to run; 10 by default, with --view until Ctrl-C."),
+    ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Open the 3D view in the browser, and run until Ctrl-C.")
+    ] = False,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="With --view, only print the address of the 3D view.")
+    ] = False,
+    udpm: Annotated[
+        bool, typer.Option("--udpm", help="Use real multicast for LCM instead of LCM in memory.")
+    ] = False,
+    synthetic: SceneOptions,
+) -> None:
+    """Run a self-contained demo: simulator, gateway and two subscribers. Counts lost messages.
+
+    If the extra `view` is installed, the demo can be watched in a browser while it runs.
+    """
+    check_exists("--c3d", synthetic.c3d)
+    import uvloop
+
+    from gateway.cli.demo_lab import view_is_installed, view_process
+    from gateway.simulator.c3d_scene import C3dScene
+    from gateway.simulator.synthetic import SyntheticScene
+
+    set_up_log(LogLevel.WARNING)
+    scene: Scene = (
+        SyntheticScene(**synthetic.settings()) if synthetic.c3d is None else C3dScene(synthetic.c3d)
+    )
+    run_s = seconds if seconds is not None or view else 10.0
+    watch = (
+        partial(view_process, is_required=view, opens_browser=not no_browser)
+        if view or view_is_installed()
+        else None
+    )
+    if not uvloop.run(_run_demo(scene, run_s, udpm, watch)):
+        raise typer.Exit(1)
+
+
+async def _run_demo(scene: "Scene", seconds: float | None, udpm: bool, view: "ViewProcess | None") -> bool:
+    """Run the demo; without a time, Ctrl-C ends it."""
+    import asyncio
+
+    from rich.console import Console
+
+    from gateway.cli.demo_lab import run_demo
+
+    stop = asyncio.Event()
+    if seconds is None:
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+    return await run_demo(scene, stop, Console(), seconds=seconds, udpm=udpm, view=view)

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from gateway.display.terminal.lists import print_list
+from gateway.display.terminal import print_list
 from gateway.logs.safe_text import safe_text
 from gateway.takes.files.description import TakeDetails
 

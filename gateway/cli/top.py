@@ -96,7 +96,7 @@ class _Notices(logging.Handler):
 
 
 def _show(live: "LiveData", subscriber: "GatewaySubscriber", notices: "deque[str]", title: str) -> None:
-    from gateway.display.terminal.screen import Keyboard, Screen
+    from gateway.display.terminal import Keyboard, Screen
     from gateway.display.top.app import App
 
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored by nohup
@@ -109,8 +109,8 @@ def _show(live: "LiveData", subscriber: "GatewaySubscriber", notices: "deque[str
 def _print(
     live: "LiveData", subscriber: "GatewaySubscriber", wanted: list[str], *, is_once: bool, as_json: bool
 ) -> None:
-    from gateway.display.terminal.screen import has_colours
-    from gateway.display.top.reports import (
+    from gateway.display.terminal import has_colours
+    from gateway.display.top.app import (
         json_line,
         missing_sources,
         print_json_lines,

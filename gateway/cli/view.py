@@ -78,8 +78,7 @@ def _live_data(
     from gateway.client.client import GatewayClient
     from gateway.client.transport import close_in_time
     from gateway.display.live.live_data import LiveData
-    from gateway.display.view.server import RunningTakes
-    from gateway.display.view.viewer import Viewer
+    from gateway.display.view.viewer import RunningTakes, Viewer
 
     live = LiveData()
     subscriber = GatewayClient(address).subscribe(sources, None, live)

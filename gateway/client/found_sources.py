@@ -1,14 +1,14 @@
 """The sources that gateways serve, found on Zenoh or LCM, with what the gateways report about them."""
 
 from collections.abc import Iterable
-from typing import Final, NamedTuple
+from typing import Final
 
 import rtc3d
 
 from gateway.errors import ProtocolError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
-from gateway.stream.status_text import message_texts
+from gateway.messages.source_report import SourceReport, source_report
 
 MAX_SOURCES: Final = 1000
 """How many sources are kept. Anybody on the network can send some."""
@@ -17,49 +17,14 @@ MAX_STATUS_BYTES: Final = 256 * 1024
 _MAX_TOTAL_BYTES: Final = 4 * 1024 * 1024
 """What all statuses together may have: decoding takes about 1 s for this much."""
 
-_MAX_STREAMS: Final = 16
-"""How many streams of a source are kept. A source of the gateway has one for each component at most."""
-
 NO_ANSWER: Final = "its gateway does not answer"
-
-
-class FoundStream(NamedTuple):
-    """One stream: what the status line says about it (``text``), and some of its ``stream_status_t``."""
-
-    components: str
-    text: str
-    state: str
-    problem: str
-    rate_hz: float
-    tries: int
-
-
-class FoundSource(NamedTuple):
-    """One source of one gateway.
-
-    ``gateway`` is the id of the gateway's Zenoh session, or "". If there is no readable status, ``problem``
-    says why, and the rest is empty. All texts are safe to print.
-    """
-
-    name: str
-    gateway: str = ""
-    problem: str = ""
-    server: str = ""
-    host: str = ""
-    version: str = ""
-    streams: tuple[FoundStream, ...] = ()
-
-    @property
-    def components(self) -> list[str]:
-        """The components of all streams, each once."""
-        return list(dict.fromkeys(key for stream in self.streams for key in stream.components.split()))
 
 
 class FoundSources:
     """Collects the sources that are found, up to MAX_SOURCES, each with its newest status."""
 
     def __init__(self) -> None:
-        self._sources: dict[tuple[str, ...], FoundSource] = {}
+        self._sources: dict[tuple[str, ...], SourceReport] = {}
         self._num_bytes = 0
         self.heard: set[str] = set()
         """The names of all sources that were heard, wanted or not, up to MAX_SOURCES."""
@@ -69,9 +34,12 @@ class FoundSources:
         """Why nothing is found, or that the wanted source is not."""
 
     @property
-    def sources(self) -> list[FoundSource]:
+    def sources(self) -> list[SourceReport]:
         """The sources by name, server and computer."""
-        return sorted(self._sources.values())
+        return sorted(
+            self._sources.values(),
+            key=lambda each: (each.name, each.gateway, each.problem, each.server, each.host, each.version),
+        )
 
     @property
     def readable_names(self) -> list[str]:
@@ -97,9 +65,9 @@ class FoundSources:
     def add_silent(self, names: Iterable[str]) -> None:
         """Add sources whose gateways do not answer."""
         for name in names:
-            self.add(FoundSource(safe_text(name), problem=NO_ANSWER))
+            self.add(SourceReport(safe_text(name), problem=NO_ANSWER))
 
-    def add(self, source: FoundSource) -> None:
+    def add(self, source: SourceReport) -> None:
         """Add a source, or replace what an earlier status said about it."""
         identity = (
             (source.name, source.gateway) if source.gateway else (source.name, source.server, source.host)
@@ -110,37 +78,25 @@ class FoundSources:
             self.num_left_out += 1
 
 
-def read_status(message: bytes, name: str, gateway: str = "") -> FoundSource:
+def read_status(message: bytes, name: str, gateway: str = "") -> SourceReport:
     """Return what a status says about the source ``name``; if that is "", the status names it.
 
     The message may come from anybody, and from another version of the gateway.
     """
-    if len(message) > MAX_STATUS_BYTES:
-        return FoundSource(safe_text(name), gateway, f"its status is too long: {len(message)} bytes")
     try:
-        is_status = message_type(message) is rtc3d.status_t
-    except ProtocolError:
-        is_status = False
-    if not is_status:
-        return FoundSource(safe_text(name), gateway, "its status is of another version of rtc3d-gateway")
-    try:
-        status = decode(message)
+        if len(message) > MAX_STATUS_BYTES:
+            problem = f"its status is too long: {len(message)} bytes"
+        elif _is_status(message):
+            return source_report(decode(message), name, gateway)
+        else:
+            problem = "its status is of another version of rtc3d-gateway"
     except ProtocolError as error:
-        return FoundSource(safe_text(name), gateway, f"its status cannot be read: {error}")
-    num_streams = len(status.streams)
-    status.streams = status.streams[:_MAX_STREAMS]
-    return FoundSource(
-        safe_text(name or status.source),
-        gateway,
-        f"it has {num_streams} streams; {_MAX_STREAMS} are shown" if num_streams > _MAX_STREAMS else "",
-        safe_text(status.server),
-        safe_text(status.host),
-        safe_text(status.gateway_version),
-        tuple(map(_stream, message_texts(status), status.streams)),
-    )
+        problem = f"its status cannot be read: {error}"
+    return SourceReport(safe_text(name), gateway, problem)
 
 
-def _stream(text: tuple[str, str], stream: rtc3d.stream_status_t) -> FoundStream:
-    return FoundStream(
-        *text, safe_text(stream.state), safe_text(stream.problem), stream.frame_rate_hz, stream.tries
-    )
+def _is_status(message: bytes) -> bool:
+    try:
+        return message_type(message) is rtc3d.status_t
+    except ProtocolError:
+        return False

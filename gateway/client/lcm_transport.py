@@ -9,6 +9,7 @@ import uuid
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -162,8 +163,8 @@ def _add(found: FoundSources, prefix: str, wanted: str | None, channel: str, mes
         return
     source = read_status(message, "")
     if not source.name:
-        source = source._replace(
-            name=safe_text(_CHANNEL.split(channel)[0].removeprefix(f"{prefix}_").lower())
+        source = replace(
+            source, name=safe_text(_CHANNEL.split(channel)[0].removeprefix(f"{prefix}_").lower())
         )
     channels = lcm_channel(prefix, source.name)
     if channel.startswith(channels):

@@ -1,10 +1,9 @@
 """The doctor: checks every layer between servers and subscribers, and suggests remedies.
 
 ``all_checks`` runs the checks in the order in which a fault has consequences, and each gives a ``Finding``
-(what was checked, whether it is right, what was found, what to do). ``report`` prints them, for people or as
-JSON.
+(what was checked, whether it is right, what was found, what to do). It also checks this computer's clock.
+``report`` prints the findings, for people or as JSON.
 
-- ``computer_checks``: this computer's clock and receive buffer.
 - ``source_checks``: one server, from its name to its frames. It connects as the gateway does and listens for
   some seconds: ``observation`` collects what arrives, ``frame_checks`` judges it.
 - ``gateway_checks``: the running gateway, by its own health page.

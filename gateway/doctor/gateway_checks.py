@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from gateway.config.settings import MetricsSettings
 from gateway.logs.losses import counts_text, route_name
-from gateway.outputs.findings import Finding, Subject, as_sentence
+from gateway.outputs.findings import Check, Finding
 from gateway.outputs.listen_address import from_this_computer, host_in_url
 from gateway.stream.state import StreamState
 from gateway.workers import WorkerThread
@@ -134,7 +134,7 @@ def _get(host: str, port: int) -> bytes:
 CHECKS: Final = ("health", "stream", "output", "loss")
 """The checks in order. All but the first are made once for each stream, output and loss."""
 
-_gateway: Final = Subject("running gateway")
+_HEALTH, _STREAM, _OUTPUT, _LOSS = (Check("running gateway", name) for name in CHECKS)
 
 
 def check_gateway(
@@ -147,18 +147,16 @@ def check_gateway(
     """
     if isinstance(report, NoReport):
         yield _no_gateway(report, connects=connects)
-        for check in CHECKS[1:]:
-            yield _gateway.not_tested(check, "no running gateway could be asked")
+        for check in (_STREAM, _OUTPUT, _LOSS):
+            yield check.not_tested("no running gateway could be asked")
         return
-    yield _gateway.passing("health", f"a gateway answers on {where}")
+    yield _HEALTH.passing(f"a gateway answers on {where}")
     for problem in report.process:
-        found, _, remedy = problem.partition("; ")
-        yield _gateway.failing("health", found, as_sentence(remedy))
+        yield _HEALTH.problem(problem)
     served = {stream.source for stream in report.streams}
     for source in sources:
         if source not in served:
-            yield _gateway.warning(
-                "stream",
+            yield _STREAM.warning(
                 f"{source}: the running gateway has no source of this name",
                 "It runs with another configuration. Reload or restart it with this one, or check "
                 "metrics.port.",
@@ -166,29 +164,27 @@ def check_gateway(
     for stream in report.streams:
         yield from _check_stream(stream, connects=connects)
     for output in report.outputs:
-        yield _check_output(output)
+        yield _check_output(output.output, output.problem)
     if not report.losses:
-        yield _gateway.passing("loss", "nothing has been lost since the gateway started")
+        yield _LOSS.passing("nothing has been lost since the gateway started")
     for loss in report.losses:
-        yield _check_loss(loss)
+        finding = _LOSS.warning if loss.messages_last_minute else _LOSS.note
+        yield finding(loss.found, f"The newest was: {loss.text}")
 
 
 def _no_gateway(report: NoReport, *, connects: bool) -> Finding:
     if report.something_answers:
-        return _gateway.failing(
-            "health",
+        return _HEALTH.failing(
             report.reason,
             "If it is the gateway, read its log and restart it. If it is another program, set metrics.port.",
         )
     if connects:
-        return _gateway.note(
-            "health",
+        return _HEALTH.note(
             report.reason,
             "The checks below open connections of their own to the servers. They cannot tell what a gateway "
             "has lost.",
         )
-    return _gateway.failing(
-        "health",
+    return _HEALTH.failing(
         report.reason,
         "Start the gateway, or check metrics in the configuration. Without --no-connect, doctor connects "
         "to the servers itself.",
@@ -207,32 +203,19 @@ def _check_stream(stream: RunningStream, *, connects: bool) -> Iterator[Finding]
             if connects
             else "Check the server and the network. Without --no-connect, doctor looks for the reason."
         )
-        yield _gateway.failing("stream", f"{stream.name}: {stream.state}: {stream.problem}", remedy)
+        yield _STREAM.failing(f"{stream.name}: {stream.state}: {stream.problem}", remedy)
     elif stream.state == StreamState.NO_MEASUREMENT.value:
-        yield _gateway.failing(
-            "stream",
+        yield _STREAM.failing(
             f"{stream.name}: {stream.server} reports that no measurement is running",
             "Start a measurement on the server; the gateway then streams automatically.",
         )
     else:
-        yield _gateway.passing("stream", found)
+        yield _STREAM.passing(found)
     for limitation in stream.limitations:
-        yield _gateway.note("stream", f"{stream.name}: {limitation}")
+        yield _STREAM.note(f"{stream.name}: {limitation}")
 
 
-def _check_output(output: RunningOutput) -> Finding:
-    if not output.problem:
-        return _gateway.passing("output", f"{output.output}: connected")
-    found, _, remedy = output.problem.partition("; ")
-    return _gateway.failing(
-        "output",
-        f"{output.output}: {found}",
-        as_sentence(remedy) if remedy else f"See the checks of {output.output} below.",
-    )
-
-
-def _check_loss(loss: RunningLoss) -> Finding:
-    what_to_do = f"The newest was: {loss.text}"
-    if loss.messages_last_minute:
-        return _gateway.warning("loss", loss.found, what_to_do)
-    return _gateway.note("loss", loss.found, what_to_do)
+def _check_output(name: str, problem: str) -> Finding:
+    if problem:
+        return _OUTPUT.problem(f"{name}: {problem}", f"See the checks of {name} below.")
+    return _OUTPUT.passing(f"{name}: connected")

@@ -3,17 +3,24 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.descriptions.source_frame import source_frame, unknown_unit_text
-from gateway.doctor.computer_checks import check_receive_buffer
-from gateway.doctor.frame_checks import check_byte_order, check_frames, check_rate, check_visibility
+from gateway.doctor.frame_checks import (
+    check_byte_order,
+    check_frames,
+    check_rate,
+    check_receive_buffer,
+    check_visibility,
+)
 from gateway.doctor.gateway_checks import HealthReport
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.logs.safe_text import quoted
-from gateway.outputs.findings import Finding, MessageLoad, Result, Subject, as_sentence
+from gateway.messages.summary import described_items
+from gateway.outputs.findings import Check, Finding, MessageLoad, Result, as_sentence, failing_first
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.tcp import is_address, look_up
@@ -46,7 +53,6 @@ class SourceChecks:
     def __init__(self, source: SourceSettings, seconds: float, running: HealthReport | None = None) -> None:
         self._source = source
         self._seconds = seconds
-        self._subject = Subject(source.name)
         self._server = f"{source.host}:{source.port}"
         self._running = running
         self._addresses: frozenset[str] = frozenset()  # of the source's host, as far as they are known
@@ -59,17 +65,15 @@ class SourceChecks:
 
     async def run(self) -> AsyncIterator[Finding]:
         """Run the checks in order, yield their findings, and close the connections."""
-        remaining = list(CHECKS)
-        for check in (self._check_name, self._check_tcp, self._check_protocol):
+        for number, check in enumerate((self._check_name, self._check_tcp, self._check_protocol), start=1):
             if check == self._check_tcp and await self._gateway_is_connected():
                 yield self._second_connection()
             finding = await check()
-            yield finding
-            remaining.remove(finding.check)
             if finding.result is Result.FAILING:
-                for name in remaining:
-                    yield self._subject.not_tested(name, f"it needs {finding.check}, which failed")
+                for each in failing_first(finding, CHECKS[number:]):
+                    yield each
                 break
+            yield finding
         else:
             yield self._check_parameters()
             await asyncio.sleep(self._seconds)
@@ -82,18 +86,21 @@ class SourceChecks:
         """Check the host name, and yield for each other check that it is not made."""
         yield await self._check_name()
         for name in CHECKS[1:]:
-            yield self._subject.not_tested(name, "--no-connect")
+            yield self._check(name).not_tested("--no-connect")
 
     def _check_stream(self, stream: ObservedStream) -> Iterator[Finding]:
-        name = stream.component_keys if len(self._streams) > 1 else ""
-        subject = Subject(self._source.name, name)
+        components = stream.component_keys if len(self._streams) > 1 else ""
+        check = partial(Check, self._source.name, stream=components)
         others_receive = any(other.observed for other in self._streams if other is not stream)
-        yield check_frames(subject, stream, self._parameters, others_receive=others_receive)
-        yield check_byte_order(subject, stream, self._source.byte_order)
-        yield check_rate(subject, stream, self._parameters)
-        yield check_receive_buffer(subject, stream.load_bytes_per_s)
+        yield check_frames(check("frames"), stream, self._parameters, others_receive=others_receive)
+        yield check_byte_order(check("byte order"), stream, self._source.byte_order)
+        yield check_rate(check("rate"), stream, self._parameters)
+        yield check_receive_buffer(check("buffer"), stream.load_bytes_per_s)
         if set(COMPONENTS_WITH_VISIBILITY).intersection(stream.settings.components):
-            yield check_visibility(subject, stream, self._parameters)
+            yield check_visibility(check("visibility"), stream, self._parameters)
+
+    def _check(self, name: str) -> Check:
+        return Check(self._source.name, name)
 
     async def _gateway_is_connected(self) -> bool:
         """Return whether the running gateway is connected to this server, perhaps by another host name."""
@@ -108,8 +115,7 @@ class SourceChecks:
 
     def _second_connection(self) -> Finding:
         """Return a note that says what doctor is about to do (field note 21)."""
-        return self._subject.note(
-            CONNECTION,
+        return self._check(CONNECTION).note(
             f"the running gateway is connected to {self._server}; doctor now opens further connections to it",
             "Some servers serve one client only, or fail with two. With --no-connect, doctor asks the "
             "running gateway instead.",
@@ -125,17 +131,16 @@ class SourceChecks:
         host = self._source.host
         if is_address(host):
             self._addresses = frozenset([host])
-            return self._subject.passing("name", f"{host} is an IP address")
+            return self._check("name").passing(f"{host} is an IP address")
         try:
             self._addresses = await self._resolve(host)
         except OSError as error:  # includes TimeoutError, which has no text
             reason = error.strerror or f"no answer within {self._source.connect_timeout_s:g} s"
-            return self._subject.failing(
-                "name",
+            return self._check("name").failing(
                 f"the host name {host!r} cannot be resolved: {reason}",
                 "Correct the source's host, add the name to DNS or /etc/hosts, or use an IP address.",
             )
-        return self._subject.passing("name", f"{host} resolves to {', '.join(sorted(self._addresses))}")
+        return self._check("name").passing(f"{host} resolves to {', '.join(sorted(self._addresses))}")
 
     async def _resolve(self, host: str) -> frozenset[str]:
         """Return the addresses of ``host``; raises OSError, of which TimeoutError has no text."""
@@ -152,10 +157,10 @@ class SourceChecks:
                 await stream.session.connect()
         except ConnectError as error:
             found, _, question = str(error).partition("; ")
-            return self._subject.failing("TCP", found, f"{question[:1].upper()}{question[1:]}")
+            return self._check("TCP").failing(found, f"{question[:1].upper()}{question[1:]}")
         count = len(self._streams)
         connections = "a connection" if count == 1 else f"{count} connections, one per stream"
-        return self._subject.passing("TCP", f"{self._server} accepts {connections}")
+        return self._check("TCP").passing(f"{self._server} accepts {connections}")
 
     async def _check_protocol(self) -> Finding:
         for stream in self._streams:
@@ -167,9 +172,8 @@ class SourceChecks:
             await self._open_further_streams(self._streams[0])
         limitations = dict.fromkeys(text for stream in self._streams for text in stream.status.limitations)
         if not limitations:
-            return self._subject.passing("protocol", "the server accepts every command")
-        return self._subject.passing(
-            "protocol",
+            return self._check("protocol").passing("the server accepts every command")
+        return self._check("protocol").passing(
             f"the server is an RT server; the gateway works around this: {'; '.join(limitations)}",
         )
 
@@ -191,25 +195,21 @@ class SourceChecks:
     def _protocol_failure(self, stream: ObservedStream, error: LinkError) -> Finding:
         if isinstance(error.__cause__, PacketError):
             first_bytes = quoted(error.__cause__.first_bytes.decode("latin-1"), 60)
-            return self._subject.failing(
-                "protocol",
+            return self._check("protocol").failing(
                 f"the program at {self._server} is not an RT server; its first bytes are {first_bytes}",
                 f"Correct the source's host and port: {_PORTS}.",
             )
         if stream.session.is_open and not stream.status.bytes_in:
-            return self._subject.failing(
-                "protocol",
+            return self._check("protocol").failing(
                 f"{self._server} accepts a connection but sends nothing",
                 f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT server.",
             )
         if stream.session.is_open:  # only the refusal of StreamFrames leaves it open
-            return self._subject.failing(
-                "protocol",
+            return self._check("protocol").failing(
                 f"{self._server} refuses every form of the StreamFrames command",
                 "Enable the real-time output in the server's settings.",
             )
-        return self._subject.failing(
-            "protocol",
+        return self._check("protocol").failing(
             str(error),
             f"Check that this is the RT server's port ({_PORTS}) and that the server accepts one more "
             "client. Close other programs that are connected to it, and read the server's own messages.",
@@ -220,41 +220,21 @@ class SourceChecks:
         if first.parsed is not None:
             parameters = first.parsed.parameters
             repaired = f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
-            found = _summary(parameters) + repaired
+            found = described_items(parameters, event="event type") or "the server's parameters are empty"
+            found += repaired
             if source_frame(self._source, parameters).metres_per_unit is None:
                 problem, _, remedy = unknown_unit_text(parameters, "positions in metres").partition("; ")
-                return self._subject.warning("parameters", f"{found}; {problem}", as_sentence(remedy))
-            return self._subject.passing("parameters", found)
+                return self._check("parameters").warning(f"{found}; {problem}", as_sentence(remedy))
+            return self._check("parameters").passing(found)
         refusals = [text for text in first.status.limitations if "SendParameters" in text]
         if refusals:
-            return self._subject.not_tested(
-                "parameters", f"{refusals[0]}; names, units and configured rates are unknown"
+            return self._check("parameters").not_tested(
+                f"{refusals[0]}; names, units and configured rates are unknown"
             )
         prefix = "no parameters: "
         reasons = [text for text in first.status.limitations if text.startswith(prefix)]
-        return self._subject.failing(
-            "parameters",
+        return self._check("parameters").failing(
             f"the server's XML cannot be read: {reasons[0].removeprefix(prefix)}",
             "The gateway publishes data without names and units. Look for unusual characters in the names of "
             "markers and tools on the server, or update the server's software.",
         )
-
-
-def _summary(parameters: Parameters) -> str:
-    """Return for example "24 markers, 4 tools"."""
-    parts = []
-    if parameters.markers is not None:
-        parts.append(_count(len(parameters.markers.markers), "marker"))
-    if parameters.tools is not None:
-        parts.append(_count(len(parameters.tools.tools), "tool"))
-    if parameters.analog is not None:
-        parts.append(_count(len(parameters.analog.channels), "analog channel"))
-    if parameters.force is not None:
-        parts.append(_count(len(parameters.force.plates), "force plate"))
-    if parameters.events is not None:
-        parts.append(_count(len(parameters.events.events), "event type"))
-    return ", ".join(parts) or "the server's parameters are empty"
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -8,7 +8,9 @@ import rtc3d
 
 from gateway.errors import ParametersError
 from gateway.logs.losses import counts_text
+from gateway.messages.source_report import LossReport, OutputReport, SourceReport, StreamReport, source_report
 from gateway.messages.texts import xml_bytes
+from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4
@@ -22,7 +24,7 @@ def summarise(message: Any, units: Sequence[str] = ()) -> str:
     """
     match message:
         case rtc3d.status_t():
-            text = _status(message)
+            text = _status(source_report(message))
         case rtc3d.clock_t():
             text = f"#{message.sequence} {_clock(message.clock)} ({message.components})"
         case rtc3d.parameters_t():
@@ -64,19 +66,24 @@ def summarise_xml(xml: bytes) -> str:
         parameters = parse_parameters(xml).parameters
     except ParametersError:
         return f"{size} that cannot be read as parameters"
+    return f"{size}: {described_items(parameters) or 'no markers, tools, channels, plates or events'}"
+
+
+def described_items(parameters: Parameters, event: str = "event") -> str:
+    """Return what parameters describe, such as "24 markers, 1 tool"; ``event`` is the word for events."""
     sections = (
         ("marker", parameters.markers, "markers"),
         ("tool", parameters.tools, "tools"),
         ("analog channel", parameters.analog, "channels"),
         ("force plate", parameters.force, "plates"),
-        ("event", parameters.events, "events"),
+        (event, parameters.events, "events"),
     )
     texts = []
     for name, section, items in sections:
         if section is not None:
             count = len(getattr(section, items))
             texts.append(f"{count} {name}{'' if count == 1 else 's'}")
-    return f"{size}: {', '.join(texts) or 'no markers, tools, channels, plates or events'}"
+    return ", ".join(texts)
 
 
 def _frame_content(message: Any, units: Sequence[str]) -> str:
@@ -154,25 +161,24 @@ def _clock(clock: Any) -> str:
     return f"offset {clock.offset_us} µs, drift {clock.drift_ppm:.1f} ppm, ± {clock.uncertainty_us:.0f} µs"
 
 
-def _status(status: Any) -> str:
-    streams = "; ".join(map(_stream, status.streams))
-    outputs = "; ".join(map(_output, status.outputs))
-    return f"#{status.sequence} {status.source} at {status.server}: {streams}; outputs: {outputs}"
+def _status(report: SourceReport) -> str:
+    streams = "; ".join(map(_stream_summary, report.streams))
+    outputs = "; ".join(map(_output_summary, report.outputs))
+    return f"#{report.sequence} {report.name} at {report.server}: {streams}; outputs: {outputs}"
 
 
-def _stream(stream: Any) -> str:
+def _stream_summary(stream: StreamReport) -> str:
     error = f", last error: {stream.last_error}" if stream.last_error else ""
     return (
-        f"[{stream.components}] {stream.state} {stream.frame_rate_hz:.1f} Hz, "
-        f"{stream.frames_in} frames, {stream.reconnects} reconnects{_losses(stream.drops)}{error}"
+        f"[{stream.components}] {stream.state} {stream.frame_rate_hz:.1f} Hz, {stream.num_frames} frames, "
+        f"{stream.num_reconnects} reconnects{_lost(stream.losses)}{error}"
     )
 
 
-def _output(output: Any) -> str:
-    return f"{output.name} {'ok' if output.connected else output.problem}{_losses(output.drops)}"
+def _output_summary(output: OutputReport) -> str:
+    return f"{output.output} {'ok' if output.is_connected else output.problem}{_lost(output.losses)}"
 
 
-def _losses(losses: Sequence[Any]) -> str:
+def _lost(losses: Sequence[LossReport]) -> str:
     """Return what was lost, such as ", lost 872 messages of 436 frames (skipped while behind)"."""
-    text = counts_text((loss.cause, loss.messages, loss.frames) for loss in losses)
-    return f", lost {text}" if text else ""
+    return f", lost {counts_text(losses)}" if losses else ""

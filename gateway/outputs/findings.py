@@ -1,5 +1,6 @@
 """Results of checks; the doctor reports them."""
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Final, NamedTuple
 
@@ -48,38 +49,54 @@ class Finding(NamedTuple):
         return self.result is Result.NOT_TESTED and self.found == NO_CONFIGURATION
 
 
-class Subject(NamedTuple):
-    """Something that is checked: a source, one of its streams, an output or this computer.
+class Check(NamedTuple):
+    """One check of a subject: a source, an output or this computer. Creates its findings.
 
-    Creates its findings.
+    ``stream`` are the components of the stream that is checked, if its source has several.
     """
 
+    subject: str
     name: str
     stream: str = ""
 
-    def passing(self, check: str, found: str) -> Finding:
+    def passing(self, found: str) -> Finding:
         """Return a passing finding."""
-        return Finding(self.name, check, Result.PASSING, found, "", self.stream)
+        return Finding(self.subject, self.name, Result.PASSING, found, "", self.stream)
 
-    def note(self, check: str, found: str, remedy: str = "") -> Finding:
+    def note(self, found: str, remedy: str = "") -> Finding:
         """Return a note, and what to do if it is not as intended."""
-        return Finding(self.name, check, Result.NOTE, found, remedy, self.stream)
+        return Finding(self.subject, self.name, Result.NOTE, found, remedy, self.stream)
 
-    def warning(self, check: str, found: str, remedy: str) -> Finding:
+    def warning(self, found: str, remedy: str) -> Finding:
         """Return a warning and what to do about it."""
-        return Finding(self.name, check, Result.WARNING, found, remedy, self.stream)
+        return Finding(self.subject, self.name, Result.WARNING, found, remedy, self.stream)
 
-    def failing(self, check: str, found: str, remedy: str) -> Finding:
+    def failing(self, found: str, remedy: str) -> Finding:
         """Return a failing finding and what to do about it."""
-        return Finding(self.name, check, Result.FAILING, found, remedy, self.stream)
+        return Finding(self.subject, self.name, Result.FAILING, found, remedy, self.stream)
 
-    def not_tested(self, check: str, reason: str) -> Finding:
+    def problem(self, text: str, default_remedy: str = "") -> Finding:
+        """Return a failing finding for the text of an error: what is wrong, "; ", and what to do about it.
+
+        Without what to do, it is ``default_remedy``.
+        """
+        found, _, remedy = text.partition("; ")
+        return self.failing(found, as_sentence(remedy) if remedy else default_remedy)
+
+    def not_tested(self, reason: str) -> Finding:
         """Return a finding for a check that could not be made."""
-        return Finding(self.name, check, Result.NOT_TESTED, reason, "", self.stream)
+        return Finding(self.subject, self.name, Result.NOT_TESTED, reason, "", self.stream)
 
-    def disabled(self, check: str) -> Finding:
-        """Return a finding for a check of an output that the configuration does not enable."""
-        return self.not_tested(check, f"{self.name}.enabled is false")
+
+def failing_first(failing: Finding, later: Iterable[str]) -> list[Finding]:
+    """Return a failing finding, and that the ``later`` checks of its subject are not made because of it."""
+    reason = f"it needs {failing.check}, which failed"
+    return [failing, *(Check(failing.subject, name).not_tested(reason) for name in later)]
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things, such as "1 router" or "2 routers"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def as_sentence(text: str) -> str:

@@ -11,9 +11,10 @@ from gateway.logs.losses import Loss
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.contract import OutputHealth, OutputStatus
+from gateway.rtc3d.components import ComponentType
 from gateway.stream.clock import ServerClock
-from gateway.stream.status import StreamStatus
-from gateway.stream.status_text import unusable_frames
+from gateway.stream.process_clock import running_clock
+from gateway.stream.status import FRAME_REJECTED, StreamStatus
 
 _COPIED_FIELDS: Final = (
     "components",
@@ -108,6 +109,33 @@ def _stream_message(stream: StreamStatus, rate_hz: float, stall_timeout_s: float
     message.limitations = list(stream.limitations)
     message.num_limitations = len(message.limitations)
     return message
+
+
+def unusable_frames(status: StreamStatus, max_age_s: float) -> str:
+    """Return why nothing is published although frames come; "" if frames are usable, or none come.
+
+    ``max_age_s`` is how long this must last, or how old the newest frame may be.
+    """
+    rejected = next((loss for loss in status.losses.report() if loss.cause == FRAME_REJECTED), None)
+    if rejected is not None and rejected.age_s < max_age_s and not _is_recent(status.last_frame_s, max_age_s):
+        reason = rejected.text.removeprefix(f"{FRAME_REJECTED}: ")
+        return f"frames come, and all are rejected: {reason}"
+    if (
+        status.unwanted_components
+        and status.components != ComponentType.EVENT.key  # events are sporadic
+        and _is_recent(status.last_frame_s, max_age_s)
+        and not _is_recent(status.unwanted_since_s, max_age_s)
+    ):
+        return (
+            f"frames come, and none has a component of this stream ({status.components}); the newest has "
+            f"{status.unwanted_components}: check the server's real-time output, and sources.streams"
+        )
+    return ""
+
+
+def _is_recent(time_s: float | None, max_age_s: float) -> bool:
+    """Return whether a time on the running clock is at most ``max_age_s`` ago."""
+    return time_s is not None and running_clock().time() - time_s <= max_age_s
 
 
 def _output_message(

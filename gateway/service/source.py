@@ -7,6 +7,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import rtc3d
+
 from gateway.c3d_files.receiving import SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.config.settings import SourceSettings, StreamSettings
@@ -14,6 +16,7 @@ from gateway.errors import LinkError, QueryError
 from gateway.logs.failures import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.decode import C3D
 from gateway.messages.encode import NOT_PUBLISHED
+from gateway.messages.source_report import SourceReport, source_report
 from gateway.messages.texts import encode_within_limits
 from gateway.outputs.contract import Answer, Output, ServerFile, ServerParameters
 from gateway.publish.fan_out import FanOut
@@ -95,7 +98,7 @@ class Source:
             else ConfiguredStreams(settings.streams, self._new_stream)
         )
         self._failure: asyncio.Future[None] | None = None  # ends ``run``
-        self._newest_status: bytes = self._encoded_status()
+        self._newest_status: bytes = encode_within_limits(self._status_message())
 
     def _new_queries(self) -> SourceQueries:
         return SourceQueries(
@@ -133,9 +136,9 @@ class Source:
         return [stream.status for stream in self.streams]
 
     @property
-    def rated_statuses(self) -> list[tuple[StreamStatus, float]]:
-        """The status of each stream, with its frame rate in Hz at the last ``publish_status``."""
-        return [(stream.status, stream.frame_rate.rate_hz) for stream in self.streams]
+    def report(self) -> SourceReport:
+        """What this source's status says now; frame rates are those of the last ``publish_status``."""
+        return source_report(self._status_message())
 
     async def run(self) -> None:
         """Run every stream until cancelled; then send Bye to the server.
@@ -214,7 +217,7 @@ class Source:
     def _publish_newest_status(self) -> None:
         for stream in self.streams:
             stream.frame_rate.update(stream.status.frames_in)
-        self._newest_status = self._encoded_status()
+        self._newest_status = encode_within_limits(self._status_message())
         self.fan_out.publish_status(self._newest_status)
 
     def _publish_clock(self) -> None:
@@ -223,12 +226,12 @@ class Source:
         clock = clock_message(self.queries.session, self.history.sequence, best)
         self.fan_out.publish_clock(encode_within_limits(clock))
 
-    def _encoded_status(self) -> bytes:
-        message = status_message(
+    def _status_message(self) -> rtc3d.status_t:
+        return status_message(
             source=self.name,
             server=f"{self.settings.host}:{self.settings.port}",
             sequence=self.history.sequence,
-            streams=self.rated_statuses,
+            streams=[(stream.status, stream.frame_rate.rate_hz) for stream in self.streams],
             outputs=[
                 (status, output.health(), (output.query_results or {}).get(self.name, {}))
                 for output, status in self.fan_out.outputs
@@ -236,7 +239,6 @@ class Source:
             stall_timeout_s=self.settings.stall_timeout_s,
             frame=self.queries.frame,
         )
-        return encode_within_limits(message)
 
     def _new_stream(self, stream: StreamSettings, listener: Listener) -> Supervisor:
         status = StreamStatus(

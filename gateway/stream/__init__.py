@@ -19,8 +19,7 @@ Around it, from the outside to the inside:
 - ``stream_requests``: what the session asks the server for: handshake, rate, pause, signs of life.
   ``replies`` has the commands that wait for a reply; ``rate_check`` compares the rate that arrives with the
   one that was requested.
-- ``status``: what is known about a stream, its counters and its failures. ``state`` derives one word from it,
-  and ``status_text`` makes sentences of it.
+- ``status``: what is known about a stream, its counters and its failures. ``state`` derives one word from it.
 
 Time-outs count only the time during which this process runs (``process_clock``, ``process_timeout``). Nothing
 here knows any output.

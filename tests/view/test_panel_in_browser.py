@@ -15,7 +15,7 @@ from gateway.display.view.viewer import PERIOD_S
 from gateway.rtc3d.components import ComponentType
 from tests.browser import NewPage, chromium, new_page
 from tests.statuses import stream
-from tests.unit.display.view.live_lab import Lab
+from tests.unit.display.live_lab import Lab
 
 pytestmark = pytest.mark.chromium
 

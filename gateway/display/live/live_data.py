@@ -5,14 +5,13 @@ import time
 from collections import deque
 from typing import Any, Final, NamedTuple
 
-import rtc3d
-
 from gateway.client.reception import Reception
 from gateway.client.series import Series, Source
 from gateway.descriptions.labels import EventText, event_text
 from gateway.display.live.component import LiveComponent
 from gateway.errors import ParametersError, ProtocolError
 from gateway.messages.decode import decode
+from gateway.messages.source_report import SourceReport, source_report
 from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
@@ -47,9 +46,10 @@ class LiveSource(Source):
         self.newest_parameters = Parameters()
         """The server's parameters; without any section until they come."""
         self.parameters_version = 0
-        self.newest_status: rtc3d.status_t | None = None
-        self.first_status: rtc3d.status_t | None = None
-        """The first status since the gateway's start that came here."""
+        self.report: SourceReport | None = None
+        """What the newest status says; None before the first."""
+        self.first_report: SourceReport | None = None
+        """What the first status since the gateway's start says that came here."""
         self.num_unreadable = 0
         """How many parameters and statuses could not be read."""
         self._read_parameters: bytes | None = None
@@ -64,7 +64,7 @@ class LiveSource(Source):
     @property
     def status_age_s(self) -> float | None:
         """How long ago the newest status came; None before the first."""
-        return None if self.newest_status is None else time.monotonic() - self._status_s
+        return None if self.report is None else time.monotonic() - self._status_s
 
     @property
     def is_silent(self) -> bool:
@@ -109,9 +109,9 @@ class LiveSource(Source):
 
     def _decode_status(self, message: bytes) -> None:
         try:
-            former, self.newest_status = self.newest_status, decode(message)
-            if former is None or former.sequence > self.newest_status.sequence:
-                self.first_status = self.newest_status
+            former, self.report = self.report, source_report(decode(message))
+            if former is None or former.sequence > self.report.sequence:
+                self.first_report = self.report
             self._status_s = time.monotonic()
         except ProtocolError as error:
             self.num_unreadable += 1

@@ -1,38 +1,23 @@
 """What is known about a source, from what its gateway publishes: values without numpy, for tables and JSON.
 
-The names of the fields are those of ``top --json``. Texts from networks are cut and escaped, and there is a
-limit to how many entries of a status are taken.
+The names of the fields are those of ``top --json``. What the status says is in ``source.report``.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import islice
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final
 
-from gateway.client.series import POSE
+from gateway.client.series import POSE, Series
 from gateway.descriptions.labels import describe
-from gateway.display.live.component import LiveComponent, Percentiles
+from gateway.display.live.component import LiveComponent
 from gateway.display.live.live_data import LiveSource
 from gateway.logs.safe_text import safe_text
+from gateway.messages.source_report import Level, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.stream.status_text import Level, message_texts, source_text, stream_level
-
-_MAX_ENTRIES: Final = 50
-"""How many streams, outputs, causes and results of a status are taken, of each kind."""
 
 _MAX_LABEL: Final = 64
-_MAX_SENTENCE: Final = 500
-
-_Entry = TypeVar("_Entry")
-
-
-@dataclass(frozen=True, slots=True)
-class StateFacts:
-    """The state of a source. ``level`` is ok, warning or error."""
-
-    text: str
-    level: str
+"""How much is shown of a marker's or tool's label, and of its unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +32,16 @@ class ComponentFacts:
     num_gaps: int
     num_restarts: int
     has_two_gateways: bool
-    capture_to_gateway_p50_ms: float | None
-    capture_to_gateway_p99_ms: float | None
-    gateway_to_here_p50_ms: float | None
-    gateway_to_here_p99_ms: float | None
-    num_items: int | None
-    num_visible: int | None
-    age_s: float | None
-    is_stopped: bool
-    num_skipped: int
-    num_malformed: int
+    capture_to_gateway_p50_ms: float | None = None
+    capture_to_gateway_p99_ms: float | None = None
+    gateway_to_here_p50_ms: float | None = None
+    gateway_to_here_p99_ms: float | None = None
+    num_items: int | None = None
+    num_visible: int | None = None
+    age_s: float | None = None
+    is_stopped: bool = False
+    num_skipped: int = 0
+    num_malformed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,28 +59,6 @@ class ItemFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class StreamFacts:
-    """One stream of a source, as its status describes it."""
-
-    components: str
-    state: str
-    problem: str
-    session: int
-    byte_order: str
-    rate: str
-    frame_rate_hz: float
-    lag_ms: float
-    num_reconnects: int
-    num_restarts: int
-    has_clock: bool
-    clock_drift_ppm: float
-    clock_uncertainty_us: float
-    limitations: list[str]
-    last_error: str
-    last_error_utime: int
-
-
-@dataclass(frozen=True, slots=True)
 class LossFacts:
     """What was lost for one cause, since the start of ``where``."""
 
@@ -103,17 +66,6 @@ class LossFacts:
     cause: str
     num_messages: int
     num_frames: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class OutputFacts:
-    """One output of the gateway. ``messages`` are by component, ``queries`` by result."""
-
-    output: str
-    is_connected: bool
-    problem: str
-    messages: dict[str, int]
-    queries: dict[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,75 +77,49 @@ class EventFacts:
     parameters: str
 
 
-class Names(NamedTuple):
-    """Where a source comes from: the server, the gateway's computer and its version; "" if not known."""
-
-    server: str
-    host: str
-    version: str
-
-
-def source_names(source: LiveSource) -> Names:
-    """Return where a source comes from, as its status says."""
-    status = source.newest_status
-    if status is None:
-        return Names("", "", "")
-    return Names(_label(status.server), _label(status.host), _label(status.gateway_version))
-
-
-def state(source: LiveSource) -> StateFacts:
+def state(source: LiveSource) -> State:
     """Return the state of a source, in the words of the status line."""
     if source.is_silent:
         age_s = source.status_age_s
         since = "yet" if age_s is None else f"for {age_s:.0f} s"
-        return StateFacts(f"no status of its gateway {since}; is it running?", "error")
-    status = source.newest_status
-    if status is None:
-        return StateFacts("waiting for the status of its gateway", "warning")
-    text = _sentence(source_text(message_texts(status))) or "its gateway reports no stream"
-    stopped = [each.key for each in WIRE_ORDER if _is_stopped(source, each)]
-    levels = {stream_level(stream.state, stream.problem) for stream in status.streams}
-    if Level.BAD in levels:
-        return StateFacts(text, "error")
-    if stopped:
-        return StateFacts(f"{text}; stopped: {' '.join(stopped)}", "error")
-    return StateFacts(text, "ok" if levels == {Level.GOOD} else "warning")
-
-
-def _is_stopped(source: LiveSource, kind: ComponentType) -> bool:
-    component = source.components.get(kind.key)
-    return component is not None and component.is_stopped
+        return State(Level.BAD, f"no status of its gateway {since}; is it running?")
+    if source.report is None:
+        return State(Level.WAITING, "waiting for the status of its gateway")
+    level, text = source.report.level, safe_text(source.report.text) or "its gateway reports no stream"
+    stopped = [key for key, each in [*source.components.items()] if each.is_stopped]
+    if stopped and level is not Level.BAD:
+        in_order = [each.key for each in WIRE_ORDER if each.key in stopped]
+        return State(Level.BAD, f"{text}; stopped: {' '.join(in_order)}")
+    return State(level, text)
 
 
 def components(source: LiveSource) -> list[ComponentFacts]:
     """Return the components that have come or that the streams request, in the order of frames."""
-    wanted = {key for stream in streams(source) for key in stream.components.split()}
-    wanted.update([*source.components])
+    wanted = {*source.components, *(source.report.components if source.report else ())}
     found = [_component(source, each) for each in WIRE_ORDER if each.key in wanted]
     poses = [series for series in source.series if series.key.startswith(POSE)]
-    return [*found, _poses(poses)] if poses else found
+    if poses:
+        found.append(ComponentFacts(f"{POSE}*", None, None, *_message_counts(poses), num_items=len(poses)))
+    return found
 
 
 def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     component = source.components.get(kind.key) or LiveComponent(kind)
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
-    announced = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
+    announced_hz = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
     can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
-    to_gateway, to_here = component.latency.to_gateway, component.latency.to_here
+    to_gateway_p50_ms, to_gateway_p99_ms = component.latency.to_gateway or (None, None)
+    to_here_p50_ms, to_here_p99_ms = component.latency.to_here or (None, None)
     return ComponentFacts(
-        component=kind.key,
-        rate_hz=0.0 if component.is_stopped else component.rate_hz,
-        announced_rate_hz=_finite(announced),
-        num_messages=0 if series is None else series.num_messages,
-        num_lost=0 if series is None else series.check.num_lost,
-        num_gaps=0 if series is None else series.check.num_gaps,
-        num_restarts=0 if series is None else series.check.num_restarts,
-        has_two_gateways=series is not None and series.check.has_two_publishers,
-        capture_to_gateway_p50_ms=_p50_ms(to_gateway),
-        capture_to_gateway_p99_ms=_p99_ms(to_gateway),
-        gateway_to_here_p50_ms=_p50_ms(to_here),
-        gateway_to_here_p99_ms=_p99_ms(to_here),
+        kind.key,
+        0.0 if component.is_stopped else component.rate_hz,
+        announced_hz if announced_hz is not None and math.isfinite(announced_hz) else None,
+        *_message_counts([] if series is None else [series]),
+        to_gateway_p50_ms,
+        to_gateway_p99_ms,
+        to_here_p50_ms,
+        to_here_p99_ms,
         num_items=len(component.newest_items) if has_come else None,
         num_visible=int(component.is_visible.sum()) if can_be_seen else None,
         age_s=component.age_s,
@@ -203,28 +129,15 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     )
 
 
-def _poses(series: Iterable[Any]) -> ComponentFacts:
-    poses = [*series]
-    checks = [each.check for each in poses]
-    return ComponentFacts(
-        component=f"{POSE}*",
-        rate_hz=None,
-        announced_rate_hz=None,
-        num_messages=sum(each.num_messages for each in poses),
-        num_lost=sum(check.num_lost for check in checks),
-        num_gaps=sum(check.num_gaps for check in checks),
-        num_restarts=max(check.num_restarts for check in checks),
-        has_two_gateways=any(check.has_two_publishers for check in checks),
-        capture_to_gateway_p50_ms=None,
-        capture_to_gateway_p99_ms=None,
-        gateway_to_here_p50_ms=None,
-        gateway_to_here_p99_ms=None,
-        num_items=len(poses),
-        num_visible=None,
-        age_s=None,
-        is_stopped=False,
-        num_skipped=0,
-        num_malformed=0,
+def _message_counts(series: Sequence[Series]) -> tuple[int, int, int, int, bool]:
+    """Return how many messages came, were lost, in how many gaps; restarts; whether two gateways publish."""
+    checks = [each.check for each in series]
+    return (
+        sum(each.num_messages for each in series),
+        sum(check.num_lost for check in checks),
+        sum(check.num_gaps for check in checks),
+        max((check.num_restarts for check in checks), default=0),
+        any(check.has_two_publishers for check in checks),
     )
 
 
@@ -233,81 +146,38 @@ def has_two_gateways(source: LiveSource) -> bool:
     return any(series.check.has_two_publishers for series in source.series)
 
 
-def markers(source: LiveSource) -> list[ItemFacts]:
-    """Return the markers, in the order of the server."""
-    return _items(source.components.get("3d"))
-
-
-def tools(source: LiveSource) -> list[ItemFacts]:
-    """Return the tools, in the order of the server."""
-    return _items(source.components.get("6d"))
-
-
-def _items(component: LiveComponent | None) -> list[ItemFacts]:
+def items(source: LiveSource, kind: ComponentType) -> list[ItemFacts]:
+    """Return the markers or the tools, in the order of the server."""
+    component = source.components.get(kind.key)
     if component is None:
         return []
-    items = component.newest_items
-    shares = component.visible_shares.tolist() or [None] * len(items)
-    errors = items["error"].tolist() if "error" in (items.dtype.names or ()) else [None] * len(items)
+    newest = component.newest_items
+    shares = component.visible_shares.tolist() or [None] * len(newest)
+    errors = newest["error"].tolist() if "error" in (newest.dtype.names or ()) else [None] * len(newest)
     columns = zip(
         component.description.labels,
         component.description.units,
         shares,
         component.is_visible.tolist(),
-        *(items[name].tolist() for name in "xyz"),
+        *(newest[name].tolist() for name in "xyz"),
         errors,
         strict=True,
     )
-    return [
-        ItemFacts(
-            safe_text(label, _MAX_LABEL),
-            share,
-            is_seen,
-            x if is_seen else None,
-            y if is_seen else None,
-            z if is_seen else None,
-            safe_text(unit, _MAX_LABEL),
-            error if is_seen else None,
-        )
-        for label, unit, share, is_seen, x, y, z, error in columns
-    ]
-
-
-def streams(source: LiveSource) -> list[StreamFacts]:
-    """Return the streams of the newest status."""
-    status = source.newest_status
-    return [] if status is None else [_stream(stream) for stream in _first(status.streams)]
-
-
-def _stream(stream: Any) -> StreamFacts:
-    return StreamFacts(
-        components=_label(stream.components),
-        state=_label(stream.state),
-        problem=_sentence(stream.problem),
-        session=stream.session,
-        byte_order=_label(stream.byte_order),
-        rate=_label(stream.rate),
-        frame_rate_hz=stream.frame_rate_hz,
-        lag_ms=stream.lag_ms,
-        num_reconnects=stream.reconnects,
-        num_restarts=stream.restarts,
-        has_clock=bool(stream.clock.has_clock),
-        clock_drift_ppm=stream.clock.drift_ppm,
-        clock_uncertainty_us=stream.clock.uncertainty_us,
-        limitations=[_sentence(text) for text in _first(stream.limitations)],
-        last_error=_sentence(stream.last_error),
-        last_error_utime=stream.last_error_utime,
-    )
+    found = []
+    for label, unit, share, is_seen, *values in columns:
+        x, y, z, error = values if is_seen else (None, None, None, None)
+        name, unit_name = safe_text(label, _MAX_LABEL), safe_text(unit, _MAX_LABEL)
+        found.append(ItemFacts(name, share, is_seen, x, y, z, unit_name, error))
+    return found
 
 
 def losses(source: LiveSource) -> list[LossFacts]:
     """Return what was lost: before the outputs, on each of them, and on the way here."""
-    status = source.newest_status
     found = []
-    for stream in _first(() if status is None else status.streams):
-        found += [_loss(f"stream {_label(stream.components)}", drop) for drop in _first(stream.drops)]
-    for output in _first(() if status is None else status.outputs):
-        found += [_loss(f"output {_label(output.name)}", drop) for drop in _first(output.drops)]
+    if source.report is not None:
+        routes = [(f"stream {each.components}", each.losses) for each in source.report.streams]
+        routes += [(f"output {each.output}", each.losses) for each in source.report.outputs]
+        found = [LossFacts(where, *loss) for where, losses in routes for loss in losses]
     checks = [(series.key, series.check) for series in source.series]
     here = {
         "missing in the sequence of messages": sum(check.num_lost for _, check in checks),
@@ -319,81 +189,60 @@ def losses(source: LiveSource) -> list[LossFacts]:
     return found + [LossFacts("received here", cause, count, None) for cause, count in here.items() if count]
 
 
-def _loss(where: str, drop: Any) -> LossFacts:
-    return LossFacts(where, _label(drop.cause), drop.messages, drop.frames)
-
-
-def outputs(source: LiveSource) -> list[OutputFacts]:
-    """Return the outputs of the newest status."""
-    status = source.newest_status
-    return [
-        OutputFacts(
-            output=_label(output.name),
-            is_connected=bool(output.connected),
-            problem=_sentence(output.problem),
-            messages=_counts(output.messages),
-            queries=_counts(output.queries),
-        )
-        for output in _first(() if status is None else status.outputs)
-    ]
-
-
 def events(source: LiveSource) -> list[EventFacts]:
     """Return the last events, the newest one first."""
     return [
-        EventFacts(event.capture_utime, _label(event.text.label), _sentence(event.text.description))
+        EventFacts(event.capture_utime, safe_text(event.text.label), safe_text(event.text.description))
         for event in reversed(source.events)
     ]
 
 
+_STREAM_FIELDS: Final = (
+    "components",
+    "state",
+    "problem",
+    "session",
+    "byte_order",
+    "rate",
+    "frame_rate_hz",
+    "lag_ms",
+    "num_reconnects",
+    "num_restarts",
+    "has_clock",
+    "clock_drift_ppm",
+    "clock_uncertainty_us",
+    "limitations",
+    "last_error",
+    "last_error_utime",
+)
+_LEVELS: Final = {Level.GOOD: "ok", Level.WAITING: "warning", Level.BAD: "error"}
+_OUTPUT_FIELDS: Final = ("output", "is_connected", "problem", "messages", "queries")
+
+
 def source_facts(source: LiveSource) -> dict[str, Any]:
     """Return everything about a source, for JSON."""
-    found, names = state(source), source_names(source)
+    found, report = state(source), source.report or SourceReport(source.name)
     return {
-        "source": _label(source.name),
-        "server": names.server,
-        "host": names.host,
-        "gateway_version": names.version,
+        "source": safe_text(source.name),
+        "server": report.server,
+        "host": report.host,
+        "gateway_version": report.version,
         "state": found.text,
-        "level": found.level,
+        "level": _LEVELS[found.level],
         "status_age_s": source.status_age_s,
         "age_s": source.age_s,
         "is_stopped": source.is_stopped,
         "has_two_gateways": has_two_gateways(source),
         "parameters_version": source.parameters_version,
         "components": components(source),
-        "markers": markers(source),
-        "tools": tools(source),
-        "streams": streams(source),
+        "markers": items(source, ComponentType.MARKERS),
+        "tools": items(source, ComponentType.TOOLS),
+        "streams": [_fields(stream, _STREAM_FIELDS) for stream in report.streams],
         "losses": losses(source),
-        "outputs": outputs(source),
+        "outputs": [_fields(output, _OUTPUT_FIELDS) for output in report.outputs],
         "events": events(source),
     }
 
 
-def _first(entries: Iterable[_Entry]) -> list[_Entry]:
-    return [*islice(entries, _MAX_ENTRIES)]
-
-
-def _counts(counts: Iterable[Any]) -> dict[str, int]:
-    return {_label(each.name): each.count for each in _first(counts)}
-
-
-def _label(text: str) -> str:
-    return safe_text(text, _MAX_LABEL)
-
-
-def _sentence(text: str) -> str:
-    return safe_text(text, _MAX_SENTENCE)
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-def _p50_ms(latency: Percentiles | None) -> float | None:
-    return None if latency is None else latency.p50_ms
-
-
-def _p99_ms(latency: Percentiles | None) -> float | None:
-    return None if latency is None else latency.p99_ms
+def _fields(report: object, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(report, name) for name in names}

@@ -6,16 +6,18 @@ from typing import Final, NamedTuple
 
 from gateway.display.live.component import SLOW_SHARE, visible_percent
 from gateway.display.live.live_data import LiveSource
-from gateway.display.terminal.screen import Style
+from gateway.display.terminal import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
 from gateway.logs.safe_text import safe_text
+from gateway.messages.source_report import Level, OutputReport
+from gateway.rtc3d.components import ComponentType
 
 TWO_GATEWAYS: Final = (
     "two gateways publish a source of this name, so lost messages are not counted exactly: give one of them "
     "another name"
 )
-_LEVEL_STYLES: Final = {"ok": Style.GOOD, "warning": Style.WARNING, "error": Style.BAD}
+_LEVEL_STYLES: Final = {Level.GOOD: Style.GOOD, Level.WAITING: Style.WARNING, Level.BAD: Style.BAD}
 _MAX_NAME: Final = 40
 _SELDOM_SHARE: Final = 0.9
 """A marker or tool that is visible in a smaller share of the frames is worth a look."""
@@ -106,58 +108,46 @@ def _latency_cell(p50_ms: float | None, p99_ms: float | None) -> Cell:
 
 def markers(sources: Sequence[LiveSource]) -> Table:
     """How often each marker was visible, and where it is."""
-    columns = (
-        Column("marker"),
-        Column("visible in 10 s", is_number=True),
-        Column("now"),
-        *_position_columns(),
-        Column("source", rank=1),
-    )
-    rows = [
-        (*_item_cells(item), text_cell(_name(source))) for source in sources for item in facts.markers(source)
-    ]
-    return Table(columns, [Section(rows)] if rows else [], "no markers so far", Order("visible in 10 s"))
+    return _items(sources, ComponentType.MARKERS, "marker")
 
 
 def tools(sources: Sequence[LiveSource]) -> Table:
     """How often each tool was visible, its error, and where it is."""
+    return _items(sources, ComponentType.TOOLS, "tool")
+
+
+def _items(sources: Sequence[LiveSource], kind: ComponentType, noun: str) -> Table:
+    has_error = kind is ComponentType.TOOLS
     columns = (
-        Column("tool"),
+        Column(noun),
         Column("visible in 10 s", is_number=True),
         Column("now"),
-        Column("error", is_number=True),
-        *_position_columns(),
+        *([Column("error", is_number=True)] if has_error else []),
+        *(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"),
+        Column("unit", rank=3),
         Column("source", rank=1),
     )
-    rows = []
-    for source in sources:
-        for item in facts.tools(source):
-            name, share, now, *position = _item_cells(item)
-            error = number_cell(item.error, 3)
-            rows.append((name, share, now, error, *position, text_cell(_name(source))))
-    return Table(columns, [Section(rows)] if rows else [], "no tools so far", Order("visible in 10 s"))
-
-
-def _position_columns() -> list[Column]:
-    return [*(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"), Column("unit", rank=3)]
-
-
-def _item_cells(item: facts.ItemFacts) -> list[Cell]:
-    share = item.visible_share
-    style = Style.FAINT if share is None else _share_style(share)
-    return [
-        text_cell(item.label, Style.PLAIN if item.is_visible else Style.BAD),
-        Cell("") if share is None else Cell(f"{visible_percent(share):.1f} %", style, share),
-        text_cell("visible") if item.is_visible else text_cell("missing", Style.BAD),
-        *(number_cell(value, 1) for value in (item.x, item.y, item.z)),
-        text_cell(item.unit, Style.FAINT),
+    rows = [
+        (
+            text_cell(item.label, Style.PLAIN if item.is_visible else Style.BAD),
+            _share_cell(item.visible_share),
+            text_cell("visible") if item.is_visible else text_cell("missing", Style.BAD),
+            *([number_cell(item.error, 3)] if has_error else []),
+            *(number_cell(value, 1) for value in (item.x, item.y, item.z)),
+            text_cell(item.unit, Style.FAINT),
+            text_cell(_name(source)),
+        )
+        for source in sources
+        for item in facts.items(source, kind)
     ]
+    return Table(columns, [Section(rows)], f"no {noun}s so far", Order("visible in 10 s"))
 
 
-def _share_style(share: float) -> Style:
-    if share < _SELDOM_SHARE:
-        return Style.BAD
-    return Style.WARNING if share < 1 else Style.PLAIN
+def _share_cell(share: float | None) -> Cell:
+    if share is None:
+        return Cell("")
+    style = Style.BAD if share < _SELDOM_SHARE else _warning_if(share < 1)
+    return Cell(f"{visible_percent(share):.1f} %", style, share)
 
 
 def server(sources: Sequence[LiveSource]) -> Table:
@@ -179,12 +169,11 @@ def server(sources: Sequence[LiveSource]) -> Table:
 
 
 def _server_of(source: LiveSource) -> Section:
-    status = source.newest_status
-    found = facts.source_names(source)
-    where = "" if status is None else f" from {found.server} by {found.host} (version {found.version})"
+    report = source.report
+    where = "" if report is None else f" from {report.server} by {report.host} (version {report.version})"
     state = facts.state(source)
     rows, notes = [], []
-    for stream in facts.streams(source):
+    for stream in report.streams if report else ():
         drift_ppm = stream.clock_drift_ppm if stream.has_clock else None
         uncertainty_us = stream.clock_uncertainty_us if stream.has_clock else None
         rows.append(
@@ -233,7 +222,7 @@ def drops(sources: Sequence[LiveSource]) -> Table:
         for source in sources
         for loss in facts.losses(source)
     ]
-    return Table(columns, [Section(rows)] if rows else [], "nothing was lost")
+    return Table(columns, [Section(rows)], "nothing was lost")
 
 
 def outputs(sources: Sequence[LiveSource]) -> Table:
@@ -247,7 +236,7 @@ def outputs(sources: Sequence[LiveSource]) -> Table:
     )
     rows, notes = [], []
     for source in sources:
-        for output in facts.outputs(source):
+        for output in _outputs(source):
             is_fine = output.is_connected and not output.problem
             rows.append(
                 (
@@ -262,7 +251,7 @@ def outputs(sources: Sequence[LiveSource]) -> Table:
                 )
             )
         notes += [(text, Style.BAD) for text in _output_problems(source)]
-    return Table(columns, [Section(rows, (), notes)] if rows else [], "no output so far")
+    return Table(columns, [Section(rows, (), notes)], "no output so far")
 
 
 def questions(sources: Sequence[LiveSource]) -> Table:
@@ -281,10 +270,10 @@ def questions(sources: Sequence[LiveSource]) -> Table:
             number_cell(count),
         )
         for source in sources
-        for output in facts.outputs(source)
+        for output in _outputs(source)
         for result, count in output.queries.items()
     ]
-    return Table(columns, [Section(rows)] if rows else [], "nobody has asked anything so far")
+    return Table(columns, [Section(rows)], "nobody has asked anything so far")
 
 
 def events(sources: Sequence[LiveSource]) -> Table:
@@ -301,7 +290,7 @@ def events(sources: Sequence[LiveSource]) -> Table:
         )
         for source, event in found
     ]
-    return Table(columns, [Section(rows)] if rows else [], "no events so far")
+    return Table(columns, [Section(rows)], "no events so far")
 
 
 PAGES: Final = (
@@ -327,8 +316,11 @@ def event_time(utime: int) -> str:
 
 
 def _output_problems(source: LiveSource) -> list[str]:
-    found = facts.outputs(source)
-    return [f"{_name(source)} to {each.output}: {each.problem}" for each in found if each.problem]
+    return [f"{_name(source)} to {each.output}: {each.problem}" for each in _outputs(source) if each.problem]
+
+
+def _outputs(source: LiveSource) -> Sequence[OutputReport]:
+    return source.report.outputs if source.report else ()
 
 
 def _name(source: LiveSource) -> str:

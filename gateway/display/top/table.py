@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from rich.cells import cell_len, chop_cells, set_cell_size
 
-from gateway.display.terminal.screen import Line, Style
+from gateway.display.terminal import Line, Style
 from gateway.logs.safe_text import quoted
 
 _GAP: Final = 2

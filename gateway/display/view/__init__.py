@@ -4,9 +4,9 @@
 (``gateway.display.live``) and updates what the browsers show. With a take instead of a gateway, it also has
 the controls of the player.
 
-- ``server``: the web server, who may connect to it, and how long data wait in this program.
-- ``scene``: the picture, a group for each source. ``world`` has the floor, the axes and the camera,
-  ``markers_and_tools`` and ``plates`` what moves in it.
+- ``server``: the web server, and who may connect to it.
+- ``scene``: the picture, a group for each source. ``laboratory`` has the floor, the axes, the camera and the
+  force plates, ``markers_and_tools`` what moves in it.
 - ``panel``: what stands beside the picture: the banner, the tabs, the switches. ``source_text`` says what is
   known about a source, ``texts`` turns numbers and names from the network into HTML, and ``plots`` draws
   channels.

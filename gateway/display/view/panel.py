@@ -1,20 +1,24 @@
 """The panel beside the picture: state, rates, latency, losses, visibility, events and plots."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+import numpy as np
 import viser
 
 from gateway.descriptions.force_plates import METRES_PER_NEWTON
+from gateway.display.live.component import Percentiles
 from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.view.laboratory import UP_AXES, UpAxis
 from gateway.display.view.markers_and_tools import SourceColor
 from gateway.display.view.plots import Plots
-from gateway.display.view.server import ShownLatency, set_theme
-from gateway.display.view.source_text import State, data_state, gateway_states, ignored_html, source_html
+from gateway.display.view.server import set_theme
+from gateway.display.view.source_text import data_state, gateway_states, ignored_html, source_html
 from gateway.display.view.texts import clock_text, counted, events_html, html_text, items_html
-from gateway.display.view.world import UP_AXES, UpAxis
-from gateway.stream.status_text import Level
+from gateway.messages.host_time import now_utime
+from gateway.messages.source_report import Level, State
 
 _SCRIPT: Final = """
 if (!window.gatewayScript) {
@@ -148,10 +152,10 @@ class Switches:
         self._tab = tab
         with tab:
             button = server.gui.add_button("Fit view", hint="Turn the camera so that it sees all data.")
-            self._marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
-            self._tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
-            self._trails = server.gui.add_checkbox("Marker trails", initial_value=False)
-            self._floor = server.gui.add_checkbox("Floor", initial_value=True)
+            self.marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
+            self.tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
+            self.trails = server.gui.add_checkbox("Marker trails", initial_value=False)
+            self.floor = server.gui.add_checkbox("Floor", initial_value=True)
             self._up = server.gui.add_dropdown(
                 "Up axis", UP_AXES, initial_value="z", hint="The axis of the laboratory that points up."
             )
@@ -176,26 +180,6 @@ class Switches:
                 set_theme(event.client.gui, dark=themes.value == "dark")
 
     @property
-    def marker_labels(self) -> bool:
-        """Whether markers have labels."""
-        return self._marker_labels.value
-
-    @property
-    def tool_labels(self) -> bool:
-        """Whether tools have labels."""
-        return self._tool_labels.value
-
-    @property
-    def trails(self) -> bool:
-        """Whether markers have trails."""
-        return self._trails.value
-
-    @property
-    def floor(self) -> bool:
-        """Whether the floor is shown."""
-        return self._floor.value
-
-    @property
     def up(self) -> UpAxis:
         """The axis that points up; z if a page has sent anything else."""
         chosen = self._up.value
@@ -215,6 +199,36 @@ class Switches:
                 f'<div style="margin: 0 0.8em; height: 3px; background: rgb({red}, {green}, {blue})"></div>'
             )
             return self._server.gui.add_checkbox(name, initial_value=True)
+
+
+_NUM_LATENCIES: Final = 300
+"""10 s at 30 pictures per second."""
+
+
+class ShownLatency:
+    """The time from the arrival of what is shown to its sending, by source and component."""
+
+    def __init__(self) -> None:
+        self._samples_ms: dict[str, dict[str, deque[float]]] = {}
+
+    def add(self, sources: Sequence[LiveSource]) -> None:
+        """Take the newest messages, which are sent to the browsers now."""
+        now = now_utime()
+        for source in sources:
+            samples_ms = self._samples_ms.setdefault(source.name, {})
+            for key, component in [*source.components.items()]:
+                arrived_utime = component.newest_arrived_utime
+                if len(component.batch.heads) and arrived_utime is not None:
+                    of_component = samples_ms.setdefault(key, deque(maxlen=_NUM_LATENCIES))
+                    of_component.append((now - arrived_utime) / 1000)
+
+    def percentiles(self, source: str) -> dict[str, Percentiles]:
+        """Return the percentiles of the newest samples, by component."""
+        found = {}
+        for key, samples_ms in self._samples_ms.get(source, {}).items():
+            p50, p99 = np.percentile([*samples_ms], (50, 99))
+            found[key] = Percentiles(float(p50), float(p99))
+        return found
 
 
 _PLOT_INTERVAL_S: Final = 0.1

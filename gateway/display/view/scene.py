@@ -11,10 +11,18 @@ import viser
 
 from gateway.display.live.component import LiveComponent
 from gateway.display.live.live_data import LiveSource
+from gateway.display.view.laboratory import (
+    Plates,
+    Sphere,
+    UpAxis,
+    World,
+    fit,
+    on_floor,
+    sphere_around,
+    up_axis_of,
+)
 from gateway.display.view.markers_and_tools import Markers, Tools, color_of
 from gateway.display.view.panel import Switches
-from gateway.display.view.plates import Plates
-from gateway.display.view.world import Sphere, UpAxis, World, fit, on_floor, sphere_around, up_axis_of
 from gateway.rtc3d.parameters import Parameters
 
 _NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
@@ -64,10 +72,14 @@ class SourceScene:
         prefix = "" if is_alone else f"{source.name}: "
         if "3d" in components:
             self._markers.update(
-                components["3d"], now_s, prefix, labels=switches.marker_labels, trails=switches.trails
+                components["3d"],
+                now_s,
+                prefix,
+                labels=switches.marker_labels.value,
+                trails=switches.trails.value,
             )
         if "6d" in components:
-            self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels)
+            self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels.value)
         self._plates.update(components.get("force"), source.newest_parameters, up, now_s, prefix)
         self._say_stopped(source.name, components, up)
 
@@ -181,7 +193,7 @@ class Scene:
         if self._world.up != self._switches.up:
             self._world.set_up(self._switches.up)
             self._fitted.clear()
-        self._world.show_floor(visible=self._switches.floor)
+        self._world.show_floor(visible=self._switches.floor.value)
 
     def _fit(self, clients: dict[int, viser.ClientHandle], now_s: float) -> None:
         """Fit the view of browsers that are new, or want it; of all when the first markers or tools come."""

@@ -3,85 +3,18 @@
 import errno
 import logging
 import socket
-import time
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
 import rich
 import viser
 import websockets.asyncio.server
 
-from gateway.client.transport import GatewaySubscriber
-from gateway.display.live.component import Percentiles
-from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.errors import ViewError
-from gateway.messages.host_time import now_utime
 from gateway.outputs.listen_address import foreign_request
-
-_NUM_SAMPLES: Final = 300
-"""10 s at 30 pictures per second."""
-
-
-class ShownLatency:
-    """The time from the arrival of what is shown to its sending, by source and component."""
-
-    def __init__(self) -> None:
-        self._samples_ms: dict[str, dict[str, deque[float]]] = {}
-
-    def add(self, sources: Sequence[LiveSource]) -> None:
-        """Take the newest messages, which are sent to the browsers now."""
-        now = now_utime()
-        for source in sources:
-            samples_ms = self._samples_ms.setdefault(source.name, {})
-            for key, component in [*source.components.items()]:
-                arrived_utime = component.newest_arrived_utime
-                if len(component.batch.heads) and arrived_utime is not None:
-                    of_component = samples_ms.setdefault(key, deque(maxlen=_NUM_SAMPLES))
-                    of_component.append((now - arrived_utime) / 1000)
-
-    def percentiles(self, source: str) -> dict[str, Percentiles]:
-        """Return the percentiles of the newest samples, by component."""
-        found = {}
-        for key, samples_ms in self._samples_ms.get(source, {}).items():
-            p50, p99 = np.percentile([*samples_ms], (50, 99))
-            found[key] = Percentiles(float(p50), float(p99))
-        return found
-
-
-PERIOD_S: Final = 2.0
-
-
-class RunningTakes:
-    """Queries the gateways that have the output takes; ``is_watched`` says whether a page is open."""
-
-    def __init__(
-        self,
-        live: LiveData,
-        subscriber: GatewaySubscriber,
-        is_watched: Callable[[], object],
-        period_s: float = PERIOD_S,
-    ) -> None:
-        self._live = live
-        self._subscriber = subscriber
-        self._is_watched = is_watched
-        self._period_s = period_s
-        self._due_s = 0.0
-
-    def tick(self) -> None:
-        """Query if it is time. Call it often."""
-        now_s = time.monotonic()
-        if now_s < self._due_s or not self._is_watched():
-            return
-        self._due_s = now_s + self._period_s
-        for source in self._live.sources_now:
-            outputs = source.newest_status.outputs if source.newest_status else ()
-            if any(output.name == "takes" for output in outputs):
-                self._subscriber.query_takes(source)
 
 
 class ViewServer(viser.ViserServer):

@@ -1,9 +1,7 @@
 """What the panel says about one source, as HTML: state, rates, latency, losses."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Final, NamedTuple
-
-import rtc3d
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final
 
 from gateway.display.live.component import LiveComponent, Percentiles
 from gateway.display.live.live_data import LiveData, LiveSource
@@ -19,19 +17,11 @@ from gateway.display.view.texts import (
     table,
 )
 from gateway.logs.losses import counts_text
+from gateway.messages.source_report import Level, LossReport, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.stream.status import FRAME_REJECTED, NOT_SENT, SKIPPED
-from gateway.stream.status_text import Level, message_texts, stream_level
 
 _MAX_CHARACTERS: Final = 300
-_MAX_STREAMS: Final = 8
-
-
-class State(NamedTuple):
-    """A state in words, and how well it works."""
-
-    level: Level
-    text: str
 
 
 def data_state(source: LiveSource) -> State:
@@ -55,20 +45,14 @@ def gateway_states(source: LiveSource) -> list[State]:
 
     If it says the same about all, that is one state. If the gateway is not heard, that is the state.
     """
-    status, age_s = source.newest_status, source.status_age_s
+    report, age_s = source.report, source.status_age_s
     if source.is_silent:
         text = "no gateway heard" if age_s is None else f"gateway not heard for {age_text(age_s)}"
         return [State(Level.BAD, text)]
-    if status is None:
-        return []
-    texts = message_texts(status)[:_MAX_STREAMS]
-    levels = [stream_level(stream.state, stream.problem) for stream in status.streams]
-    if len({text for _, text in texts}) == 1:
-        return [State(levels[0], texts[0][1])]
-    return [
-        State(level, f"{components}: {text}")
-        for level, (components, text) in zip(levels, texts, strict=False)
-    ]
+    streams = report.streams if report else ()
+    if len({stream.text for stream in streams}) == 1:
+        return [State(streams[0].level, streams[0].text)]
+    return [State(stream.level, f"{stream.components}: {stream.text}") for stream in streams]
 
 
 def states_html(states: Iterable[State]) -> str:
@@ -77,10 +61,6 @@ def states_html(states: Iterable[State]) -> str:
         f"<p class={state.level.value}>{html_text(state.text, _MAX_CHARACTERS)}</p>" for state in states
     )
 
-
-_MAX_SENTENCE_CHARACTERS: Final = 300
-_MAX_LINES: Final = 20
-"""How many streams and outputs, each with its drops, are shown."""
 
 _NOTE: Final = (
     "<p class=dim>Server and gateway: since the gateway’s start. Here: since this view’s start, on the way "
@@ -100,10 +80,10 @@ def _component_rows(source: LiveSource, components: Mapping[str, LiveComponent])
     """Yield the figures of each component; nothing if all are 0."""
     figures = {}
     for key, component in components.items():
-        server = _dropped(source.newest_status, key, NOT_SENT)
-        gateway = _dropped(source.newest_status, key, FRAME_REJECTED, SKIPPED)
+        server = _dropped(source.report, key, NOT_SENT)
+        gateway = _dropped(source.report, key, FRAME_REJECTED, SKIPPED)
         # Skipped messages have numbers: those skipped since this view began are gaps here, too.
-        skipped = _dropped(source.newest_status, key, SKIPPED) - _dropped(source.first_status, key, SKIPPED)
+        skipped = _dropped(source.report, key, SKIPPED) - _dropped(source.first_report, key, SKIPPED)
         gaps = source.series_by_key[key].check.num_lost - skipped
         figures[key] = (server, gateway, max(0, gaps) + component.num_skipped + component.num_malformed)
     if any(map(any, figures.values())):
@@ -113,27 +93,27 @@ def _component_rows(source: LiveSource, components: Mapping[str, LiveComponent])
 
 def _output_rows(source: LiveSource) -> Iterator[tuple[str, ...]]:
     """Yield what each output of the gateway has dropped, of all components together."""
-    for output in source.newest_status.outputs[:_MAX_LINES] if source.newest_status else ():
-        dropped = sum(drop.messages for drop in output.drops)
+    for output in source.report.outputs if source.report else ():
+        dropped = sum(loss.num_messages for loss in output.losses)
         if dropped:
-            yield f"output {html_text(output.name)}", NONE, _figure(dropped), NONE, _figure(dropped)
+            yield f"output {html_text(output.output)}", NONE, _figure(dropped), NONE, _figure(dropped)
 
 
 def _figure(number: int) -> str:
     return f"<span class=bad>{count_text(number)}</span>" if number else "0"
 
 
-def _dropped(status: rtc3d.status_t | None, key: str, *causes: str) -> int:
+def _dropped(report: SourceReport | None, key: str, *causes: str) -> int:
     """Return how many messages of a component were lost before any output: one in each frame.
 
     Events are not in every frame, so they are not counted.
     """
     return sum(
-        drop.frames
-        for stream in (status.streams if status and key != "event" else ())
+        loss.num_frames
+        for stream in (report.streams if report and key != "event" else ())
         if {key, "all"} & {*stream.components.split()}
-        for drop in stream.drops
-        if drop.cause in causes
+        for loss in stream.losses
+        if loss.cause in causes
     )
 
 
@@ -154,33 +134,33 @@ def _causes(source: LiveSource, components: Mapping[str, LiveComponent]) -> Iter
     if source.num_unreadable:
         unreadable = counted(source.num_unreadable, "message")
         yield Level.BAD, f"parameters or status that cannot be read: {unreadable}"
-    if source.newest_status is not None:
-        yield from _status_causes(source.newest_status)
+    if source.report is not None:
+        yield from _report_causes(source.report)
 
 
-def _status_causes(status: rtc3d.status_t) -> Iterator[tuple[Level, str]]:
+def _report_causes(report: SourceReport) -> Iterator[tuple[Level, str]]:
     """Say what the gateway has lost since its start, and what its streams and outputs lack."""
-    for stream in status.streams[:_MAX_LINES]:
+    for stream in report.streams:
         name = html_text(stream.components)
-        if stream.drops:
-            yield Level.WAITING, f"dropped at {name}: {_drops(stream.drops)}"
-        for limitation in stream.limitations[:_MAX_LINES]:
-            yield Level.WAITING, f"{name}: {html_text(limitation, _MAX_SENTENCE_CHARACTERS)}"
+        if stream.losses:
+            yield Level.WAITING, f"dropped at {name}: {_drops(stream.losses)}"
+        for limitation in stream.limitations:
+            yield Level.WAITING, f"{name}: {html_text(limitation, _MAX_CHARACTERS)}"
         if stream.last_error:
             at = clock_text(stream.last_error_utime / 1e6)
-            error = html_text(stream.last_error, _MAX_SENTENCE_CHARACTERS)
+            error = html_text(stream.last_error, _MAX_CHARACTERS)
             yield Level.WAITING, f"last error of {name}, {at}: {error}"
-    for output in status.outputs[:_MAX_LINES]:
-        if not output.connected:
-            problem = html_text(output.problem or NONE, _MAX_SENTENCE_CHARACTERS)
-            yield Level.BAD, f"output {html_text(output.name)}: {problem}"
-        if output.drops:
-            yield Level.WAITING, f"dropped at output {html_text(output.name)}: {_drops(output.drops)}"
+    for output in report.outputs:
+        name = html_text(output.output)
+        if not output.is_connected:
+            problem = html_text(output.problem or NONE, _MAX_CHARACTERS)
+            yield Level.BAD, f"output {name}: {problem}"
+        if output.losses:
+            yield Level.WAITING, f"dropped at output {name}: {_drops(output.losses)}"
 
 
-def _drops(drops: list[rtc3d.loss_t]) -> str:
-    texts = counts_text((drop.cause, drop.messages, drop.frames) for drop in drops[:_MAX_LINES])
-    return html_text(texts, _MAX_SENTENCE_CHARACTERS)
+def _drops(losses: Sequence[LossReport]) -> str:
+    return html_text(counts_text(losses), _MAX_CHARACTERS)
 
 
 _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
@@ -244,11 +224,11 @@ def _components(source: LiveSource) -> dict[str, LiveComponent]:
 
 def _origin(source: LiveSource) -> Iterator[str]:
     """Say where the data come from, and whether the gateway records them."""
-    status = source.newest_status
-    if status is None:
+    report = source.report
+    if report is None:
         return
-    on_host = f" on {html_text(status.host)}" if status.host else ""
-    yield f"server {html_text(status.server)} · gateway {html_text(status.gateway_version)}{on_host}"
+    on_host = f" on {html_text(report.host)}" if report.host else ""
+    yield f"server {html_text(report.server)} · gateway {html_text(report.version)}{on_host}"
     if source.running_take is not None and not source.is_silent:
         yield (
             f"recording the take {html_text(source.running_take)}"

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import viser
 
+from gateway.client.transport import GatewaySubscriber
 from gateway.display.live.live_data import LiveData
 from gateway.display.view.panel import Panel
 from gateway.display.view.scene import Scene
@@ -143,6 +144,37 @@ def _length_by_reading_us(reader: TakeReader) -> int:
     for batches in reader.batches():
         last_utime = max(last_utime, *(batch.utimes[-1] for batch in batches))
     return last_utime - reader.start_utime
+
+
+_TAKES_PERIOD_S: Final = 2.0
+
+
+class RunningTakes:
+    """Queries the gateways that have the output takes; ``is_watched`` says whether a page is open."""
+
+    def __init__(
+        self,
+        live: LiveData,
+        subscriber: GatewaySubscriber,
+        is_watched: Callable[[], object],
+        period_s: float = _TAKES_PERIOD_S,
+    ) -> None:
+        self._live = live
+        self._subscriber = subscriber
+        self._is_watched = is_watched
+        self._period_s = period_s
+        self._due_s = 0.0
+
+    def tick(self) -> None:
+        """Query if it is time. Call it often."""
+        now_s = time.monotonic()
+        if now_s < self._due_s or not self._is_watched():
+            return
+        self._due_s = now_s + self._period_s
+        for source in self._live.sources_now:
+            outputs = source.report.outputs if source.report else ()
+            if any(output.output == "takes" for output in outputs):
+                self._subscriber.query_takes(source)
 
 
 PERIOD_S: Final = 1 / 30

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
-from gateway.outputs.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.listen_address import from_this_computer, host_in_url, is_loopback, listen_problem
 
@@ -15,7 +15,7 @@ _PACKAGES: Final = ("foxglove-sdk", "protobuf", "websockets")
 _TIMEOUT_S: Final = 2.0
 _MAX_MESSAGES: Final = 20
 
-_foxglove: Final = Subject("foxglove")
+_PACKAGE, _PORT = (Check("foxglove", name) for name in CHECKS)
 
 
 def check_foxglove(
@@ -27,16 +27,11 @@ def check_foxglove(
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
-            return [
-                _foxglove.failing(
-                    "package",
-                    f"the package {name} is not installed",
-                    "Install it with: pip install 'rtc3d-gateway[foxglove]'",
-                ),
-                _foxglove.not_tested("port", "it needs package, which failed"),
-            ]
+            remedy = "Install it with: pip install 'rtc3d-gateway[foxglove]'"
+            failing = _PACKAGE.failing(f"the package {name} is not installed", remedy)
+            return failing_first(failing, CHECKS[1:])
     found = ", ".join(f"{name} {number}" for name, number in versions.items())
-    return [_foxglove.passing("package", found), _check_port(settings, sources)]
+    return [_PACKAGE.passing(found), _check_port(settings, sources)]
 
 
 def leaves_host(settings: FoxgloveSettings) -> bool:
@@ -48,23 +43,21 @@ def _check_port(settings: FoxgloveSettings, sources: Sequence[str]) -> Finding:
     address = f"ws://{host_in_url(settings.host)}:{settings.port}"
     problem = listen_problem(settings.host, settings.port)
     if not problem:
-        return _foxglove.passing("port", f"viewers will be able to connect to {address}")
+        return _PORT.passing(f"viewers will be able to connect to {address}")
     topics = _advertised_topics(settings)
     if topics is None:
-        return _foxglove.failing(
-            "port",
+        return _PORT.failing(
             f"cannot listen on {address}: {problem}, and what is there is no gateway",
             f"`ss -ltnp` shows which program uses port {settings.port}. Stop it, or correct foxglove.host "
             "and foxglove.port.",
         )
     missing = [source for source in sources if not any(topic.startswith(f"/{source}/") for topic in topics)]
     if missing:
-        return _foxglove.warning(
-            "port",
+        return _PORT.warning(
             f"a gateway serves viewers at {address}, but not {', '.join(missing)}",
             "Reload the gateway, or start it with this configuration.",
         )
-    return _foxglove.passing("port", f"a gateway serves viewers at {address}, with {len(topics)} topics")
+    return _PORT.passing(f"a gateway serves viewers at {address}, with {len(topics)} topics")
 
 
 def _advertised_topics(settings: FoxgloveSettings) -> list[str] | None:

@@ -6,7 +6,7 @@ from typing import Final
 from urllib.parse import parse_qs
 
 from gateway.errors import OutputError
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.lcm.connection import (
     MULTICAST_SCHEMES,
     multicast_interface,
@@ -27,7 +27,7 @@ _LARGEST_DATAGRAM: Final = 65_499
 
 _LOOPBACK: Final = {None, "", "127.0.0.1", "::1", "localhost"}
 
-_lcm: Final = Subject("lcm")
+_ROUTE, _REQUESTS, _BUFFERS = (Check("lcm", name) for name in CHECKS)
 
 
 def check_lcm(
@@ -40,7 +40,7 @@ def check_lcm(
         return [
             _check_other_scheme(url, scheme),
             _check_requests(settings),
-            _lcm.not_tested("buffers", f"{scheme} does not need a receive buffer"),
+            _BUFFERS.not_tested(f"{scheme} does not need a receive buffer"),
         ]
     return [_check_route(url), _check_requests(settings), _check_buffers(url, loads)]
 
@@ -50,10 +50,8 @@ def _check_other_scheme(url: str, scheme: str) -> Finding:
         try:
             open_lcm(url)
         except OutputError as error:
-            return _lcm.failing(
-                "route", str(error).partition("; ")[0], "Start LCM's TCP relay, or correct lcm.url."
-            )
-    return _lcm.passing("route", f"{url} does not need multicast")
+            return _ROUTE.failing(str(error).partition("; ")[0], "Start LCM's TCP relay, or correct lcm.url.")
+    return _ROUTE.passing(f"{url} does not need multicast")
 
 
 def leaves_host(settings: LcmSettings) -> bool:
@@ -72,34 +70,32 @@ def _ttl(url: str) -> str:
 def _check_route(url: str) -> Finding:
     problem = multicast_problem(url)
     if problem:
-        found, _, remedy = problem.partition("; ")
-        return _lcm.failing("route", found, as_sentence(remedy))
+        return _ROUTE.problem(problem)
     try:
         open_lcm(url)
     except OutputError as error:
-        return _lcm.failing("route", str(error).partition("; ")[0], "Correct lcm.url.")
+        return _ROUTE.failing(str(error).partition("; ")[0], "Correct lcm.url.")
     address = split_url(url).netloc or "the default group"
     ttl = _ttl(url)
     if ttl == "0":
-        return _lcm.passing("route", f"multicast to {address} works and stays on this computer (ttl=0)")
-    return _lcm.passing("route", f"multicast to {address} works, with ttl={ttl}")
+        return _ROUTE.passing(f"multicast to {address} works and stays on this computer (ttl=0)")
+    return _ROUTE.passing(f"multicast to {address} works, with ttl={ttl}")
 
 
 def _check_requests(settings: LcmSettings) -> Finding:
     """Check whether other computers can send requests. The ttl of the gateway's URL does not prevent it."""
     if not settings.queries:
-        return _lcm.passing("requests", "lcm.queries is false: the gateway receives nothing on LCM")
+        return _REQUESTS.passing("lcm.queries is false: the gateway receives nothing on LCM")
     url = settings.effective_queries_url
     try:
         interface = multicast_interface(url)
     except OSError:
-        return _lcm.not_tested("requests", "it needs route, which failed")
+        return _REQUESTS.not_tested("it needs route, which failed")
     if interface is None:
-        return _lcm.passing("requests", f"{url} does not use multicast")
+        return _REQUESTS.passing(f"{url} does not use multicast")
     if interface == "lo":
-        return _lcm.passing("requests", "multicast uses the loopback interface only")
-    return _lcm.warning(
-        "requests",
+        return _REQUESTS.passing("multicast uses the loopback interface only")
+    return _REQUESTS.warning(
         f"the gateway joins multicast on the network interface {interface}; requests from other "
         "computers arrive unless a firewall drops them, also with ttl=0, which limits only sending",
         "On a network that others use, set lcm.queries to false, or install the firewall rule in "
@@ -113,7 +109,7 @@ def _check_buffers(url: str, loads: Sequence[MessageLoad]) -> Finding:
         2 * max((charged_bytes(load.largest_bytes) for load in loads), default=0),
     )
     if not needed:
-        return _lcm.not_tested("buffers", "no frames arrived, so the sizes of messages are unknown")
+        return _BUFFERS.not_tested("no frames arrived, so the sizes of messages are unknown")
     requested = parse_qs(split_url(url).query).get("recv_buf_size", [""])[0]
     available = receive_buffer_bytes(int(requested) if requested.isdecimal() else None)
     largest = max(load.largest_bytes for load in loads)
@@ -122,12 +118,12 @@ def _check_buffers(url: str, loads: Sequence[MessageLoad]) -> Finding:
         f"{_kib(needed)}, with messages of up to {largest} bytes"
     )
     if available >= needed:
-        return _lcm.passing("buffers", found)
+        return _BUFFERS.passing(found)
     size = -(-round(needed) // 2)  # the kernel doubles the size that a program requests
     remedy = f"Add recv_buf_size={size} to the LCM URL of every subscriber"
     if receive_buffer_bytes(2**30) < needed:
         remedy += f", and allow it on their computers: sysctl -w net.core.rmem_max={size}"
-    return _lcm.failing("buffers", found, f"{remedy}.")
+    return _BUFFERS.failing(found, f"{remedy}.")
 
 
 def receive_buffer_bytes(requested: int | None) -> int:

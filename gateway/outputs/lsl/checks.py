@@ -12,7 +12,7 @@ from gateway.errors import ConfigError, OutputError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import lsl_environment
@@ -25,7 +25,7 @@ _POLL_S: Final = 0.05
 _MIN_SEARCH_S: Final = 2.0
 _START_S: Final = 10.0
 
-_lsl: Final = Subject("lsl")
+_OPENS, _FOUND, _GATEWAY = (Check("lsl", name) for name in CHECKS)
 
 
 def check_lsl(
@@ -35,8 +35,7 @@ def check_lsl(
     try:
         output = LslOutput(settings)
     except ConfigError as error:
-        found, _, remedy = str(error).partition("; ")
-        return _not_open(found, remedy)
+        return _not_open(str(error))
     try:
         publisher = output.frame_publisher(_TEST_SOURCE)
         output.start()
@@ -45,18 +44,17 @@ def check_lsl(
             time.sleep(_POLL_S)
         problem = output.health().problem
         if problem:
-            found, _, remedy = problem.partition("; ")
-            return _not_open(found, remedy)
+            return _not_open(problem)
         parameters = Parameters(events=ParametersEvents())
         output.publish_parameters(
             _TEST_SOURCE, ServerParameters(b"", 1, 1, parsed=parameters, frame=CoordinateFrame(_TEST_SOURCE))
         )
-        opens = _lsl.passing("opens", f"liblsl {output.version} opens streams")
+        opens = _OPENS.passing(f"liblsl {output.version} opens streams")
         try:
             streams = _find_streams(settings, max(seconds / 2, _MIN_SEARCH_S))
         except OutputError as error:
-            failing = _lsl.failing("found", str(error), "Check lsl.config, or the file lsl_api.cfg.")
-            return [opens, failing, _lsl.not_tested("gateway", "it needs found, which failed")]
+            failing = _FOUND.failing(str(error), "Check lsl.config, or the file lsl_api.cfg.")
+            return [opens, *failing_first(failing, ["gateway"])]
         publisher.close()
     finally:
         output.close()
@@ -90,19 +88,17 @@ def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]
     return found
 
 
-def _not_open(found: str, remedy: str) -> list[Finding]:
-    remedy = as_sentence(remedy) if remedy else "Correct lsl in the configuration."
-    others = [_lsl.not_tested(check, "it needs opens, which failed") for check in CHECKS[1:]]
-    return [_lsl.failing("opens", found, remedy), *others]
+def _not_open(problem: str) -> list[Finding]:
+    failing = _OPENS.problem(problem, "Correct lsl in the configuration.")
+    return failing_first(failing, CHECKS[1:])
 
 
 def _found(names: set[tuple[str, str]]) -> Finding:
     others = {computer for computer, _ in names} - {socket.gethostname()}
     if (socket.gethostname(), f"{_TEST_SOURCE}_event") in names:
         also = f", and streams of {len(others)} other computers" if others else ""
-        return _lsl.passing("found", f"another program on this computer finds a stream{also}")
-    return _lsl.failing(
-        "found",
+        return _FOUND.passing(f"another program on this computer finds a stream{also}")
+    return _FOUND.failing(
         "another program on this computer does not find a stream",
         "Allow UDP port 16571 and the ports from 16572 in the firewall, and see docs/how-to/lsl.md.",
     )
@@ -113,11 +109,10 @@ def _gateway(names: set[tuple[str, str]], sources: Sequence[str]) -> Finding:
     served = [source for source in sources if source in found]
     missing = [source for source in sources if source not in served]
     if not served:
-        return _lsl.note("gateway", "no gateway offers streams of these sources now", "Start the gateway.")
+        return _GATEWAY.note("no gateway offers streams of these sources now", "Start the gateway.")
     if missing:
-        return _lsl.warning(
-            "gateway",
+        return _GATEWAY.warning(
             f"streams of {', '.join(served)} are offered, but none of {', '.join(missing)}",
             "Streams appear when the server has sent its parameters or a frame.",
         )
-    return _lsl.passing("gateway", f"streams of {', '.join(served)} are offered")
+    return _GATEWAY.passing(f"streams of {', '.join(served)} are offered")

@@ -7,7 +7,7 @@ from typing import Final
 import zenoh
 
 from gateway.descriptions.labels import printable
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Check, Finding, MessageLoad, as_sentence, failing_first
 from gateway.outputs.ros2.messages import NO_HASH, ROS_TYPES
 from gateway.outputs.ros2.output import REMEDY, client_config
 from gateway.outputs.ros2.settings import Ros2Settings
@@ -21,7 +21,7 @@ _MAX_NAMED: Final = 8
 _MAX_SHOWN_CHARS: Final = 100
 _MAX_TOKENS: Final = 100_000
 
-_ros2: Final = Subject("ros2")
+_ROUTER, _GATEWAY, _NODES, _TYPES = (Check("ros2", name) for name in CHECKS)
 
 
 def check_ros2(
@@ -35,10 +35,8 @@ def check_ros2(
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        return [
-            _ros2.failing("router", f"no Zenoh router at {settings.connect}: {zenoh_reason(error)}", _REMEDY),
-            *(_ros2.not_tested(check, "it needs router, which failed") for check in CHECKS[1:]),
-        ]
+        found = f"no Zenoh router at {settings.connect}: {zenoh_reason(error)}"
+        return failing_first(_ROUTER.failing(found, as_sentence(REMEDY)), CHECKS[1:])
     try:
         replies = session.liveliness().get(tokens_of(settings.domain_id), timeout=seconds)
         first = itertools.islice(replies, _MAX_TOKENS)
@@ -47,25 +45,21 @@ def check_ros2(
         session.close()
     seen = [each for each in map(seen_entity, tokens) if each is not None]
     names = sorted({each.node for each in seen if not each.topic})
-    reached = _ros2.passing("router", f"connected to the router at {settings.connect}")
+    reached = _ROUTER.passing(f"connected to the router at {settings.connect}")
     return [reached, _gateway(names, settings), _nodes(names, settings), _types(seen, settings)]
-
-
-_REMEDY: Final = as_sentence(REMEDY)
 
 
 def _gateway(names: Sequence[str], settings: Ros2Settings) -> Finding:
     name = full_name(settings.namespace, NODE_NAME)
     if name in names:
-        return _ros2.passing("gateway", f"the node {name} is visible in domain {settings.domain_id}")
-    return _ros2.not_tested("gateway", f"the node {name} is not in domain {settings.domain_id} now")
+        return _GATEWAY.passing(f"the node {name} is visible in domain {settings.domain_id}")
+    return _GATEWAY.not_tested(f"the node {name} is not in domain {settings.domain_id} now")
 
 
 def _nodes(names: Sequence[str], settings: Ros2Settings) -> Finding:
     others = [name for name in names if name != full_name(settings.namespace, NODE_NAME)]
     if not others:
-        return _ros2.note(
-            "nodes",
+        return _NODES.note(
             f"no ROS node is visible in domain {settings.domain_id}",
             "If nodes are running, check that RMW_IMPLEMENTATION is rmw_zenoh_cpp, that ROS_DOMAIN_ID is "
             f"{settings.domain_id}, and that they use this router.",
@@ -73,7 +67,7 @@ def _nodes(names: Sequence[str], settings: Ros2Settings) -> Finding:
     shown = ", ".join(map(_shown, others[:_MAX_NAMED])) + (
         f" and {len(others) - _MAX_NAMED} more" if len(others) > _MAX_NAMED else ""
     )
-    return _ros2.passing("nodes", f"visible in domain {settings.domain_id}: {shown}")
+    return _NODES.passing(f"visible in domain {settings.domain_id}: {shown}")
 
 
 def _types(seen: Sequence[SeenEntity], settings: Ros2Settings) -> Finding:
@@ -82,13 +76,12 @@ def _types(seen: Sequence[SeenEntity], settings: Ros2Settings) -> Finding:
         if each.is_subscription and each.type_hash != hashes.get(each.dds_name, each.type_hash):
             remedy = "These nodes get nothing from the gateway. Correct ros2.distribution"
             hint = "humble" if each.type_hash == NO_HASH else "that of the nodes, such as jazzy"
-            return _ros2.warning(
-                "types",
+            return _TYPES.warning(
                 f"{_shown(each.node)} subscribes to {_shown(each.topic)} with the type hash "
                 f"{_shown(each.type_hash)}, which is not that of {settings.distribution}",
                 f"{remedy}: {hint}.",
             )
-    return _ros2.passing("types", f"no node expects other types than those of {settings.distribution}")
+    return _TYPES.passing(f"no node expects other types than those of {settings.distribution}")
 
 
 def _shown(text: str) -> str:

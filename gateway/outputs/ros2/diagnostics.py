@@ -2,14 +2,15 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
 import zenoh
 
 from gateway.errors import OutputError
 from gateway.logs.failures import DefectLog
 from gateway.messages.decode import decode
+from gateway.messages.source_report import LossReport, OutputReport, SourceReport, StreamReport, source_report
 from gateway.outputs.ros2 import messages
 from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
 from gateway.outputs.ros2.source import Sender
@@ -52,7 +53,7 @@ class DiagnosticsPublisher:
         self._router = router
         self._sender = sender
         self._defects = DefectLog(logger, "ros2 diagnostics")
-        self._previous: Any = None  # only in the sending thread
+        self._previous: SourceReport | None = None  # only in the sending thread
         self._is_closed = False
 
     @property
@@ -72,7 +73,7 @@ class DiagnosticsPublisher:
 
     def _send(self, message: bytes) -> None:
         try:
-            previous, self._previous = self._previous, decode(message)
+            previous, self._previous = self._previous, source_report(decode(message))
             statuses = diagnostics_of(self._previous, previous, self._names())
             self._topic.put(diagnostic_array(messages.stamp(self._previous.utime), statuses), time.time_ns())
         except zenoh.ZError as error:
@@ -85,36 +86,39 @@ class DiagnosticsPublisher:
         self._is_closed = True
 
 
-def diagnostics_of(status: Any, previous: Any = None, names: Names = NO_NAMES) -> list[DiagnosticStatus]:
-    """Return what a decoded ``status_t`` says: one status per stream and output, and the coordinate frame.
+def diagnostics_of(
+    report: SourceReport, previous: SourceReport | None = None, names: Names = NO_NAMES
+) -> list[DiagnosticStatus]:
+    """Return the report of a source: one status per stream and output, and one of the coordinate frame.
 
     There is one more for items whose topics have other ``names`` than their labels.
 
-    A stream or output that has lost messages since ``previous``, the ``status_t`` before, gets a warning. If
+    A stream or output that has lost messages since ``previous``, the report before, gets a warning. If
     that is missing or old, it is unknown when they were lost.
     """
-    name = f"rtc3d_gateway: {status.source}"
-    is_known = previous is not None and status.utime - previous.utime <= _MAX_PREVIOUS_US
-    lost = _lost(previous) if is_known else {}
+    name = f"rtc3d_gateway: {report.name}"
+    lost: Mapping[str, int] = {}
+    if previous is not None and report.utime - previous.utime <= _MAX_PREVIOUS_US:
+        lost = _lost(previous)
     return [
-        *(_stream(name, status.server, stream, lost) for stream in status.streams),
-        *(_output(name, status.server, output, lost) for output in status.outputs),
-        _frame(name, status),
-        *([_labels(name, status.server, names)] if any(names.values()) else ()),
+        *(_stream(name, report.server, stream, lost) for stream in report.streams),
+        *(_output(name, report.server, output, lost) for output in report.outputs),
+        _frame(name, report),
+        *([_labels(name, report.server, names)] if any(names.values()) else ()),
     ]
 
 
-def _frame(name: str, status: Any) -> DiagnosticStatus:
+def _frame(name: str, report: SourceReport) -> DiagnosticStatus:
     """Return how the source's positions were made from the server's, for nodes that need those."""
     values = {
-        "metres per unit of the server": f"{status.metres_per_unit:g}",
-        "rotation (x y z w)": " ".join(map(repr, status.rotation_xyzw)),
-        "translation (m)": " ".join(map(repr, status.translation_m)),
+        "metres per unit of the server": f"{report.metres_per_unit:g}",
+        "rotation (x y z w)": " ".join(map(repr, report.rotation_xyzw)),
+        "translation (m)": " ".join(map(repr, report.translation_m)),
     }
-    level, message = OK, status.frame_id
-    if not status.metres_per_unit:
-        level, message = WARN, f"{status.frame_id}: the server's unit of length is unknown"
-    return DiagnosticStatus(level, f"{name} coordinate frame", message, status.server, values)
+    level, message = OK, report.frame_id
+    if not report.metres_per_unit:
+        level, message = WARN, f"{report.frame_id}: the server's unit of length is unknown"
+    return DiagnosticStatus(level, f"{name} coordinate frame", message, report.server, values)
 
 
 def _labels(name: str, server: str, names: Names) -> DiagnosticStatus:
@@ -127,54 +131,54 @@ def _labels(name: str, server: str, names: Names) -> DiagnosticStatus:
     return DiagnosticStatus(OK, f"{name} names", "labels that are not valid names in ROS", server, values)
 
 
-def _stream(name: str, server: str, stream: Any, lost: Mapping[str, int]) -> DiagnosticStatus:
+def _stream(name: str, server: str, stream: StreamReport, lost: Mapping[str, int]) -> DiagnosticStatus:
     level = _LEVELS.get(stream.state, ERROR)
     message = stream.state
     if level == ERROR and stream.last_error:
         message += f": {stream.last_error}"
     if level == OK and stream.problem:
         level, message = ERROR, stream.problem
-    num_lost = _num_lost(stream.drops)
+    num_lost = _num_lost(stream.losses)
     if level == OK:
         level, message = _with_losses(message, num_lost - lost.get(stream.components, num_lost))
     values = {
         "rate (Hz)": f"{stream.frame_rate_hz:.1f}",
         "lag (ms)": f"{stream.lag_ms:.1f}",
-        "frames": str(stream.frames_in),
-        "reconnects": str(stream.reconnects),
+        "frames": str(stream.num_frames),
+        "reconnects": str(stream.num_reconnects),
         "session": str(stream.session),
         "messages lost": str(num_lost),
-        **_drops(stream.drops),
+        **_causes(stream.losses),
         **{f"limitation {number}": text for number, text in enumerate(stream.limitations, start=1)},
     }
     return DiagnosticStatus(level, f"{name} {stream.components}", message, server, values)
 
 
-def _output(name: str, server: str, output: Any, lost: Mapping[str, int]) -> DiagnosticStatus:
+def _output(name: str, server: str, output: OutputReport, lost: Mapping[str, int]) -> DiagnosticStatus:
     values = {
-        **{f"sent {count.name}": str(count.count) for count in output.messages},
-        **_drops(output.drops),
+        **{f"sent {component}": str(number) for component, number in output.messages.items()},
+        **_causes(output.losses),
     }
     level, message = ERROR, output.problem
-    if output.connected:
-        num_lost = _num_lost(output.drops)
-        level, message = _with_losses("connected", num_lost - lost.get(f"to {output.name}", num_lost))
-    return DiagnosticStatus(level, f"{name} to {output.name}", message, server, values)
+    if output.is_connected:
+        num_lost = _num_lost(output.losses)
+        level, message = _with_losses("connected", num_lost - lost.get(f"to {output.output}", num_lost))
+    return DiagnosticStatus(level, f"{name} to {output.output}", message, server, values)
 
 
 def _with_losses(message: str, num_new: int) -> tuple[int, str]:
     return (WARN, f"{message}; messages lost: {num_new}") if num_new > 0 else (OK, message)
 
 
-def _lost(status: Any) -> dict[str, int]:
-    """Return how many messages a status says were lost, by stream and output."""
-    streams = {stream.components: _num_lost(stream.drops) for stream in status.streams}
-    return streams | {f"to {output.name}": _num_lost(output.drops) for output in status.outputs}
+def _lost(report: SourceReport) -> dict[str, int]:
+    """Return how many messages a report says were lost, by stream and output."""
+    streams = {stream.components: _num_lost(stream.losses) for stream in report.streams}
+    return streams | {f"to {output.output}": _num_lost(output.losses) for output in report.outputs}
 
 
-def _num_lost(drops: Iterable[Any]) -> int:
-    return sum(drop.messages for drop in drops)
+def _num_lost(losses: Sequence[LossReport]) -> int:
+    return sum(loss.num_messages for loss in losses)
 
 
-def _drops(drops: Iterable[Any]) -> dict[str, str]:
-    return {f"lost: {drop.cause}": str(drop.messages) for drop in drops}
+def _causes(losses: Sequence[LossReport]) -> dict[str, str]:
+    return {f"lost: {loss.cause}": str(loss.num_messages) for loss in losses}

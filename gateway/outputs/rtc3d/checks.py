@@ -4,7 +4,7 @@ import socket
 from collections.abc import Sequence
 from typing import Final
 
-from gateway.outputs.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.listen_address import from_this_computer, listen_problem
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.commands import Version, encode_command
@@ -14,7 +14,7 @@ CHECKS: Final = ("sources", "ports")
 
 _MAX_REPLY_BYTES: Final = 64 * 1024
 
-_rtc3d: Final = Subject("rtc3d")
+_SOURCES, _PORTS = (Check("rtc3d", name) for name in CHECKS)
 
 
 def check_rtc3d(
@@ -27,24 +27,22 @@ def check_rtc3d(
 def _check_sources(settings: Rtc3dSettings, sources: Sequence[str]) -> Finding:
     unknown = [source for source in settings.ports if source not in sources]
     if unknown:
-        return _rtc3d.warning(
-            "sources",
+        return _SOURCES.warning(
             f"rtc3d.ports has a port for {', '.join(unknown)}, which is no source",
             f"Correct the name; the sources are {', '.join(sources)}.",
         )
     missing = [source for source in sources if source not in settings.ports]
     if missing:
-        return _rtc3d.note(
-            "sources",
+        return _SOURCES.note(
             f"RTC3D clients cannot connect to {', '.join(missing)}",
             "If they should, add a port in rtc3d.ports.",
         )
-    return _rtc3d.passing("sources", "each source has a port for RTC3D clients")
+    return _SOURCES.passing("each source has a port for RTC3D clients")
 
 
 def _check_ports(settings: Rtc3dSettings, seconds: float) -> list[Finding]:
     return [_check_port(settings.host, source, port, seconds) for source, port in settings.ports.items()] or [
-        _rtc3d.not_tested("ports", "rtc3d.ports is empty")
+        _PORTS.not_tested("rtc3d.ports is empty")
     ]
 
 
@@ -52,11 +50,10 @@ def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
     place = f"{host}, port {port} (for {source})"
     problem = listen_problem(host, port)
     if not problem:
-        return _rtc3d.passing("ports", f"{place} is free")
+        return _PORTS.passing(f"{place} is free")
     if _is_rt_server(host, port, seconds):
-        return _rtc3d.passing("ports", f"an RT server answers on {place}: the gateway, if it runs")
-    return _rtc3d.failing(
-        "ports",
+        return _PORTS.passing(f"an RT server answers on {place}: the gateway, if it runs")
+    return _PORTS.failing(
         f"cannot listen on {place}: {problem}",
         f"Choose another port in rtc3d.ports.{source}, correct rtc3d.host, or stop the program that has it.",
     )

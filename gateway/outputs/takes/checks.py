@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
+from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.folder import check_directory
 from gateway.outputs.takes.settings import TakesSettings
@@ -18,7 +18,7 @@ CHECKS: Final = ("folder", "space", "links")
 _FEW_MINUTES: Final = 60.0
 _GIB: Final = 1024**3
 
-_takes: Final = Subject("takes")
+_FOLDER, _SPACE, _LINKS = (Check("takes", name) for name in CHECKS)
 
 
 def check_takes(
@@ -27,22 +27,15 @@ def check_takes(
     """Check that takes can be recorded; ``loads`` say how long the disk lasts."""
     directory = settings.effective_directory
     if not directory.exists():
-        note = _takes.note(
-            "folder", f"{directory} does not exist yet", "The gateway creates it when it starts."
-        )
-        return [note, *(_takes.not_tested(check, "the folder does not exist yet") for check in CHECKS[1:])]
+        note = _FOLDER.note(f"{directory} does not exist yet", "The gateway creates it when it starts.")
+        return [note, *(each.not_tested("the folder does not exist yet") for each in (_SPACE, _LINKS))]
     try:
         check_directory(directory)
         with _probe(directory):
             pass
     except OSError as error:
-        found, _, remedy = disk_problem(directory, error).partition("; ")
-        reason = "it needs folder, which failed"
-        return [
-            _takes.failing("folder", found, as_sentence(remedy)),
-            *(_takes.not_tested(check, reason) for check in CHECKS[1:]),
-        ]
-    writable = _takes.passing("folder", f"{directory} can be written")
+        return failing_first(_FOLDER.problem(disk_problem(directory, error)), CHECKS[1:])
+    writable = _FOLDER.passing(f"{directory} can be written")
     return [writable, _check_space(settings, loads), _check_links(settings)]
 
 
@@ -62,22 +55,20 @@ def _check_space(settings: TakesSettings, loads: Sequence[MessageLoad]) -> Findi
     found = f"{free_bytes / _GIB:.1f} GiB are free"
     rate = sum(load.rate_hz * load.largest_bytes for load in loads)
     if not rate:
-        return _takes.passing("space", f"{found}; no frames arrived, so the rate of a take is unknown")
+        return _SPACE.passing(f"{found}; no frames arrived, so the rate of a take is unknown")
     minutes = min(free_bytes, settings.max_bytes) / rate / 60
     limit = "takes.max_bytes" if settings.max_bytes < free_bytes else "the disk"
     found += (
         f"; a take has {60 * rate / 2**20:.1f} MiB a minute, so {limit} is full after {minutes:.0f} minutes"
     )
     if minutes >= _FEW_MINUTES:
-        return _takes.passing("space", found)
-    return _takes.warning(
-        "space", found, "Make room on the disk, choose another folder, or raise takes.max_bytes."
-    )
+        return _SPACE.passing(found)
+    return _SPACE.warning(found, "Make room on the disk, choose another folder, or raise takes.max_bytes.")
 
 
 def _check_links(settings: TakesSettings) -> Finding:
     if not settings.keep_last_s:
-        return _takes.not_tested("links", "takes.keep_last_s is 0")
+        return _LINKS.not_tested("takes.keep_last_s is 0")
     directory = settings.effective_directory
     try:
         with _probe(directory) as path:
@@ -85,9 +76,8 @@ def _check_links(settings: TakesSettings) -> Finding:
             os.link(path, link)
             link.unlink()
     except OSError as error:
-        return _takes.failing(
-            "links",
+        return _LINKS.failing(
             f"the file system of {directory} has no hard links ({error.strerror}), which saving takes needs",
             "Choose a folder on ext4, XFS or Btrfs as takes.directory.",
         )
-    return _takes.passing("links", "the last seconds can be saved without copying")
+    return _LINKS.passing("the last seconds can be saved without copying")

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from gateway.errors import system_reason
-from gateway.outputs.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
 from gateway.outputs.vrpn.server import bind
@@ -15,7 +15,7 @@ CHECKS: Final = ("port", "access")
 
 _TIMEOUT_S: Final = 2.0
 
-_vrpn: Final = Subject("vrpn")
+_PORT, _ACCESS = (Check("vrpn", name) for name in CHECKS)
 
 
 def check_vrpn(
@@ -37,14 +37,13 @@ def _check_port(settings: VrpnSettings) -> Finding:
             bind(socket.getaddrinfo(settings.host, settings.port, type=kind), kind).close()
     except OSError as error:
         if _is_served(settings):
-            return _vrpn.passing("port", f"a VRPN server answers on {where}")
-        return _vrpn.failing(
-            "port",
+            return _PORT.passing(f"a VRPN server answers on {where}")
+        return _PORT.failing(
             f"cannot listen on {where}: {system_reason(error)}, and no VRPN server answers there",
             "Stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
             "computer and a free port.",
         )
-    return _vrpn.passing("port", f"TCP and UDP are free on {where}; no gateway serves VRPN there now")
+    return _PORT.passing(f"TCP and UDP are free on {where}; no gateway serves VRPN there now")
 
 
 def _is_served(settings: VrpnSettings) -> bool:
@@ -61,9 +60,8 @@ def _is_served(settings: VrpnSettings) -> bool:
 
 def _check_access(settings: VrpnSettings) -> Finding:
     if not leaves_host(settings):
-        return _vrpn.passing("access", "only programs on this computer can connect")
-    return _vrpn.note(
-        "access",
+        return _ACCESS.passing("only programs on this computer can connect")
+    return _ACCESS.note(
         f"any computer that reaches {settings.host} can connect: VRPN has no password and no encryption",
         "Open the port in the firewall for the computers that need it, or set vrpn.host to 127.0.0.1.",
     )

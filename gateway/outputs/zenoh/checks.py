@@ -16,7 +16,7 @@ import zenoh
 from gateway.config.secrets import mask_secrets_in_text
 from gateway.errors import ConfigError
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.findings import Finding, MessageLoad, Subject
+from gateway.outputs.findings import Check, Finding, MessageLoad, counted, failing_first
 from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
@@ -30,7 +30,7 @@ _LOCAL: Final = re.compile(r"unix|(tcp|tls|quic|udp|ws)/(127\.[\d.]+|\[::1\]|loc
 """The beginning of endpoints on this computer."""
 _POLL_S: Final = 0.05
 
-_zenoh: Final = Subject("zenoh")
+_LINK, _GATEWAY = (Check("zenoh", name) for name in CHECKS)
 
 
 def check_zenoh(
@@ -96,10 +96,7 @@ def _doctor_config(settings: ZenohSettings, seconds: float) -> zenoh.Config:
 
 
 def _no_link(found: str, remedy: str) -> list[Finding]:
-    return [
-        _zenoh.failing("link", found, remedy),
-        _zenoh.not_tested("gateway", "it needs link, which failed"),
-    ]
+    return failing_first(_LINK.failing(found, remedy), ["gateway"])
 
 
 def _find_gateways(session: zenoh.Session, keys: dict[str, str], seconds: float) -> list[str]:
@@ -128,20 +125,15 @@ def _listen_problem(config: zenoh.Config, listen: Sequence[str]) -> str:
 
 
 def _link(mode: str, routers: int, peers: int) -> Finding:
-    others = "a router" if mode == "client" else f"{_count(routers, 'router')} and {_count(peers, 'peer')}"
-    return _zenoh.passing("link", f"the session is open and connected to {others}")
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+    others = "a router" if mode == "client" else f"{counted(routers, 'router')} and {counted(peers, 'peer')}"
+    return _LINK.passing(f"the session is open and connected to {others}")
 
 
 def _gateway(served: Sequence[str], sources: Sequence[str]) -> Finding:
     missing = [source for source in sources if source not in served]
     if not missing:
-        return _zenoh.passing("gateway", f"a gateway serves {', '.join(sources)}")
-    return _zenoh.not_tested(
-        "gateway",
+        return _GATEWAY.passing(f"a gateway serves {', '.join(sources)}")
+    return _GATEWAY.not_tested(
         f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix and "
         "the router's access rules",
     )

@@ -1,21 +1,19 @@
 """The health check: every stream receives frames, every output is connected, and nothing is lost."""
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from http import HTTPStatus
 from typing import Any, NamedTuple
 
-from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.config.settings import StreamSettings
 from gateway.logs.losses import Loss, last_minute_text, route_name
 from gateway.logs.safe_text import safe_json
-from gateway.outputs.contract import Output, OutputHealth
+from gateway.messages.source_report import StreamReport, streams_text
 from gateway.service.gateway import Gateway
 from gateway.service.monitoring.http_pages import Page
 from gateway.service.source import Source
 from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
-from gateway.stream.status_text import source_text, stream_text, unusable_frames
 
 
 class _Route(NamedTuple):
@@ -38,19 +36,14 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
     ``process_problems`` are those of the whole process, see ProcessLimits. If something was lost in the last
     minute, the gateway is degraded, which is still 200.
     """
-    now_s = running_clock().time()  # a stop of this process does not make the newest frames older
-    streams = [
-        _stream_health(source, stream.settings, stream.status, stream.frame_rate.rate_hz, now_s)
-        for source in gateway.sources
-        for stream in source.streams
-    ]
-    outputs = [_output_health(output) for output in gateway.outputs]
+    streams = [each for source in gateway.sources for each in _streams(source)]
+    outputs = _outputs(gateway)
     problems = [
         *(f"gateway: {problem}" for problem in process_problems),
         *(f"{each['source']} ({each['stream']}): {each['problem']}" for each in streams if each["problem"]),
         *(f"{each['output']}: {each['problem']}" for each in outputs if each["problem"]),
     ]
-    routes = list(_losses(gateway))
+    routes = list(_routes(gateway))
     losses = [f"{route.name}: {text}" for route in routes if (text := last_minute_text(route.losses))]
     body = {
         "status": "unhealthy" if problems else "degraded" if losses else "healthy",
@@ -67,31 +60,35 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
     )
 
 
-def _stream_health(
-    source: Source, stream: StreamSettings, status: StreamStatus, rate_hz: float, now_s: float
-) -> dict[str, Any]:
-    age_s = None if status.last_frame_s is None else now_s - status.last_frame_s
-    return {
-        "source": source.name,
-        "stream": status.components,
-        "server": f"{source.settings.host}:{source.settings.port}",
-        "state": status.state.value,
-        "session": status.session,
-        "frames": status.frames_in,
-        "frame_rate_hz": round(rate_hz, 3),
-        "lag_s": round(status.lag_s, 6),
-        "last_frame_age_s": age_s,
-        "limitations": list(status.limitations),
-        "problem": _stream_problem(source, stream, status, age_s),
-    }
+def _streams(source: Source) -> Iterator[dict[str, Any]]:
+    now_s = running_clock().time()  # a stop of this process does not make the newest frames older
+    report = source.report
+    for stream, supervisor in zip(report.streams, source.streams, strict=False):
+        last_frame_s = supervisor.status.last_frame_s
+        age_s = None if last_frame_s is None else now_s - last_frame_s
+        yield {
+            "source": report.name,
+            "stream": stream.components,
+            "server": report.server,
+            "state": stream.state,
+            "session": stream.session,
+            "frames": stream.num_frames,
+            "frame_rate_hz": round(stream.frame_rate_hz, 3),
+            "lag_s": round(stream.lag_ms / 1000, 6),
+            "last_frame_age_s": age_s,
+            "limitations": stream.limitations,
+            "problem": stream.problem or _stream_problem(source, supervisor.settings, stream, age_s),
+        }
 
 
-def _output_health(output: Output) -> dict[str, str]:
-    health = output.health()
-    return {"output": output.name, "problem": "" if health.connected else health.problem}
+def _outputs(gateway: Gateway) -> list[dict[str, str]]:
+    healths = ((output.name, output.health()) for output in gateway.outputs)
+    return [
+        {"output": name, "problem": "" if health.connected else health.problem} for name, health in healths
+    ]
 
 
-def _losses(gateway: Gateway) -> Iterator[_Route]:
+def _routes(gateway: Gateway) -> Iterator[_Route]:
     """Yield what each stream lost before any output, and what each source lost on each output."""
     for source in gateway.sources:
         for status in source.statuses:
@@ -105,20 +102,19 @@ def _losses_json(route: _Route) -> list[dict[str, Any]]:
     return [names | loss._asdict() | {"age_s": round(loss.age_s, 1)} for loss in route.losses]
 
 
-def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
-    """Return what is wrong with a stream and what to check; "" if frames arrive or none are needed."""
+def _stream_problem(
+    source: Source, settings: StreamSettings, stream: StreamReport, age_s: float | None
+) -> str:
+    """Return why no frame arrives and what to check; "" if frames arrive or none are needed."""
     max_age_s = source.settings.stall_timeout_s
-    problem = unusable_frames(status, max_age_s)
-    if problem:
-        return problem
     if age_s is not None and age_s < max_age_s:
         return ""
     silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
-    if _needs_no_frames(source, stream, status.state):
+    if _needs_no_frames(source, settings, StreamState(stream.state)):
         return ""
-    if status.state is StreamState.IDLE:
+    if stream.state == StreamState.IDLE.value:
         return f"{silence}: {source.settings.host} is connected but sends nothing; is a measurement running?"
-    reason = status.last_error or f"connecting to {source.settings.host}:{source.settings.port}"
+    reason = stream.last_error or f"connecting to {source.settings.host}:{source.settings.port}"
     return f"{silence}: {reason}"
 
 
@@ -135,44 +131,22 @@ def _needs_no_frames(source: Source, stream: StreamSettings, state: StreamState)
 
 
 def status_lines(gateway: Gateway) -> list[str]:
-    """Return a text for each source, for each output that cannot send, and for what an output loses."""
-    outputs = ((output.name, output.health()) for output in gateway.outputs)
-    losses = (
-        (f"{source.name} to {output.name}", status.losses)
-        for source in gateway.sources
-        for output, status in source.fan_out.outputs
-    )
-    return [
-        *(source_line(source.settings, source.rated_statuses) for source in gateway.sources),
-        *output_lines(outputs),
-        *loss_lines(losses),
-    ]
+    """Return a text for each source, for each output that cannot send, and for what an output loses.
 
-
-def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, float]]) -> str:
-    """Return the status of a source, such as "lab: streaming 200.0 Hz".
-
-    ``streams`` are pairs of a status and a frame rate in Hz. If their texts differ, the components of each
-    stream precede its text.
+    The line of a source is such as "lab: streaming 200.0 Hz". If the texts of its streams differ, the
+    components of each stream precede its text.
     """
-    server = f"{source.host}:{source.port}"
+    lines = [f"{source.name}: {_streams_line(source)}" for source in gateway.sources]
+    lines += [f"{each['output']}: {each['problem']}" for each in _outputs(gateway) if each["problem"]]
+    for route in _routes(gateway):
+        if route.output and (text := last_minute_text(route.losses)):
+            lines.append(f"{route.name}: {text}")
+    return lines
+
+
+def _streams_line(source: Source) -> str:
     texts = []
-    for status, rate_hz in streams:
-        problem = unusable_frames(status, source.stall_timeout_s)
-        text = problem or stream_text(status.state, server, rate_hz, status.tries)
+    for stream, status in zip(source.report.streams, source.statuses, strict=False):
         lost = last_minute_text(status.losses.report())
-        texts.append((status.components, f"{text}, {lost}" if lost else text))
-    return f"{source.name}: {source_text(texts)}"
-
-
-def output_lines(outputs: Iterable[tuple[str, OutputHealth]]) -> list[str]:
-    """Return a text for each output that cannot send; ``outputs`` are pairs of a name and its health."""
-    return [f"{name}: {health.problem}" for name, health in outputs if not health.connected]
-
-
-def loss_lines(losses: Iterable[tuple[str, Sequence[Loss]]]) -> list[str]:
-    """Return a text for each output that lost something in the last minute.
-
-    ``losses`` are pairs of the route, such as "lab to zenoh", and what was lost on it.
-    """
-    return [f"{route}: {text}" for route, lost in losses if (text := last_minute_text(lost))]
+        texts.append((stream.components, f"{stream.text}, {lost}" if lost else stream.text))
+    return streams_text(texts)

@@ -14,7 +14,7 @@ import pytest
 
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.display.live.live_data import LiveData
-from gateway.display.view.server import RunningTakes
+from gateway.display.view.viewer import RunningTakes
 from gateway.outputs.takes.folder import MAX_PIECE_BYTES, TakesFolder
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway

@@ -8,9 +8,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gateway.cli import completion
-from gateway.cli.completion import source_names
-from gateway.cli.main import app
+from gateway.cli import options
+from gateway.cli.main import COMPLETION_VARIABLE, app
+from gateway.cli.options import source_names
 from tests.gateway_process import PROGRAM
 from tests.takes import description, write_take
 
@@ -19,14 +19,14 @@ from tests.takes import description, write_take
 def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the path of the default configuration, which does not exist."""
     path = tmp_path / "default.yaml"
-    monkeypatch.setattr(completion, "DEFAULT_CONFIG", path)
+    monkeypatch.setattr(options, "DEFAULT_CONFIG", path)
     return path
 
 
 def offered(line: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return what is offered in bash for the last word of a line, which may be empty."""
     words = line.split(" ")
-    monkeypatch.setenv(completion.VARIABLE, "complete_bash")
+    monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
     monkeypatch.setenv("COMP_WORDS", line)
     monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
     result = CliRunner().invoke(app, [], prog_name="rtc3d-gateway")
@@ -118,7 +118,7 @@ def test_source_names_need_no_take_and_no_configuration() -> None:
 
 @pytest.mark.parametrize("variables", [{}, {"COMP_WORDS": "x"}, {"COMP_WORDS": "x", "COMP_CWORD": "y"}])
 def test_without_the_variables_of_a_shell_it_fails_silently(variables: dict[str, str]) -> None:
-    environ = {**os.environ, completion.VARIABLE: "complete_bash", **variables}
+    environ = {**os.environ, COMPLETION_VARIABLE: "complete_bash", **variables}
     run = subprocess.run(PROGRAM, env=environ, capture_output=True, text=True, check=False)
     assert (run.stdout, run.stderr) == ("", "")
 

@@ -3,13 +3,16 @@
 from collections.abc import Callable
 
 import pytest
+import rtc3d
 
 from gateway.cli import echo_sources as silence_module
 from gateway.cli.echo_sources import Silence
 from gateway.client.client import GatewayClient
-from gateway.client.found_sources import FoundSource, FoundSources, FoundStream
+from gateway.client.found_sources import FoundSources
 from gateway.errors import OutputError, QueryError
+from gateway.messages.source_report import source_report
 from gateway.outputs.kind import SubscriptionRequest
+from tests import statuses
 from tests.waiting import wait_until
 
 
@@ -17,8 +20,9 @@ def found_of(*components: str) -> FoundSources:
     """Return the source lab with a stream of each of these components."""
     found = FoundSources()
     found.hear("lab")
-    streams = tuple(FoundStream(each, "streaming 200.0 Hz", "streaming", "", 200.0, 0) for each in components)
-    found.add(FoundSource("lab", server="192.0.2.20:3020", host="pc", streams=streams))
+    status = rtc3d.status_t()
+    status.streams = [statuses.stream(each) for each in components]
+    found.add(source_report(status, "lab"))
     return found
 
 

@@ -9,8 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gateway.cli import configuration
-from gateway.cli.configuration import configuration_from_options
+from gateway.cli import config
+from gateway.cli.config import configuration_from_options
 from gateway.cli.main import app
 from gateway.cli.options import QueryOptions
 from gateway.client import GatewayAddress
@@ -26,7 +26,7 @@ from tests.configurations import MODEL
 def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the path of the default configuration, which does not exist."""
     path = tmp_path / "default.yaml"
-    monkeypatch.setattr(configuration, "DEFAULT_CONFIG", path)
+    monkeypatch.setattr(config, "DEFAULT_CONFIG", path)
     return path
 
 

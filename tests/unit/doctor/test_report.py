@@ -4,9 +4,7 @@ import json
 from rich.console import Console
 
 from gateway.doctor.report import Report
-from gateway.outputs.findings import NO_CONFIGURATION, Finding, Result, Subject
-
-LAB = Subject("lab")
+from gateway.outputs.findings import NO_CONFIGURATION, Check, Finding, Result
 
 
 def reported(*findings: Finding, console: Console | None = None, quiet: bool = False) -> Report:
@@ -31,12 +29,12 @@ def in_json(report: Report) -> list[dict[str, str]]:
 
 def test_findings_are_printed_in_columns_below_their_subject() -> None:
     findings = (
-        LAB.passing("name", "[bold]127.0.0.1[/] is an address"),
-        LAB.failing(
-            "TCP", "connection refused by 192.0.2.20:3020 :smile:", "Is the RT server running, is it?"
+        Check("lab", "name").passing("[bold]127.0.0.1[/] is an address"),
+        Check("lab", "TCP").failing(
+            "connection refused by 192.0.2.20:3020 :smile:", "Is the RT server running, is it?"
         ),
-        LAB.not_tested("protocol", "it needs TCP, which failed"),
-        Subject("zenoh").passing("link", "open"),
+        Check("lab", "protocol").not_tested("it needs TCP, which failed"),
+        Check("zenoh", "link").passing("open"),
     )
     assert shown(*findings) == (
         "lab\n"
@@ -49,7 +47,7 @@ def test_findings_are_printed_in_columns_below_their_subject() -> None:
         "  ok    link        open\n"
         "2 ok, 1 failed, 1 not tested\n"
     )
-    assert "connection" in shown(LAB.passing("TCP", "connection " * 3), width=10)
+    assert "connection" in shown(Check("lab", "TCP").passing("connection " * 3), width=10)
     text = shown(*findings, color=True)
     for part in ("\x1b[1;32mok", "\x1b[1;31mFAIL", "\x1b[1;31m2 ok, 1 failed, 1 not tested"):
         assert part in text
@@ -57,10 +55,10 @@ def test_findings_are_printed_in_columns_below_their_subject() -> None:
 
 def test_checks_that_need_a_valid_configuration_get_one_line() -> None:
     findings = (
-        Subject("configuration").failing("file", "lab.yaml:1:2: wrong", "Correct it."),
-        *(Subject("source").not_tested(check, NO_CONFIGURATION) for check in ("name", "TCP")),
-        Subject("zenoh").not_tested("link", NO_CONFIGURATION),
-        Subject("this computer").passing("clock", "right"),
+        Check("configuration", "file").failing("lab.yaml:1:2: wrong", "Correct it."),
+        *(Check("source", name).not_tested(NO_CONFIGURATION) for name in ("name", "TCP")),
+        Check("zenoh", "link").not_tested(NO_CONFIGURATION),
+        Check("this computer", "clock").passing("right"),
     )
     assert shown(*findings, width=100) == (
         "configuration\n"
@@ -76,9 +74,9 @@ def test_checks_that_need_a_valid_configuration_get_one_line() -> None:
 
 def test_warnings_and_notes_are_counted_and_do_not_fail() -> None:
     findings = (
-        LAB.warning("loss", "12 messages", "Look."),
-        LAB.note("rate", "no rate to compare with"),
-        LAB.note("frames", "no 6d", "Enable it."),
+        Check("lab", "loss").warning("12 messages", "Look."),
+        Check("lab", "rate").note("no rate to compare with"),
+        Check("lab", "frames").note("no 6d", "Enable it."),
     )
     assert shown(*findings) == (
         "lab\n"
@@ -95,8 +93,8 @@ def test_warnings_and_notes_are_counted_and_do_not_fail() -> None:
 
 
 def test_two_streams_of_a_source_are_named_apart() -> None:
-    streams = (Subject("lab", "3d 6d"), Subject("lab", "analog"))
-    findings = [LAB.passing("TCP", "x"), *(stream.passing("frames", "y") for stream in streams)]
+    streams = (Check("lab", "frames", "3d 6d"), Check("lab", "frames", "analog"))
+    findings = [Check("lab", "TCP").passing("x"), *(stream.passing("y") for stream in streams)]
     lines = shown(*findings).splitlines()
     assert lines[::2] == ["lab", "lab (3d 6d)", "lab (analog)", "3 ok, 0 failed, 0 not tested"]
     assert [each.get("stream") for each in in_json(reported(*findings))] == [None, "3d 6d", "analog"]
@@ -105,7 +103,7 @@ def test_two_streams_of_a_source_are_named_apart() -> None:
 def test_line_breaks_are_kept_and_long_words_are_not_split() -> None:
     path = "/etc/rtc3d-gateway/a-very-long-name-of-a-file.yaml:1:2:"
     remedy = "Correct them all, one after the other, and check again."
-    text = shown(LAB.failing("file", f"{path} wrong\nlab.yaml:3:4: wrong", remedy))
+    text = shown(Check("lab", "file").failing(f"{path} wrong\nlab.yaml:3:4: wrong", remedy))
     assert [line[20:] for line in text.splitlines()[1:6]] == [
         path,
         "wrong",
@@ -116,7 +114,7 @@ def test_line_breaks_are_kept_and_long_words_are_not_split() -> None:
 
 
 def test_json_has_every_field_of_every_finding() -> None:
-    passing, failing = LAB.passing("name", "ü"), LAB.failing("TCP", "x", "y")
+    passing, failing = Check("lab", "name").passing("ü"), Check("lab", "TCP").failing("x", "y")
     assert json.loads(reported(passing).as_json())["ok"] is True
     assert json.loads(reported(passing, failing).as_json()) == {
         "ok": False,
@@ -125,17 +123,17 @@ def test_json_has_every_field_of_every_finding() -> None:
             {"subject": "lab", "check": "TCP", "result": "red", "found": "x", "remedy": "y"},
         ],
     }
-    report = reported(LAB.not_tested("name", "no frames"))
+    report = reported(Check("lab", "name").not_tested("no frames"))
     assert (report.is_ok, report.findings) == (True, [Finding("lab", "name", Result.NOT_TESTED, "no frames")])
 
 
 def test_an_output_that_is_not_enabled_has_one_line() -> None:
     checks = ("route", "requests", "buffers")
     findings = (
-        Subject("zenoh").passing("link", "open"),
-        *(Subject("lcm").disabled(check) for check in checks),
-        *(Subject("takes").disabled(check) for check in ("folder", "space")),
-        Subject("this computer").passing("clock", "synchronised"),
+        Check("zenoh", "link").passing("open"),
+        *(Check("lcm", name).not_tested("lcm.enabled is false") for name in checks),
+        *(Check("takes", name).not_tested("takes.enabled is false") for name in ("folder", "space")),
+        Check("this computer", "clock").passing("synchronised"),
     )
     assert shown(*findings) == (
         "zenoh\n"
@@ -153,10 +151,10 @@ def test_an_output_that_is_not_enabled_has_one_line() -> None:
 
 def test_a_quiet_report_has_only_warnings_and_failures() -> None:
     findings = (
-        LAB.passing("name", "fine"),
-        Subject("hall").failing("TCP", "refused", "Start it."),
-        Subject("hall").not_tested("protocol", "it needs TCP"),
-        Subject("zenoh").warning("link", "slow", "Look."),
+        Check("lab", "name").passing("fine"),
+        Check("hall", "TCP").failing("refused", "Start it."),
+        Check("hall", "protocol").not_tested("it needs TCP"),
+        Check("zenoh", "link").warning("slow", "Look."),
     )
     assert shown(*findings, quiet=True) == (
         "hall\n"

@@ -8,11 +8,11 @@ from typing import Any, cast
 
 import pytest
 
-from gateway.doctor import computer_checks, frame_checks, gateway_checks, source_checks
-from gateway.doctor.computer_checks import check_receive_buffer
+from gateway.doctor import all_checks, frame_checks, gateway_checks, source_checks
+from gateway.doctor.frame_checks import check_receive_buffer
 from gateway.doctor.gateway_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.observation import ObservedStream
-from gateway.outputs.findings import Finding, Result, Subject
+from gateway.outputs.findings import Check, Finding, Result
 from gateway.outputs.kind import OPENS
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
@@ -22,7 +22,7 @@ from gateway.rtc3d.parameters import Parameters
 
 def test_the_clock_is_read() -> None:
     """The structure that the kernel fills has the right size and order."""
-    is_synchronised, max_error_us = computer_checks.read_clock()
+    is_synchronised, max_error_us = all_checks.read_clock()
     assert isinstance(is_synchronised, bool)
     assert max_error_us >= 0
 
@@ -39,8 +39,8 @@ def test_a_clock_matters_to_messages_that_leave(
     monkeypatch: pytest.MonkeyPatch, clock: tuple[bool, int], leaving: list[str], result: Result, found: str
 ) -> None:
     """Programs on this computer use the same clock; others compare utime with theirs."""
-    monkeypatch.setattr(computer_checks, "read_clock", lambda: clock)
-    finding = computer_checks.check_clock(leaving)
+    monkeypatch.setattr(all_checks, "read_clock", lambda: clock)
+    finding = all_checks.check_clock(leaving)
     assert finding.result is result
     assert finding.found.endswith(found)
     assert ("chrony" in finding.remedy) is (result is not Result.PASSING)
@@ -52,8 +52,8 @@ def test_a_clock_whose_state_is_not_reported_is_not_tested(monkeypatch: pytest.M
     def refuse() -> tuple[bool, int]:
         raise OSError(1, "adjtimex is not allowed")
 
-    monkeypatch.setattr(computer_checks, "read_clock", refuse)
-    finding = computer_checks.check_clock(["zenoh"])
+    monkeypatch.setattr(all_checks, "read_clock", refuse)
+    finding = all_checks.check_clock(["zenoh"])
     assert finding.result is Result.NOT_TESTED
     assert finding.found == "the kernel does not report it: adjtimex is not allowed"
 
@@ -116,7 +116,7 @@ def rate_finding(
     settings = SimpleNamespace(rate=rate)
     stream: Any = SimpleNamespace(observed=observed, settings=settings, shares_connection=False)
     return frame_checks.check_rate(
-        Subject("lab"), cast("ObservedStream", stream), cast("Parameters", object())
+        Check("lab", "rate"), cast("ObservedStream", stream), cast("Parameters", object())
     )
 
 
@@ -164,7 +164,7 @@ LINUX = "4096\t131072\t6291456\n"
 def buffer_finding(folder: Path, tcp_rmem: str, load_bytes_per_s: float) -> Finding:
     path = folder / "tcp_rmem"
     path.write_text(tcp_rmem)
-    return check_receive_buffer(Subject("lab"), load_bytes_per_s, path)
+    return check_receive_buffer(Check("lab", "buffer"), load_bytes_per_s, path)
 
 
 def test_a_buffer_for_two_seconds_passes(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_an_unknown_size_or_load_is_not_tested(tmp_path: Path) -> None:
         finding = buffer_finding(tmp_path, tcp_rmem, 1000)
         assert finding.result is Result.NOT_TESTED
         assert finding.found.startswith(f"{tmp_path}/tcp_rmem cannot be read: ")
-    finding = check_receive_buffer(Subject("lab"), 1000, tmp_path / "missing")  # as without Linux
+    finding = check_receive_buffer(Check("lab", "buffer"), 1000, tmp_path / "missing")  # as without Linux
     assert finding.result is Result.NOT_TESTED
     assert buffer_finding(tmp_path, LINUX, 0.0).found == "no frames arrived"
 

@@ -11,8 +11,9 @@ from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.contract import OutputHealth, OutputStatus
-from gateway.publish.status_messages import clock_message, clock_model, status_message
+from gateway.publish.status_messages import clock_message, clock_model, status_message, unusable_frames
 from gateway.stream.clock import ServerClock
+from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
@@ -174,3 +175,16 @@ def test_the_offset_of_a_server_that_counts_from_any_number_fits_its_field(first
     message = clock_model(clock)
     encoded = rtc3d.clock_model_t.decode(message.encode())
     assert encoded.offset_us == min(host_clock.offset_us - first_us, 2**63 - 1)
+
+
+async def test_frames_without_the_streams_components_are_a_problem_if_they_last() -> None:
+    status = StreamStatus("3d")
+    clock_s = running_clock().time()
+    status.frames_read(clock_s - 4)
+    status.components_received("6d")
+    status.frames_read(clock_s)
+    status.components_received("6d")
+    assert "none has a component of this stream (3d); the newest has 6d" in unusable_frames(status, 3.0)
+    assert unusable_frames(status, 100.0) == ""
+    status.components_received("")
+    assert unusable_frames(status, 3.0) == ""

@@ -1,25 +1,16 @@
-"""The status of a stream: its state, errors, limitations and counts, and the texts about them."""
+"""The status of a stream: its state, errors, limitations and counts."""
 
 import logging
-from collections.abc import Sequence
 from types import SimpleNamespace
 
 import pytest
-import rtc3d
 
-from gateway.config.settings import SourceSettings
 from gateway.errors import ClosedError, LinkError
-from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
-from gateway.publish.status_messages import status_message
 from gateway.rtc3d.client_protocol import ProtocolState
-from gateway.service.monitoring.health import source_line
-from gateway.stream.process_clock import running_clock
 from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, FrameRate, StreamStatus
-from gateway.stream.status_text import message_texts, source_text, unusable_frames
 from tests.losses import amounts
 
 SERVER = "192.0.2.20:3020"
@@ -272,61 +263,3 @@ def test_a_connection_on_which_nothing_arrives_is_idle_after_its_handshake(
 ) -> None:
     assert stream_state(Phase.HANDSHAKING, protocol_state) is StreamState.HANDSHAKING
     assert stream_state(Phase.READY, protocol_state) is StreamState.IDLE
-
-
-# --- the texts about a status_t
-
-
-LAB = SourceSettings(name="lab", host="192.0.2.9")
-Streams = Sequence[tuple[StreamStatus, float]]
-
-
-def message_of(streams: Streams) -> rtc3d.status_t:
-    server = f"{LAB.host}:{LAB.port}"
-    message = status_message(
-        source="lab",
-        server=server,
-        sequence=0,
-        streams=streams,
-        outputs=[],
-        stall_timeout_s=2.0,
-        frame=CoordinateFrame("lab"),
-    )
-    decoded: rtc3d.status_t = decode(message.encode())
-    return decoded
-
-
-@pytest.mark.parametrize("state", StreamState)
-@pytest.mark.parametrize("tries", [0, 1, 12])
-def test_a_status_message_has_the_words_of_the_status_line(state: StreamState, tries: int) -> None:
-    one = (StreamStatus("3d 6d", state=state, tries=tries), 199.96)
-    other = (StreamStatus("analog", state=StreamState.STREAMING), 2000.0)
-    for streams in ([one], [one, other]):
-        assert source_line(LAB, streams) == f"lab: {source_text(message_texts(message_of(streams)))}"
-
-
-async def test_frames_without_the_streams_components_are_a_problem_if_they_last() -> None:
-    status = StreamStatus("3d")
-    clock_s = running_clock().time()
-    status.frames_read(clock_s - 4)
-    status.components_received("6d")
-    status.frames_read(clock_s)
-    status.components_received("6d")
-    assert "none has a component of this stream (3d); the newest has 6d" in unusable_frames(status, 3.0)
-    assert unusable_frames(status, 100.0) == ""
-    status.components_received("")
-    assert unusable_frames(status, 3.0) == ""
-
-
-def test_texts_of_a_hostile_message_are_escaped_and_cut() -> None:
-    message = message_of([(StreamStatus("3d"), 0.0)])
-    message.streams[0].state = "\x1b[2J" + "x" * 100_000
-    message.streams[0].components = "3d\n6d"
-    [(components, text)] = message_texts(message)
-    assert components.isprintable()
-    assert text.isprintable()
-    assert len(text) < 2000
-
-
-def test_a_status_without_streams_has_no_text() -> None:
-    assert source_text(message_texts(message_of([]))) == ""

@@ -3,7 +3,7 @@
 import pytest
 from rich.cells import cell_len
 
-from gateway.display.terminal.screen import Line, Style
+from gateway.display.terminal import Line, Style
 from gateway.display.top.app import Display
 from gateway.display.top.pages import PAGES
 from gateway.display.top.table import (
@@ -19,7 +19,7 @@ from gateway.display.top.table import (
     wrapped,
 )
 from tests.statuses import stream
-from tests.unit.display.top.live_lab import LiveLab
+from tests.unit.display.live_lab import Lab
 
 COLUMNS = (Column("marker"), Column("%", is_number=True), Column("unit", rank=1))
 
@@ -93,10 +93,10 @@ class Shown:
     def __init__(self, width: int = 100, height: int = 20) -> None:
         self.display = Display("Zenoh", has_keys=True)
         self.width, self.height = width, height
-        lab = LiveLab()
-        lab.status(stream("3d"))
-        lab.frame("3d", 0, 30, missing=(1,))
-        self.sources = [lab.source()]
+        lab = Lab()
+        lab.send_status(stream("3d"))
+        lab.send_ones("3d", 0, 30, missing=(1,))
+        self.sources = [lab.source]
         self.notices: list[str] = []
 
     def lines(self) -> list[Line]:

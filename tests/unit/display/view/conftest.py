@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from gateway.display.view.server import ViewServer, open_server
-from tests.unit.display.view.live_lab import Lab
+from tests.unit.display.live_lab import Lab
 
 
 @pytest.fixture

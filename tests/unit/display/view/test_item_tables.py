@@ -10,7 +10,7 @@ from gateway.display.view.plots import MAX_CHOICES, Channel, choices, component_
 from gateway.display.view.texts import MAX_ROWS, events_html, items_html, worst_first
 from gateway.rtc3d.components import ComponentType
 from tests.takes import START_UTIME
-from tests.unit.display.view.live_lab import NAN, Lab, text_of, wait
+from tests.unit.display.live_lab import NAN, Lab, text_of, wait
 
 LABELS = """<The_3D><Markers>3</Markers>
 <Marker><Label>LASI</Label></Marker>

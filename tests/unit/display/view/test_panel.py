@@ -11,7 +11,7 @@ from gateway.display.view import panel as view_panel
 from gateway.display.view.panel import Panel
 from gateway.display.view.plots import MAX_PLOTS
 from gateway.rtc3d.components import ComponentType
-from tests.unit.display.view.live_lab import Lab, wait
+from tests.unit.display.live_lab import Lab, wait
 
 Show = Callable[[], None]
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gateway.display.view.laboratory import Sphere
 from gateway.display.view.markers_and_tools import GHOST_S, MAX_LABELS, MAX_SEGMENTS
 from gateway.display.view.scene import Scene
 from gateway.display.view.server import ViewServer
-from gateway.display.view.world import Sphere
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
 from tests.takes import parameters
-from tests.unit.display.view.live_lab import MISSING, NAN, Lab
+from tests.unit.display.live_lab import MISSING, NAN, Lab
 
 MARKERS, TOOLS, FORCE = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.FORCE
 PLATE = Plate(
@@ -64,7 +64,7 @@ class Picture:
         return self.scene._world.up
 
     def switch(self, name: str, value: object) -> None:
-        switch = getattr(self.scene._switches, f"_{name}")
+        switch = getattr(self.scene._switches, "_up" if name == "up" else name)
         switch.value = value
 
     def shown_labels(self, path: str, source: str = "MOCAP_LAB") -> dict[str, list[float]]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gateway.display.live.component import Percentiles
+from gateway.display.view.laboratory import UpAxis, on_floor, sphere_around, up_axis_of
 from gateway.display.view.markers_and_tools import MAX_M, positions_in_metres
 from gateway.display.view.texts import (
     NONE,
@@ -20,7 +21,6 @@ from gateway.display.view.texts import (
     share_text,
     value_text,
 )
-from gateway.display.view.world import UpAxis, on_floor, sphere_around, up_axis_of
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 
 

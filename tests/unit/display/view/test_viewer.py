@@ -13,7 +13,7 @@ from gateway.display.view.server import ViewServer, address_of, open_server
 from gateway.display.view.viewer import Viewer
 from gateway.errors import ViewError
 from gateway.rtc3d.components import ComponentType
-from tests.unit.display.view.live_lab import Lab
+from tests.unit.display.live_lab import Lab
 from tests.unit.display.view.page_client import PageClient, page_client
 from tests.waiting import wait_until
 

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import rtc3d
 
+from gateway.messages.source_report import source_report
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import IgnoringPublisher
 from gateway.outputs.ros2 import diagnostics as diagnostics_module
@@ -46,7 +47,7 @@ def test_the_status_becomes_diagnostics() -> None:
         rotation_xyzw=[0.5, 0.5, 0.5, 0.5],
         translation_m=[2.5, 0.0, -1.0],
     )
-    markers, analog, zenoh, frame = diagnostics_of(status)
+    markers, analog, zenoh, frame = diagnostics_of(source_report(status))
     assert markers[:4] == (0, "rtc3d_gateway: lab 3d 6d", "streaming", "192.0.2.20:3020")
     shown = {"rate (Hz)": "200.0", "limitation 1": "no clock", "limitation 2": "no parameters"}
     assert shown.items() <= markers.values.items()
@@ -60,7 +61,7 @@ def test_the_status_becomes_diagnostics() -> None:
         "translation (m)": "2.5 0.0 -1.0",
     }
     # Nodes cannot use positions without a unit; no names need no status of their own.
-    [frame] = diagnostics_of(a_status(metres_per_unit=0.0), None, {"6d": {}, "force": {}})
+    [frame] = diagnostics_of(source_report(a_status(metres_per_unit=0.0)), None, {"6d": {}, "force": {}})
     assert (frame.level, frame.message) == (1, "hall: the server's unit of length is unknown")
 
 
@@ -83,8 +84,9 @@ def test_what_loses_messages_gets_a_warning_until_it_loses_no_more() -> None:
         assert _levels(now, before) == expected
 
 
-def _levels(status: object, previous: object = None) -> list[tuple[int, str]]:
-    return [(each.level, each.message) for each in diagnostics_of(status, previous)[:-1]]
+def _levels(status: rtc3d.status_t, previous: rtc3d.status_t | None = None) -> list[tuple[int, str]]:
+    before = source_report(previous) if previous is not None else None
+    return [(each.level, each.message) for each in diagnostics_of(source_report(status), before)[:-1]]
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,9 @@ import pytest
 
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.logs.losses import Losses
-from gateway.outputs.contract import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.health import health_page, loss_lines, output_lines, source_line, status_lines
+from gateway.service.monitoring.health import health_page, status_lines
 from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -244,42 +243,19 @@ async def test_a_stream_of_events_needs_none_in_its_frames() -> None:
 # --- the status line
 
 
-LAB = SourceSettings(name="lab", host="192.0.2.9")
-STREAMS = tuple(StreamSettings(components=(each,)) for each in (ComponentType.MARKERS, ComponentType.ANALOG))
-TWO = SourceSettings(name="lab", host="192.0.2.9", streams=STREAMS)
+async def test_streams_in_different_states_are_listed_by_components() -> None:
+    lab = Lab(StreamSettings(components=MARKERS), StreamSettings(components=ANALOG))
+    assert lab.line() == "lab: waiting for 192.0.2.20:3020"
+    lab.statuses[0].state = StreamState.STREAMING
+    assert lab.line() == "lab: 3d streaming 0.0 Hz, analog waiting for 192.0.2.20:3020"
 
 
-SERVER = "192.0.2.9:3020"
-
-
-@pytest.mark.parametrize(
-    ("state", "tries", "line"),
-    [
-        (StreamState.STREAMING, 0, "streaming 200.0 Hz"),
-        (StreamState.WAITING, 0, f"waiting for {SERVER}"),
-        (StreamState.WAITING, 1, f"waiting for {SERVER}, 1 try"),
-        (StreamState.CONNECTING, 12, f"waiting for {SERVER}, 12 tries"),
-        (StreamState.HANDSHAKING, 1, f"connected to {SERVER}, handshake in progress"),
-        (StreamState.IDLE, 0, f"connected to {SERVER}, no frames requested"),
-        (StreamState.NO_MEASUREMENT, 0, f"connected to {SERVER}, no measurement running"),
-        (StreamState.STALLED, 0, f"no frames from {SERVER}"),
-    ],
-)
-def test_every_state_has_a_text_that_streams_share(state: StreamState, tries: int, line: str) -> None:
-    streams = [(StreamStatus(name, state=state, tries=tries), 199.96) for name in ("3d", "analog")]
-    assert source_line(LAB, streams[:1]) == source_line(TWO, streams) == f"lab: {line}"
-
-
-def test_streams_with_different_texts_are_listed_by_components() -> None:
-    rates = {"3d": 200.0, "analog": 2000.0}
-    streams = [(StreamStatus(name, state=StreamState.STREAMING), rate_hz) for name, rate_hz in rates.items()]
-    assert source_line(TWO, streams) == "lab: 3d streaming 200.0 Hz, analog streaming 2000.0 Hz"
-
-
-def test_only_outputs_that_cannot_send_or_lose_something_have_a_line() -> None:
-    health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True, "was away")}
-    assert output_lines(health.items()) == ["zenoh: no router"]
-    losses = Losses(logging.getLogger("tests"), "lab to zenoh")
-    losses.lost("no router", "start it", messages=5)
-    lines = loss_lines({"lab to zenoh": losses.report(), "lab to lcm": []}.items())
-    assert lines == ["lab to zenoh: lost in the last minute: 5 messages of 1 frame (no router)"]
+async def test_only_outputs_that_cannot_send_or_lose_something_have_a_line() -> None:
+    lab = lab_with(StreamState.STREAMING, 0.01)
+    assert status_lines(lab.gateway) == ["lab: streaming 0.0 Hz"]
+    lab.output.close()
+    lab.gateway.sources[0].fan_out.publish_status(b"status")
+    assert status_lines(lab.gateway)[1:] == [
+        f"memory: {lab.output.health().problem}",
+        "lab to memory: lost in the last minute: 1 message (not open)",
+    ]

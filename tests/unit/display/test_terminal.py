@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.display.terminal.screen import Screen, Style, encoded, key_names, line_text
+from gateway.display.terminal import Screen, Style, encoded, key_names, line_text
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from gateway.cli.params_output import OutputFormat, write_replies
+from gateway.cli.params import OutputFormat, write_replies
 from gateway.client.transport import Reply
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS

@@ -1,4 +1,4 @@
-"""A source with live data for tests of what is said about it."""
+"""A source whose messages arrive as a test sends them."""
 
 import re
 import time
@@ -10,7 +10,7 @@ import rtc3d
 
 from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.messages.host_time import now_utime
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from tests.takes import frame, parameters
 
 NAN = float("nan")
@@ -20,16 +20,15 @@ MISSING = (NAN, NAN, NAN, 999.0)
 class Lab:
     """The source lab, whose messages arrive as they are sent."""
 
-    def __init__(self, name: str = "lab") -> None:
+    def __init__(self, name: str = "lab", live: LiveData | None = None) -> None:
         self.name = name
-        self.live = LiveData()
+        self.live = LiveData() if live is None else live
         self._sequences: dict[ComponentType, int] = {}
 
     @property
     def source(self) -> LiveSource:
         """The source, with everything that was sent."""
-        [source] = self.live.update()
-        return source
+        return next(source for source in self.live.update() if source.name == self.name)
 
     def send(self, component: ComponentType, items: Sequence[Any], **options: Any) -> None:
         """Send a message, by default captured now, with the next sequence number."""
@@ -41,6 +40,20 @@ class Lab:
     def send_markers(self, *visible: bool) -> None:
         """Send a frame with markers that are visible or not."""
         self.send(ComponentType.MARKERS, [(1, 2, 3, 0.1) if each else MISSING for each in visible])
+
+    def send_ones(self, key: str, sequence: int, num_items: int, *, missing: tuple[int, ...] = ()) -> None:
+        """Send a component whose items are all 1, and NaN where they are ``missing``."""
+        component = COMPONENTS_BY_KEY[key]
+        num_fields = len(ITEM_DTYPES[component].names or ())
+        items = [(NAN if place in missing else 1,) * num_fields for place in range(num_items)]
+        self.send(component, items, sequence=sequence)
+
+    def send_labels(self, *labels: str) -> None:
+        """Send parameters with these markers, at 200 Hz."""
+        names = "".join(f"<Marker><Label><![CDATA[{label}]]></Label></Marker>" for label in labels)
+        self.send_parameters(
+            f"<The_3D><Markers>{len(labels)}</Markers><Frequency>200</Frequency>{names}</The_3D>"
+        )
 
     def send_parameters(self, xml: str) -> None:
         """Send parameters."""

@@ -1,1 +1,0 @@
-"""Terminals: keys without Enter, and drawing on the whole screen."""
