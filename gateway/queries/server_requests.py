@@ -14,7 +14,7 @@ from gateway.queries.known_parameters import QueryHistory
 from gateway.rtc3d.commands import Command, ControlRecording, recording_duration_s, recording_options
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
-from gateway.stream.process_timeout import running_timeout
+from gateway.stream.process_clock import RunningTimeout
 from gateway.stream.replies import Connection
 from gateway.stream.status import StreamStatus
 from gateway.takes.files.new_file import name_of_file
@@ -79,7 +79,7 @@ class ServerRequests:
         """
         name, timeout_s = f"source {self._settings.name!r}", self._settings.query_timeout_s
         try:
-            async with running_timeout(timeout_s), self._lock:
+            async with RunningTimeout(timeout_s), self._lock:
                 try:
                     return command, await self._send(command, connection)
                 except QueryError:

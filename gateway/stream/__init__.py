@@ -22,6 +22,6 @@ Around it, from the outside to the inside:
 - ``status``: what is known about a stream, its counters and its failures. ``state`` derives one word from it,
   and ``status_text`` makes sentences of it.
 
-Time-outs count only the time during which this process runs (``process_clock``, ``process_timeout``). Nothing
+Time-outs count only the time during which this process runs (``process_clock``). Nothing
 here knows any output.
 """

@@ -12,10 +12,11 @@ from gateway.messages.host_time import host_clock
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.stream.backlog import ReadClocks
 from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.rate_check import AnnouncedRates, RateWatch
 from gateway.stream.replies import ReadParameters
-from gateway.stream.session import FileReceiver, ReadClocks, Session, defect_error
+from gateway.stream.session import FileReceiver, Session, defect_error
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.stream_requests import ChangeTasks, StreamControl
