@@ -60,9 +60,8 @@ def _sources_of_take(path: Path) -> list[str]:
 
 
 def _configured_sources() -> list[str]:
-    from gateway.config.environment import apply_overrides
+    from gateway.config.document import apply_overrides, read_yaml
     from gateway.config.files import read_file
-    from gateway.config.yaml_document import read_yaml
 
     text = read_file(DEFAULT_CONFIG).decode() if DEFAULT_CONFIG.exists() else "{}"
     document = read_yaml(text, str(DEFAULT_CONFIG))

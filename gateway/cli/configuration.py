@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.loading import Configuration, read, read_server
 from gateway.outputs.registry import settings_type

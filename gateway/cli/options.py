@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 import typer
 
 from gateway.cli.completion import one_of, source_names
-from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
 from gateway.errors import QueryError
