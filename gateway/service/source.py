@@ -27,9 +27,8 @@ from gateway.rtc3d.components import only_components
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.replies import UNANSWERED, Connection
-from gateway.stream.source_warnings import SourceWarnings
 from gateway.stream.state import StreamState
-from gateway.stream.status import SessionNumbers, StreamStatus
+from gateway.stream.status import SessionNumbers, SourceWarnings, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, NoReturn
 
@@ -18,7 +19,7 @@ from gateway.stream.rate_check import AnnouncedRates, RateWatch
 from gateway.stream.replies import ReadParameters
 from gateway.stream.session import FileReceiver, Session, defect_error
 from gateway.stream.state import StreamState
-from gateway.stream.status import FrameRate, StreamStatus
+from gateway.stream.status import StreamStatus
 from gateway.stream.stream_requests import ChangeTasks, StreamControl
 from gateway.stream.tcp import Backoff, Connect, open_connection
 
@@ -230,6 +231,24 @@ class Supervisor:
         """Return the components to request from a server with these parameters."""
         self._listener.planning(self, parameters)
         return self.settings.components
+
+
+class FrameRate:
+    """The frame rate between two calls of ``update``."""
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._time_s = time.monotonic()
+        self.rate_hz = 0.0
+        """The rate at the last call of ``update``."""
+
+    def update(self, frames: int) -> float:
+        """Return the mean rate in Hz since the last call; ``frames`` is the number of frames so far."""
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._time_s
+        self.rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0
+        self._frames, self._time_s = frames, now_s
+        return self.rate_hz
 
 
 def component_keys(components: Sequence[ComponentType]) -> str:
