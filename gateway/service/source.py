@@ -19,9 +19,8 @@ from gateway.outputs.contract import Answer, Output, ServerFile, ServerParameter
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.answers import FilePayload
-from gateway.queries.known_parameters import QueryHistory, ServerAnswer
-from gateway.queries.parameter_cache import ParameterRefresh
-from gateway.queries.server_requests import RecordingAccess, StreamAccess
+from gateway.queries.server_answer import QueryHistory, ServerAnswer
+from gateway.queries.server_requests import ParameterRefresh, RecordingAccess, StreamAccess
 from gateway.queries.service import SourceQueries
 from gateway.rtc3d.components import only_components
 from gateway.rtc3d.parameters import Parameters
@@ -146,7 +145,7 @@ class Source:
         if not self.known_parameters.version:
             self.fan_out.begin(self.known_parameters)
         if self._has_new_server:
-            await self.queries.parameters.known.make_void("the configuration names another server")
+            await self.queries.parameters.make_void("the configuration names another server")
         elif self._has_new_frame and self.known_parameters.version:
             await self.queries.parameters.begin_version()
         elif self._has_new_components and self.known_parameters.version:
@@ -275,7 +274,7 @@ class Source:
     @property
     def known_parameters(self) -> ServerParameters:
         """The newest parameters as the outputs get them; empty ones if the server gives none."""
-        known = self.queries.parameters.known
+        known = self.queries.parameters
         components = self.settings.components
         return ServerParameters(
             b"" if known.newest is None else known.newest.xml,
@@ -287,7 +286,7 @@ class Source:
 
     @property
     def _parsed(self) -> Parameters:
-        newest = self.queries.parameters.known.newest
+        newest = self.queries.parameters.newest
         return Parameters() if newest is None else newest.parsed.parameters
 
     def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:

@@ -8,7 +8,6 @@ from gateway.errors import ParametersError, QueryError
 from gateway.messages.decode import JSON, XML, prefix_of
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.queries.answers import NewestJson, message_answer, schema_answer
-from gateway.queries.known_parameters import ServerAnswer, unreadable
 from gateway.queries.questions import (
     RECORDING,
     Question,
@@ -18,6 +17,7 @@ from gateway.queries.questions import (
     parse_question,
     parse_questions,
 )
+from gateway.queries.server_answer import ServerAnswer, unreadable
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.replies import XmlThread

@@ -9,7 +9,7 @@ import pytest
 from gateway.config.settings import SourceSettings
 from gateway.logs.failures import current_log_fields
 from gateway.publish.fan_out import FanOut
-from gateway.queries.parameter_cache import ParameterRefresh
+from gateway.queries.server_requests import ParameterRefresh
 from gateway.rtc3d.client_protocol import ClientProtocol
 from gateway.rtc3d.components import ComponentType
 from gateway.service.source import Source
