@@ -13,7 +13,7 @@ from typing import Final
 
 from gateway.rtc3d.frames import Frame
 from gateway.stream.clock import ServerClock
-from gateway.stream.process_clock import running_clock
+from gateway.stream.process_clock import RunningClock, running_clock
 
 _MAX_WAIT_S: Final = 0.005
 """The longest time between two frames, so that gaps and low rates do not delay a backlog."""
@@ -78,6 +78,7 @@ class Backlog:
         self._on_waiting = on_waiting
         self._on_defect = on_defect
         self._timer: asyncio.Handle | None = None  # set while frames wait
+        self._running: RunningClock | None = None  # looking it up costs a system call
         self._frames: list[Frame] = []  # waiting, without those before _next
         self._next = 0
         self._utime = 0  # when they arrived
@@ -139,7 +140,9 @@ class Backlog:
     def _publish_part(self) -> None:
         """Publish the part of the backlog that is due, and let the session read when nothing is left."""
         self._timer = None
-        running = running_clock()
+        running = self._running
+        if running is None:
+            running = self._running = running_clock()
         try:
             wait_s = self._publish_due()
             # What follows has not been read yet, so silence and unanswered commands mean nothing.

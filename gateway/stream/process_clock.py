@@ -50,10 +50,13 @@ class RunningClock:
             self._tick()
         return time_s
 
-    def longest_delay_s(self) -> float:
-        """Return the longest time in the last 30 s for which the loop did not run, so nobody read; or 0."""
+    def longest_delay_s(self, window_s: float = _DELAY_WINDOW_S) -> float:
+        """Return the longest time in the last ``window_s`` for which the loop did not run, or 0.
+
+        Nobody read meanwhile. The window is 30 s at most.
+        """
         now_s = self._loop_time()
-        recent = [delay_s for time_s, delay_s in self._delays_s if now_s - time_s < _DELAY_WINDOW_S]
+        recent = [delay_s for time_s, delay_s in self._delays_s if now_s - time_s < window_s]
         present_s = now_s - self._tick_s - _TICK_S
         return max([*recent, present_s if present_s >= _DELAY_S else 0.0])
 
