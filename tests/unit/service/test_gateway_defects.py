@@ -68,7 +68,7 @@ DEFECTS = [
     *((StreamStatus, name) for name in ("disconnected", "connecting", "reconnecting", "check")),
     *((Source, name) for name in ("publish_status", "_encoded_status", "_read_parameters", "_on_state")),
     *((FanOut, name) for name in ("publish", "publish_clock", "check_losses")),
-    *((Session, name) for name in ("_receive", "_report_change", "close")),
+    *((Session, name) for name in ("_on_event", "_report_change", "close")),
     *((AutomaticStreams, "check"), (Supervisor, "check_rate"), (ParameterRefresh, "_due_s")),
     *((Ingest, "receive"), (ClientProtocol, "receive")),
 ]
