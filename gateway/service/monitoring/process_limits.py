@@ -14,7 +14,7 @@ from typing import Final
 
 from gateway.errors import FILES_ADVICE, NO_FILES
 from gateway.logs.failures import HOLD_S, FailureLog
-from gateway.stream.process_clock import running_clock
+from gateway.stream.process_clock import RunningClock, running_clock
 from gateway.workers import thread_starts
 
 MAX_FILES: Final = 65_536
@@ -156,6 +156,7 @@ class LoopDelay:
         self._max_s = self._previous_max_s = 0.0  # of this minute and of the one before
         self._window_end_s = self._due_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
+        self._running: RunningClock | None = None  # set by ``start``
 
     @property
     def max_s(self) -> float:
@@ -164,6 +165,7 @@ class LoopDelay:
 
     def start(self) -> None:
         """Start measuring."""
+        self._running = running_clock()
         self._window_end_s = time.monotonic() + _WINDOW_S
         self._schedule()
 
@@ -188,5 +190,6 @@ class LoopDelay:
     def _measure(self) -> None:
         now_s = time.monotonic()
         self.record(now_s, max(0.0, now_s - self._due_s))  # uvloop's timers may be up to 1 ms early
-        self._max_s = max(self._max_s, running_clock().longest_delay_s(2 * _PERIOD_S))
+        if self._running is not None:
+            self._max_s = max(self._max_s, self._running.longest_delay_s(2 * _PERIOD_S))
         self._schedule()
