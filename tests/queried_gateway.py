@@ -154,7 +154,7 @@ async def wait_until_cached(gateway: Gateway) -> None:
             replies = output._queries._reply_sender
             await wait_until_async(lambda: not replies.problem)  # noqa: B023
     [source] = gateway.sources
-    await wait_until_async(lambda: source.queries.parameters.known.newest)
+    await wait_until_async(lambda: source.queries.parameters.newest)
     await wait_until_async(lambda: all(stream.session for stream in source.streams))
 
 

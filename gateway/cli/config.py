@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gateway.cli.options import ConfigOption, ServerOption
-from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.errors import ConfigError
 from gateway.logs.safe_text import safe_json

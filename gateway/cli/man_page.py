@@ -12,7 +12,7 @@ import typer
 import typer.core
 
 from gateway.cli.main import EXIT_STATUSES, app
-from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 
 _PROGRAM: Final = "rtc3d-gateway"

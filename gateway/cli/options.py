@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 import typer
 
-from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
 from gateway.errors import QueryError
@@ -176,9 +176,8 @@ def _sources_of_take(path: Path) -> list[str]:
 
 
 def _configured_sources() -> list[str]:
-    from gateway.config.environment import apply_overrides
+    from gateway.config.document import apply_overrides, read_yaml
     from gateway.config.files import read_file
-    from gateway.config.yaml_document import read_yaml
 
     text = read_file(DEFAULT_CONFIG).decode() if DEFAULT_CONFIG.exists() else "{}"
     document = read_yaml(text, str(DEFAULT_CONFIG))

@@ -62,7 +62,7 @@ def run(
     import uvloop
 
     from gateway.cli.config import chosen_file, configuration_from_options
-    from gateway.logs.log_format import LogLimit
+    from gateway.logs.limits import LogLimit
     from gateway.service.daemon import serve
 
     limit = LogLimit()

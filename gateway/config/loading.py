@@ -9,12 +9,20 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from pydantic import ValidationError
 
-from gateway.config.environment import VARIABLE_PREFIX, apply_overrides, variable_name
+from gateway.config.document import (
+    VARIABLE_PREFIX,
+    Document,
+    Location,
+    Position,
+    apply_overrides,
+    line_and_column_after,
+    read_yaml,
+    variable_name,
+)
 from gateway.config.files import read_file
-from gateway.config.secrets import MASK, file_key_for, find_secrets, is_secret_key, mask_secrets_in_text
 from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import OutputSettings, Settings
-from gateway.config.yaml_document import Document, Location, Position, line_and_column_after, read_yaml
+from gateway.config.words import MASK, file_key_for, find_secrets, is_secret_key, mask_secrets_in_text
 from gateway.errors import ConfigError
 
 logger = logging.getLogger(__name__)
@@ -33,7 +41,7 @@ class Configuration(NamedTuple):
 
 
 def read(path: Path | None, model: type[Settings], environ: Mapping[str, str] = os.environ) -> Configuration:
-    """Read the YAML file at ``path``, if any, and apply the overrides in ``environ`` (config/environment.py).
+    """Read the YAML file at ``path``, if any, and apply the overrides in ``environ`` (config/document.py).
 
     ``model`` is the whole configuration with its outputs (``settings_model``). Relative paths are relative to
     the folder of the file, or to the current folder if there is no file. Raises ConfigError with one line per

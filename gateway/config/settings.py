@@ -25,7 +25,6 @@ from pydantic import (
 from pydantic.json_schema import SkipJsonSchema
 
 from gateway.config.section import Effective, Section, expects, validation_error
-from gateway.config.transform import TransformSettings
 from gateway.config.values import (
     AbsoluteDirectory,
     Backlog,
@@ -43,6 +42,7 @@ from gateway.config.values import (
     Speed,
     StreamRate,
     Switch,
+    TransformSettings,
     not_empty,
 )
 from gateway.rtc3d.commands import AllFrames, Frequency

@@ -9,11 +9,11 @@ from typing import Any, Final, NamedTuple
 import yaml
 from pydantic.json_schema import GenerateJsonSchema
 
+from gateway.config.document import Location
 from gateway.config.loading import Configuration
-from gateway.config.secrets import mask_secrets
 from gateway.config.section import Section
 from gateway.config.settings import Settings
-from gateway.config.yaml_document import Location
+from gateway.config.words import mask_secrets
 
 _DEFAULT: Final = "default"
 _MAX_COLUMN: Final = 48

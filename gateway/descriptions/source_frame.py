@@ -4,7 +4,7 @@ import math
 from typing import Final
 
 from gateway.config.settings import SourceSettings
-from gateway.config.transform import RollPitchYaw
+from gateway.config.values import RollPitchYaw
 from gateway.messages.coordinate_frame import CoordinateFrame, Quaternion, product
 from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import Parameters

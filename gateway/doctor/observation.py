@@ -20,7 +20,7 @@ from gateway.stream.process_clock import running_clock
 from gateway.stream.replies import Connection
 from gateway.stream.session import IgnoredFiles, Session
 from gateway.stream.status import StreamStatus
-from gateway.stream.stream_requests import StreamControl
+from gateway.stream.stream_requests import StreamRequests
 from gateway.stream.supervisor import component_keys, stream_name
 from gateway.workers import WorkerThread
 
@@ -110,7 +110,7 @@ class ObservedStream:
         self.parsed: ParsedParameters | None = None
         self.observed: dict[ComponentType, ObservedComponent] = {}
         self.session = Session(source, stream, self.status, self._on_frames, IgnoredFiles())
-        self.control = StreamControl(
+        self.control = StreamRequests(
             source, stream, self.status, self.session, self._read_parameters, self._planned_components
         )
         self._plans = plans

@@ -1,28 +1,18 @@
 """Logging of failures, defects and repeated events, and of the context of log records."""
 
 import logging
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from time import monotonic
 from typing import Final, TypeVar
 
+from gateway.logs.limits import HOLD_S as HOLD_S  # noqa: PLC0414 - for the callers of FailureLog
+from gateway.logs.limits import MAX_REPEATS, Hold, Repeats
 from gateway.logs.safe_text import safe_text
 
 FIELDS: Final = ("source", "stream", "peer")
 """The context that a record can have besides its text: fields in the journal and in JSON."""
-
-HOLD_S: Final = 5.0
-MAX_HOLD_S: Final = 60.0
-"""A ``hold_s`` for FailureLog: intermittent failures are over after this time without a failure.
-
-If the next failure comes soon after that, the wait doubles, up to MAX_HOLD_S.
-"""
-
-MAX_REPEATS: Final = 5
-_REPEATS_WINDOW_S: Final = 300.0
-"""How often EventLog and FailureLog log one kind of message in this time; further ones are DEBUG."""
 
 _Result = TypeVar("_Result")
 
@@ -50,25 +40,6 @@ def current_log_fields() -> Mapping[str, str]:
     return _fields.get({})
 
 
-class _Repeats:
-    """The times of the newest messages of one kind, and how many others were not logged since then."""
-
-    def __init__(self, most: int = MAX_REPEATS) -> None:
-        self._most = most
-        self._times_s: deque[float] = deque(maxlen=most)
-        self._num_hidden = 0
-
-    def count(self) -> str | None:
-        """Count a message. Return what to add to its text, None if it is one too many."""
-        now_s = monotonic()
-        if len(self._times_s) == self._most and now_s - self._times_s[0] < _REPEATS_WINDOW_S:
-            self._num_hidden += 1
-            return None
-        self._times_s.append(now_s)
-        num_hidden, self._num_hidden = self._num_hidden, 0
-        return f" ({num_hidden} more like this since the last one)" if num_hidden else ""
-
-
 class EventLog:
     """Logs events that a server or a peer can cause as often as it likes.
 
@@ -79,7 +50,7 @@ class EventLog:
     def __init__(self, logger: logging.Logger, subject: object) -> None:
         self._logger = logger
         self._subject = subject
-        self._repeats: dict[str, _Repeats] = {}
+        self._repeats: dict[str, Repeats] = {}
 
     def log(self, level: int, text: str, kind: str, most: int = MAX_REPEATS) -> None:
         """Log an event. There must be few kinds, so they never come from a network.
@@ -88,8 +59,8 @@ class EventLog:
         """
         repeats = self._repeats.get(kind)
         if repeats is None:
-            repeats = self._repeats[kind] = _Repeats(most)
-        addition = repeats.count()
+            repeats = self._repeats[kind] = Repeats(most)
+        addition = repeats.count(monotonic())
         if addition is None:
             self._logger.debug("%s: %s", self._subject, text)
         else:
@@ -100,18 +71,17 @@ class FailureLog:
     """Logs the first of several failures in a row as WARNING, repeats as DEBUG, and recovery as INFO.
 
     ``subject`` begins every message, for example "lab" or "lcm". It can be any object; its str may change.
-    Successes within ``hold_s`` after a failure do not count as recovery, so intermittent failures are logged
-    as one. If failures come and go nevertheless, these messages are limited as by EventLog.
+    Successes within ``hold_s`` (see Hold) after a failure do not count as recovery, so intermittent failures
+    are logged as one. If failures come and go nevertheless, these messages are limited as by EventLog.
     """
 
     def __init__(self, logger: logging.Logger, subject: object, hold_s: float = 0.0) -> None:
         self._logger = logger
         self._subject = subject
-        self._first_hold_s = self._hold_s = hold_s
+        self._hold = Hold(hold_s)
         self._failures = 0
         self._first_s = self._last_s = 0.0
-        self._recovered_s = float("-inf")
-        self._repeats = _Repeats()
+        self._repeats = Repeats()
         self._is_hidden = False  # the first failure, because there were too many before
 
     @property
@@ -127,9 +97,8 @@ class FailureLog:
             self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
             return
         self._first_s = self._last_s
-        is_soon = self._last_s - self._recovered_s < MAX_HOLD_S
-        self._hold_s = min(2 * self._hold_s, MAX_HOLD_S) if is_soon else self._first_hold_s
-        addition = self._repeats.count()
+        self._hold.begin(self._first_s)
+        addition = self._repeats.count(self._first_s)
         self._is_hidden = addition is None
         self._logger.log(
             logging.DEBUG if addition is None else logging.WARNING,
@@ -145,7 +114,7 @@ class FailureLog:
         if not self._failures:
             return
         now_s = monotonic()
-        if now_s - self._last_s >= self._hold_s:
+        if now_s - self._last_s >= self._hold.seconds:
             count = "" if self._failures == 1 else f" and {self._failures} failures"
             self._logger.log(
                 logging.DEBUG if self._is_hidden else logging.INFO,
@@ -153,7 +122,7 @@ class FailureLog:
                 *(self._subject, text, now_s - self._first_s, count),
             )
             self._failures = 0
-            self._recovered_s = now_s
+            self._hold.end(now_s)
 
     def succeeded(self, text: str) -> None:
         """Log a success even if nothing has failed; after a failure, do the same as ``recovered``."""

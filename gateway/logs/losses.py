@@ -7,13 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-MIN_HOLD_S: Final = 5.0
-MAX_HOLD_S: Final = 60.0
-"""A period of loss ends when nothing has been lost for MIN_HOLD_S.
-
-If the next period begins soon after that, the wait doubles, up to MAX_HOLD_S. So loss that comes and goes
-does not fill the log.
-"""
+from gateway.logs.limits import HOLD_S, Hold
 
 _MINUTE_S: Final = 60
 
@@ -78,7 +72,7 @@ class Losses:
 
     In each period of loss, the first loss for each cause is logged, as WARNING unless ``lost`` says another
     level, and again if a later one has a higher level. The end of the period is logged as INFO with the
-    total. ``subject`` begins every log message. Any thread may call the methods.
+    total (see Hold). ``subject`` begins every log message. Any thread may call the methods.
     """
 
     def __init__(
@@ -95,10 +89,9 @@ class Losses:
         self._monotonic = monotonic
         self._lock = threading.Lock()
         self._causes: dict[str, _Cause] = {}
-        self._hold_s = MIN_HOLD_S
+        self._hold = Hold(HOLD_S)
         self._began_s: float | None = None  # when the current period of loss began; None if nothing is lost
         self._newest_s = 0.0
-        self._ended_s = float("-inf")  # when the last period ended
 
     def lost(
         self,
@@ -121,10 +114,11 @@ class Losses:
             counted.text = text
             self._newest_s = now_s
             if self._began_s is None:
-                self._begin(now_s)
+                self._began_s = now_s
+                self._hold.begin(now_s)
         is_known = False
         if self._newest_by_cause_s is not None:
-            is_known = now_s - self._newest_by_cause_s.get(cause, float("-inf")) < MIN_HOLD_S
+            is_known = now_s - self._newest_by_cause_s.get(cause, float("-inf")) < HOLD_S
             self._newest_by_cause_s[cause] = now_s
         if is_news:
             is_repeat = is_known and level == logging.WARNING
@@ -144,8 +138,8 @@ class Losses:
 
     def check(self) -> None:
         """Log the end of a period of loss if nothing has been lost for long enough. Call it every second."""
-        if self._began_s is not None and self._monotonic() - self._newest_s >= self._hold_s:
-            self._end(f"; no more in the {self._hold_s:g} s since then")
+        if self._began_s is not None and self._monotonic() - self._newest_s >= self._hold.seconds:
+            self._end(f"; no more in the {self._hold.seconds:g} s since then")
 
     def close(self) -> None:
         """Log the end of a period of loss now, because the route ends. It may be used again."""
@@ -163,18 +157,13 @@ class Losses:
         counted = self._causes.get(cause)
         return 0 if counted is None else counted.frames
 
-    def _begin(self, now_s: float) -> None:
-        is_soon = now_s - self._ended_s < MAX_HOLD_S
-        self._hold_s = min(2 * self._hold_s, MAX_HOLD_S) if is_soon else MIN_HOLD_S
-        self._began_s = now_s
-
     def _end(self, ending: str) -> None:
         with self._lock:
             if self._began_s is None:
                 return
             duration_s = self._newest_s - self._began_s
             self._began_s = None
-            self._ended_s = self._newest_s + self._hold_s
+            self._hold.end(self._newest_s + self._hold.seconds)
             counts = []
             for cause, counted in sorted(self._causes.items()):
                 if counted.period_messages:

@@ -2,8 +2,9 @@
 
 import logging
 import time
-from collections import deque
 from typing import Final
+
+from gateway.logs.limits import Repeats
 
 STEP_US: Final = 1_000
 """A change of the wall clock by this much is a step: somebody has set it."""
@@ -15,7 +16,7 @@ _READINGS: Final = 5
 """How many readings confirm a change: the process may be interrupted between the two clocks of a reading."""
 
 _LOGGED_STEPS: Final = 10
-_LOG_WINDOW_US: Final = 3_600_000_000
+_LOG_WINDOW_S: Final = 3600.0
 """At most so many steps in this time are logged as WARNING; further ones as DEBUG."""
 
 _STEADY_CLOCK: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # only Linux has the first
@@ -48,7 +49,7 @@ class HostClock:
         """Wall clock minus steady clock, at the newest reading."""
         self.steps = 0
         """How often the wall clock was set since this object was made."""
-        self._logged_us: deque[int] = deque(maxlen=_LOGGED_STEPS)
+        self._repeats = Repeats(_LOGGED_STEPS, _LOG_WINDOW_S)
 
     def read(self) -> tuple[int, int]:
         """Return the time in µs since the Unix epoch and the same moment on the steady clock in µs.
@@ -72,14 +73,10 @@ class HostClock:
         if abs(change_us) < STEP_US:
             return
         self.steps += 1
-        level = logging.WARNING
-        if len(self._logged_us) == _LOGGED_STEPS and steady_us - self._logged_us[0] < _LOG_WINDOW_US:
-            level = logging.DEBUG
-        else:
-            self._logged_us.append(steady_us)
+        is_hidden = self._repeats.count(steady_us * 1e-6) is None
         direction = "forward" if change_us > 0 else "back"
         logger.log(
-            level,
+            logging.DEBUG if is_hidden else logging.WARNING,
             "the clock of this computer was set %s by %.3f s; utime and capture_utime follow; "
             "rates and lag do not change",
             *(direction, abs(change_us) / 1e6),

@@ -2,6 +2,8 @@
 
 import math
 import re
+import struct
+from functools import cache
 from typing import Any, Final
 
 from gateway.logs.safe_text import safe_text
@@ -16,31 +18,42 @@ def encode_within_limits(message: Any) -> bytes:
     Integers and floats are moved into their range, and texts are those of ``safe_text``. So no number that a
     server makes the gateway compute, and no text, prevents its status.
     """
-    _limit(message)
-    encoded: bytes = message.encode()
+    _limit(message, with_numbers=False)
+    encoded: bytes
+    try:
+        encoded = message.encode()
+    except (struct.error, OverflowError):  # rare, and checking each number would take most of the time
+        _limit(message, with_numbers=True)
+        encoded = message.encode()
     return encoded
 
 
-def _limit(message: Any) -> None:
-    for name, type_name in zip(message.__slots__, message.__typenames__, strict=True):
+@cache
+def _fields(message_type: type[Any], *, with_numbers: bool) -> list[tuple[str, str]]:
+    """Return the names and types of the fields to limit."""
+    fields = zip(message_type.__slots__, message_type.__typenames__, strict=True)
+    others = {"boolean", "byte"} if with_numbers else {"boolean", "byte", "float", "double", *_MAX_BITS}
+    return [field for field in fields if field[1] not in others]
+
+
+def _limit(message: Any, *, with_numbers: bool) -> None:
+    for name, type_name in _fields(message.__class__, with_numbers=with_numbers):
         value = getattr(message, name)
-        if isinstance(value, list):
-            setattr(message, name, [_limited(item, type_name) for item in value])
-        else:
-            setattr(message, name, _limited(value, type_name))
+        if not isinstance(value, list):
+            setattr(message, name, _limited(value, type_name, with_numbers=with_numbers))
+        elif value:
+            limited = [_limited(item, type_name, with_numbers=with_numbers) for item in value]
+            setattr(message, name, limited)
 
 
-def _limited(value: Any, type_name: str) -> Any:
+def _limited(value: Any, type_name: str, *, with_numbers: bool) -> Any:
+    if type_name == "string":
+        return safe_text(value)
     if type_name in _MAX_BITS:
         return _limited_integer(value, 1 << _MAX_BITS[type_name])
-    match type_name:
-        case "string":
-            return safe_text(value)
-        case "float" | "double":
-            return _limited_float(value, _MAX_FLOAT if type_name == "float" else math.inf)
-        case "boolean" | "byte":
-            return value
-    _limit(value)
+    if type_name in {"float", "double"}:
+        return _limited_float(value, _MAX_FLOAT if type_name == "float" else math.inf)
+    _limit(value, with_numbers=with_numbers)
     return value
 
 

@@ -7,8 +7,8 @@ concerns, and returns an answer, a command for the server, or an error for the p
 - ``questions``: what is asked, parsed from keys and options.
 - ``answers``: answers that need no server. What takes long to make is made by the thread that sends it, once
   for all peers.
-- ``known_parameters``: the server's newest parameters and their version. ``parameter_cache`` reads them at
-  each connection and again later, and serves peers in the meantime.
-- ``server_requests``: commands for the server on behalf of peers: one at a time, shared where equal; also
-  starting and stopping its recordings.
+- ``parameter_cache``: the server's parameters: reads them at each connection and again later, publishes
+  changes under a new version, and serves peers in the meantime. ``server_answer`` is one answer of a server.
+- ``server_requests``: when the server is asked for its parameters again, and commands on behalf of peers: one
+  at a time, shared where equal; also starting and stopping its recordings.
 """

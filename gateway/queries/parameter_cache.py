@@ -1,4 +1,4 @@
-"""The parameters of one source's server: read at each connection, read again, and given to peers.
+"""The parameters of one source's server: read at each connection, kept, published, and given to peers.
 
 The server is asked for all of its parameters at once, and a peer's query for one section is answered from
 that. For ``fresh_interval_s`` after an answer, a ``fresh`` query gets that answer and does not reach the
@@ -11,7 +11,6 @@ import logging
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
-from typing import Final
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import (
@@ -21,14 +20,14 @@ from gateway.errors import (
     ReplyTimeoutError,
     ServerError,
 )
-from gateway.logs.failures import DefectLog, FailureLog
-from gateway.queries.known_parameters import (
-    Announce,
-    KnownParameters,
+from gateway.logs.failures import FailureLog
+from gateway.queries.server_answer import (
     QueryHistory,
+    Reading,
     Sections,
     ServerAnswer,
     now_s,
+    read_parameters,
     unreadable,
 )
 from gateway.queries.server_requests import ServerRequests
@@ -36,74 +35,14 @@ from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.replies import Connection, XmlThread
 
-_GAP_WITHOUT_INTERVAL_S: Final = 10.0
-"""The shortest time between two requested readings if ``parameters_interval_s`` is 0."""
-
 logger = logging.getLogger(__name__)
 
 
-class ParameterRefresh:
-    """Reads the parameters again every ``parameters_interval_s``, and soon after ``request``.
+Announce = Callable[[ServerAnswer | None, int], Awaitable[None]]
+"""Takes new parameters, None if the former ones are void, and their version.
 
-    A server that plays a file in a loop causes a request with every pass. So requests within
-    ``parameters_interval_s`` after a requested reading are served together at its end. ``last_read_s``
-    returns when the server last sent its parameters, for whatever reason, on the event loop's clock.
-    """
-
-    def __init__(
-        self,
-        settings: SourceSettings,
-        read: Callable[[], Awaitable[None]],
-        last_read_s: Callable[[], float],
-    ) -> None:
-        self._defects = DefectLog(logger, settings.name)
-        self._interval_s = settings.parameters_interval_s or math.inf
-        self._gap_s = settings.parameters_interval_s or _GAP_WITHOUT_INTERVAL_S
-        self._delay_s = settings.fresh_interval_s
-        self._read = read
-        self._last_read_s = last_read_s
-        self._requested_s: float | None = None
-        self._last_requested_reading_s = -math.inf
-        self._requested = asyncio.Event()
-
-    def request(self) -> None:
-        """Read the parameters again after ``fresh_interval_s``, because they may have changed."""
-        if self._requested_s is None:
-            self._requested_s = asyncio.get_running_loop().time()
-            self._requested.set()
-
-    async def run(self) -> None:
-        """Read the parameters again whenever it is time, until cancelled."""
-        loop = asyncio.get_running_loop()
-        started_s = loop.time()
-        while True:
-            due_s = self._due_s(started_s)
-            await self._wait_until(due_s)
-            if self._due_s(started_s) > due_s or self._requested.is_set():
-                continue  # Somebody else has asked the server, or asks for an earlier time.
-            started_s = loop.time()
-            if self._requested_s is not None:
-                self._requested_s = None
-                self._last_requested_reading_s = started_s
-            try:
-                await self._read()
-            except Exception as defect:  # noqa: BLE001 - the next reading may succeed
-                self._defects.log(defect)
-
-    def _due_s(self, started_s: float) -> float:
-        """Return when the next reading is due; ``started_s`` is when the last one began."""
-        due_s = max(started_s, self._last_read_s()) + self._interval_s
-        if self._requested_s is None:
-            return due_s
-        requested_due_s = max(self._requested_s + self._delay_s, self._last_requested_reading_s + self._gap_s)
-        return min(due_s, requested_due_s)
-
-    async def _wait_until(self, due_s: float) -> None:
-        """Wait until it is time, or until a request."""
-        self._requested.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout_at(None if due_s == math.inf else due_s):
-                await self._requested.wait()
+Publishes them, and then marks the frames that follow with the version.
+"""
 
 
 @dataclass(frozen=True)
@@ -115,9 +54,11 @@ class _Refusal:
 
 
 class ParameterCache:
-    """The answers to SendParameters. ``known`` has the newest for all sections; ``announce`` gets changes.
+    """The answers to SendParameters.
 
-    ``xml_thread`` processes all XML of the source.
+    ``version`` grows by one whenever the newest parameters mean something else than before, when they become
+    void, and when another frame of poses goes with them. ``announce`` gets each change. ``history`` keeps the
+    newest ones when the source is built again.
     """
 
     def __init__(
@@ -129,8 +70,10 @@ class ParameterCache:
     ) -> None:
         self._settings = settings
         self._requests = requests
-        self.xml_thread: XmlThread = XmlThread(settings.name)
-        self.known: KnownParameters = KnownParameters(history, self.xml_thread, announce)
+        self._announce = announce
+        self._history = history
+        self._xml_thread = XmlThread(settings.name)
+        self._change = asyncio.Lock()  # held while the newest parameters change, until that is announced
         # On one of these, the server gave the newest parameters. The others share them.
         self._connections: list[Connection] = []
         self._refusing: Connection | None = None  # one of these, on which the server refused them later on
@@ -145,10 +88,19 @@ class ParameterCache:
         self._problems = FailureLog(logger, settings.name)
 
     @property
+    def newest(self) -> ServerAnswer | None:
+        """The newest answer for all sections; None before the first, and while the former ones are void."""
+        return self._history.newest
+
+    @property
+    def version(self) -> int:
+        """The version of the newest parameters; 0 before the first."""
+        return self._history.version
+
+    @property
     def last_read_s(self) -> float:
         """When the server last sent all its parameters, on the event loop's clock; -inf if it never did."""
-        newest = self.known.newest
-        return -math.inf if newest is None else newest.received_s
+        return -math.inf if self.newest is None else self.newest.received_s
 
     # At the start of a connection.
 
@@ -163,7 +115,7 @@ class ParameterCache:
             shared = await asyncio.shield(self._reading)
             if shared is not None:
                 return await self._share(connection, shared)
-        newest = self.known.newest
+        newest = self.newest
         if newest is not None and self._is_current and self._is_valid(newest, fresh=True):
             return await self._share(connection, newest.parsed)
         self._reading = reading = asyncio.get_running_loop().create_future()
@@ -183,8 +135,13 @@ class ParameterCache:
             self._reading = None
 
     async def _share(self, connection: Connection, parsed: ParsedParameters) -> ParsedParameters:
+        """Announce the newest parameters again, for a new connection to the same server."""
         self._connections.append(connection)
-        await self.known.share(self._requests.session)
+        session = self._requests.session
+        async with self._change:
+            if self.newest is not None:
+                self._history.newest = replace(self.newest, session=session)
+                await self._announce(self.newest, self.version)
         return parsed
 
     async def _read(self, connection: Connection) -> ParsedParameters:
@@ -204,7 +161,7 @@ class ParameterCache:
             await self._invalidate(str(error))
             raise
         try:
-            answer = await self.known.take(packet.body, self._requests.session, announce_always=True)
+            answer = await self._take(packet.body, announce_always=True)
         except ParametersError as error:
             self._keep_unreadable((), packet.body, error)
             await self._invalidate(str(error))
@@ -216,12 +173,71 @@ class ParameterCache:
     async def _invalidate(self, reason: str) -> None:
         """Make the former parameters void, unless the server still gives them on another connection."""
         if not self._is_current:
-            await self.known.make_void(reason)
+            await self.make_void(reason)
+
+    # The newest parameters, and their version.
+
+    async def _take(self, xml: bytes, *, announce_always: bool = False) -> ServerAnswer:
+        """Keep an answer for all sections, and announce it if it means something else than the former one.
+
+        Raises ParametersError if nothing can be read from it; then nothing changes.
+        """
+        session = self._requests.session
+        async with self._change:
+            before = self.newest
+            reading = await self._xml_thread.process(xml, lambda xml: read_parameters(xml, before))
+            if reading.is_changed:
+                self._history.version += 1
+                self._log_change(reading, is_first=before is None)
+            self._history.newest = answer = ServerAnswer((), xml, reading.parsed, session, self.version)
+            if reading.is_changed or announce_always:
+                await self._announce(answer, self.version)
+            return answer
 
     async def begin_version(self) -> None:
-        """See KnownParameters."""
+        """Announce the parameters as another version, because they go with another frame of poses now."""
         self._answers.clear()
-        await self.known.begin_version()
+        async with self._change:
+            self._history.version += 1
+            if self.newest is not None:
+                self._history.newest = replace(self.newest, version=self.version)
+            await self._announce(self.newest, self.version)
+
+    async def make_void(self, reason: str) -> None:
+        """Forget the parameters, because the server does not give any now (field note 23)."""
+        async with self._change:
+            if self.newest is None:
+                return
+            self._history.newest = None
+            self._history.version += 1
+            self._history.events.log(
+                logging.WARNING,
+                f"the server gives no parameters any more: {reason}; the former names and units are void "
+                f"(parameters_version {self.version})",
+                "void",
+            )
+            await self._announce(None, self.version)
+
+    def _log_change(self, reading: Reading, *, is_first: bool) -> None:
+        if is_first:
+            if self.version > 1:
+                text = f"the server gives parameters again (parameters_version {self.version})"
+                self._history.events.log(logging.INFO, text, "given again")
+            return
+        if reading.renamed:
+            self._history.events.log(
+                logging.WARNING,
+                f"markers or tools were renamed on the server: {reading.renamed}; programs that use the "
+                f"names need the new ones (parameters_version {self.version})",
+                "renamed",
+            )
+        if reading.changed_sections:
+            sections = ", ".join(reading.changed_sections)
+            self._history.events.log(
+                logging.INFO,
+                f"the server's parameters changed: {sections} (parameters_version {self.version})",
+                "changed",
+            )
 
     # While connections are open.
 
@@ -252,20 +268,21 @@ class ParameterCache:
         try:
             return await self._get(sections, fresh=fresh)
         except QueryError as error:
-            if self.known.is_void and error.code in {"refused", "timeout"}:
+            is_void = self.newest is None and self.version > 0
+            if is_void and error.code in {"refused", "timeout"}:
                 text = f"{error}; the parameters of its earlier connections are void"
                 raise QueryError(text, code=error.code) from error
             raise
 
     async def _stale(self, sections: Sections) -> ServerAnswer | None:
-        newest = self.known.newest
+        newest = self.newest
         if newest is None or not sections:
             return newest
-        return await newest.part(sections, self.xml_thread) or self._answers.get(sections)
+        return await newest.part(sections, self._xml_thread) or self._answers.get(sections)
 
     async def _get(self, sections: Sections, *, fresh: bool) -> ServerAnswer:
         everything = await self._get_all(fresh=fresh)
-        part = await everything.part(sections, self.xml_thread) if sections else everything
+        part = await everything.part(sections, self._xml_thread) if sections else everything
         if part is not None:
             return part
         # The answer for all sections lacks these, or is not well-formed. So the server has to be asked.
@@ -277,7 +294,7 @@ class ParameterCache:
         )
 
     async def _get_all(self, *, fresh: bool) -> ServerAnswer:
-        for answer in (self.known.newest if self._is_current else None, self._answers.get(())):
+        for answer in (self.newest if self._is_current else None, self._answers.get(())):
             if answer is not None and self._is_valid(answer, fresh=fresh):
                 return answer
         if self._refusal is not None and self._is_valid(self._refusal, fresh=fresh):
@@ -315,9 +332,9 @@ class ParameterCache:
             if error.code in {"refused", "timeout"}:
                 self._report_problem(connection, error)
             raise
-        version = self.known.version
+        version = self.version
         try:
-            answer = await self.known.take(packet.body, self._requests.session)
+            answer = await self._take(packet.body)
         except ParametersError as error:
             self._report_problem(connection, error)
             return self._keep_unreadable((), packet.body, error)
@@ -358,14 +375,14 @@ class ParameterCache:
         return answer
 
     async def _parse(self, sections: Sections, xml: bytes) -> ServerAnswer:
-        session, version = self._requests.session, self.known.version
+        session, version = self._requests.session, self.version
         try:
-            parsed = await self.xml_thread.process(xml, parse_parameters)
+            parsed = await self._xml_thread.process(xml, parse_parameters)
         except ParametersError as error:
             return self._keep_unreadable(sections, xml, error)
         return ServerAnswer(sections, xml, parsed, session, version)
 
     def _keep_unreadable(self, sections: Sections, xml: bytes, error: ParametersError) -> ServerAnswer:
-        session, version = self._requests.session, self.known.version
+        session, version = self._requests.session, self.version
         self._answers[sections] = answer = unreadable(sections, xml, session, version, error)
         return answer

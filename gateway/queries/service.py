@@ -18,8 +18,7 @@ from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
 from gateway.queries.answers import JsonPayload, NewestJson, message_answer, schema_answer
-from gateway.queries.known_parameters import Announce, QueryHistory
-from gateway.queries.parameter_cache import ParameterCache
+from gateway.queries.parameter_cache import Announce, ParameterCache
 from gateway.queries.questions import (
     RECORDING,
     Question,
@@ -29,6 +28,7 @@ from gateway.queries.questions import (
     parse_question,
     parse_questions,
 )
+from gateway.queries.server_answer import QueryHistory
 from gateway.queries.server_requests import RecordingAccess, Recordings, ServerRequests, StreamAccess
 from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
@@ -98,7 +98,7 @@ class SourceQueries:
     @property
     def frame(self) -> CoordinateFrame:
         """The coordinate frame of the source's poses."""
-        newest = self.parameters.known.newest
+        newest = self.parameters.newest
         return source_frame(self.settings, Parameters() if newest is None else newest.parsed.parameters)
 
     def check_control(self) -> None:

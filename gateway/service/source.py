@@ -22,17 +22,15 @@ from gateway.outputs.contract import Answer, Output, ServerFile, ServerParameter
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.answers import FilePayload
-from gateway.queries.known_parameters import QueryHistory, ServerAnswer
-from gateway.queries.parameter_cache import ParameterRefresh
-from gateway.queries.server_requests import RecordingAccess, StreamAccess
+from gateway.queries.server_answer import QueryHistory, ServerAnswer
+from gateway.queries.server_requests import ParameterRefresh, RecordingAccess, StreamAccess
 from gateway.queries.service import SourceQueries
 from gateway.rtc3d.components import only_components
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.replies import UNANSWERED, Connection
-from gateway.stream.source_warnings import SourceWarnings
 from gateway.stream.state import StreamState
-from gateway.stream.status import SessionNumbers, StreamStatus
+from gateway.stream.status import SessionNumbers, SourceWarnings, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
 
@@ -150,7 +148,7 @@ class Source:
         if not self.known_parameters.version:
             self.fan_out.begin(self.known_parameters)
         if self._has_new_server:
-            await self.queries.parameters.known.make_void("the configuration names another server")
+            await self.queries.parameters.make_void("the configuration names another server")
         elif self._has_new_frame and self.known_parameters.version:
             await self.queries.parameters.begin_version()
         elif self._has_new_components and self.known_parameters.version:
@@ -278,7 +276,7 @@ class Source:
     @property
     def known_parameters(self) -> ServerParameters:
         """The newest parameters as the outputs get them; empty ones if the server gives none."""
-        known = self.queries.parameters.known
+        known = self.queries.parameters
         components = self.settings.components
         return ServerParameters(
             b"" if known.newest is None else known.newest.xml,
@@ -290,7 +288,7 @@ class Source:
 
     @property
     def _parsed(self) -> Parameters:
-        newest = self.queries.parameters.known.newest
+        newest = self.queries.parameters.newest
         return Parameters() if newest is None else newest.parsed.parameters
 
     def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:

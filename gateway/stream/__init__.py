@@ -3,10 +3,11 @@
 A source has one stream for each connection to its server. A server never sends faster than the slowest
 component that a connection requests (§5.3.5), so components with different rates need different connections.
 
-The path of a frame: ``session`` reads bytes and gives them to ``rtc3d.client_protocol``, which returns
-frames. A few frames at a time go on at once; many that arrived together are a ``backlog`` and go on at a
-pace. ``ingest`` computes when each frame was captured (``clock``), counts the frames that the server left
-out, skips late ones if the configuration says so, and hands the rest to ``publish.fan_out``.
+The path of a frame, as calls without a task between them: ``session`` reads bytes and gives them to
+``rtc3d.client_protocol``, which returns frames. ``backlog`` passes a few frames on at once, and many that
+arrived together at a pace. ``ingest`` computes when each frame was captured (``clock``), counts the frames
+that the server left out, skips late ones if the configuration says so, and calls ``publish.fan_out``, whose
+routes call the publishers of the outputs.
 
 Around it, from the outside to the inside:
 
@@ -14,13 +15,14 @@ Around it, from the outside to the inside:
   parameters.
 - ``supervisor``: one stream, kept running. It opens a connection (``tcp``), runs a session, waits and tries
   again.
-- ``session``: one TCP connection, used once; ``reading`` says when it reads, so that other sources have their
-  turn.
-- ``stream_requests``: what the session asks the server for: handshake, rate, pause, signs of life.
+- ``session``: one TCP connection, used once. It reads when other sources had their turn and no ``backlog``
+  waits.
+- ``stream_requests``: what a session asks the server for, handshake and signs of life included, and what the
+  server should send now: at which rate, or nothing.
   ``replies`` has the commands that wait for a reply; ``rate_check`` compares the rate that arrives with the
   one that was requested.
 - ``status``: what is known about a stream, its counters and its failures. ``state`` derives one word from it.
 
-Time-outs count only the time during which this process runs (``process_clock``, ``process_timeout``). Nothing
-here knows any output.
+Time-outs count only the time during which this process runs (``process_clock``). Nothing here knows any
+output.
 """

@@ -110,7 +110,7 @@ MAX_HALVINGS: Final = 8
 """The lowest rate is 1/256 of the configured one."""
 
 
-def stream_requests(
+def request_forms(
     rate: Rate, components: Sequence[ComponentType], server_rate_hz: float | None
 ) -> list[StreamFrames]:
     """Return the StreamFrames commands to try, in order, beginning with the configured rate and components.

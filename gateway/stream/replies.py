@@ -10,8 +10,7 @@ from gateway.errors import GatewayError, ReplyTimeoutError, ServerError
 from gateway.rtc3d.commands import Command, SendParameters
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.stream.process_clock import running_clock
-from gateway.stream.process_timeout import running_timeout
+from gateway.stream.process_clock import RunningTimeout, running_clock
 from gateway.workers import WorkerThread
 
 _FURTHER_REPLY_S: Final = 0.3
@@ -96,7 +95,7 @@ class Replies:
             if wait_s <= 0:
                 raise TimeoutError
             with contextlib.suppress(TimeoutError):
-                async with running_timeout(wait_s):
+                async with RunningTimeout(wait_s):
                     await asyncio.wait({reply})
         return reply.result()
 

@@ -27,10 +27,8 @@ from gateway.rtc3d.commands import Bye, Command, StopStreaming
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import FilePiece, Packet, decode_text
-from gateway.stream.backlog import Backlog, PacedFrames
-from gateway.stream.process_clock import running_clock
-from gateway.stream.process_timeout import running_timeout
-from gateway.stream.reading import LONG_READ_BYTES, Reading
+from gateway.stream.backlog import LONG_READ_BYTES, Backlog, OnFrames, ReadClocks, Reading
+from gateway.stream.process_clock import RunningTimeout, running_clock
 from gateway.stream.replies import Replies
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection, set_socket_options
@@ -72,12 +70,6 @@ _TURN_US: Final = 2000
 _MAX_PACKETS: Final = 64
 """How many packets are processed between two readings of the clock."""
 
-OnFrames = Callable[[list[Frame], int, int], None]
-"""Takes frames that arrived together, oldest first, and when, as ``HostClock.read`` returns it."""
-
-ReadClocks = Callable[[], tuple[int, int]]
-"""Returns the time in µs since the Unix epoch and on a steady clock, as ``HostClock.read`` does."""
-
 logger = logging.getLogger(__name__)
 
 
@@ -107,9 +99,15 @@ class Session:
         self._only_events = stream.has_only_events
         self._status = status
         speed = stream.backlog_speed if stream.backlog == "all" else None
-        backlog = Backlog(on_frames, status.clock, speed, read_clocks)
-        self._frames = PacedFrames(backlog, self._set_reading, self._fail_by_defect)
         self._reading = Reading(self._process)
+        self._frames = Backlog(
+            on_frames,
+            status.clock,
+            speed,
+            read_clocks,
+            on_waiting=self._reading.set_backlog,
+            on_defect=self._fail_by_defect,
+        )
         self._files = files
         self._connect = connect
         self._read_clocks = read_clocks
@@ -176,7 +174,7 @@ class Session:
     async def wait_for_data(self, timeout_s: float) -> bool:
         """Wait for frames or No Data; return whether the server sends either."""
         with contextlib.suppress(TimeoutError):
-            async with running_timeout(timeout_s):
+            async with RunningTimeout(timeout_s):
                 while not self.has_data and self._error is None:
                     self._state_changed.clear()
                     await self._state_changed.wait()
@@ -209,7 +207,7 @@ class Session:
                 self._quiet_since_s = self._running.time()
                 continue
             with contextlib.suppress(TimeoutError):
-                async with running_timeout(wait_s):
+                async with RunningTimeout(wait_s):
                     await self._ended.wait()
 
     def _check_stall(self) -> None:
@@ -289,26 +287,24 @@ class Session:
 
     def _process(self, data: bytes, utime: int, steady_us: int) -> bool:
         """Process the bytes of one read for a limited time; return whether some of them remain."""
+        protocol = self._protocol
+        state_before = protocol.state
         try:
-            self._receive(data, utime, steady_us)
+            frames, events = protocol.receive(data, _MAX_PACKETS)
+            for event in events:
+                self._on_event(event)
+            if protocol.has_more:
+                frames += self._receive_more()
+            if protocol.state is not state_before:
+                self._report_change(state_before)
+            if frames:
+                self._quiet_since_s = self._running.tick()
+                self._status.frames_read(self._quiet_since_s)
+                self._frames.receive(frames, utime, steady_us)
         except Exception as defect:  # noqa: BLE001 - a defect ends only this session
             self._fail_by_defect(defect)
             return False
-        return self._protocol.has_more
-
-    def _receive(self, data: bytes, utime: int, steady_us: int) -> None:
-        protocol = self._protocol
-        state_before = protocol.state
-        frames, events = protocol.receive(data, _MAX_PACKETS)
-        for event in events:
-            self._on_event(event)
-        if protocol.has_more:
-            frames += self._receive_more()
-        self._report_change(state_before)
-        if frames:
-            self._quiet_since_s = self._running.time()
-            self._status.frames_read(self._quiet_since_s)
-            self._frames.receive(frames, utime, steady_us)
+        return protocol.has_more
 
     def _receive_more(self) -> list[Frame]:
         """Process further packets of the read for a limited time; return the frames among them."""
@@ -342,10 +338,6 @@ class Session:
         except Exception as defect:  # noqa: BLE001 - a defect ends only this session
             self._fail_by_defect(defect)
         self._lost.set()
-
-    def _set_reading(self, is_reading: bool) -> None:
-        """Read from the server, or let the data wait in the kernel."""
-        self._reading.set_backlog(not is_reading)
 
     def _on_event(self, event: ProtocolEvent) -> None:
         match event:

@@ -3,6 +3,7 @@
 import logging
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -14,11 +15,13 @@ from gateway.logs.safe_text import safe_text
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.client_protocol import ProtocolState
 from gateway.stream.clock import ServerClock
-from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
 
 MAX_ERROR_LENGTH: Final = 500
 """Longer error texts are cut: they may quote a server, and every status message contains the last one."""
+
+MAX_LIMITATIONS: Final = 20
+"""How many limitations of a connection are kept, and how many logged ones are remembered."""
 
 MAX_UNKNOWN_TYPES: Final = 8
 """How many types that §7.2 does not define are listed for a connection."""
@@ -64,59 +67,101 @@ class SessionNumbers:
         return self.newest
 
 
+class SourceWarnings:
+    """What the streams of a source share, so that a WARNING that concerns several of them is logged once.
+
+    ``subject`` begins those about late frames.
+    """
+
+    def __init__(self, subject: object) -> None:
+        self.newest_losses_s: dict[str, float] = {}
+        """When something was lost last on any of the streams, by cause."""
+        self.logged: deque[str] = deque(maxlen=MAX_LIMITATIONS)
+        """The limitations and repairs that were logged."""
+        self._lateness = FailureLog(logger, subject)
+        self._late: set[int] = set()
+
+    def failed(self, stream: int, text: str) -> None:
+        """Log that frames are late: as WARNING unless those of another stream are late already."""
+        self._late.add(stream)
+        self._lateness.failed(text)
+
+    def in_time(self, stream: int, text: str) -> None:
+        """Note that no frames of a stream are late any more; log it if that is so for all streams."""
+        self._late.discard(stream)
+        if not self._late:
+            self._lateness.recovered(text)
+
+
 @dataclass
 class StreamStatus:
     """The status of one stream, over all its connections.
 
     Only the methods of this class change it, except for ``clock``, which Ingest updates with every frame.
     Most methods are named after the event that they report.
-
-    ``components`` are the stream's components, separated by spaces. ``name`` begins the stream's log
-    lines. ``on_state`` is called after each change of the state, with the former one. ``parameters_version``
-    is that of the server's parameters, 0 before the first; all streams of a source have the same.
-    ``last_frame_utime`` is when the newest frame arrived, in µs since the Unix epoch, 0 before the first;
-    ``last_frame_s`` is the same on the running clock (see ``gateway.stream.process_clock``), None before the
-    first. ``connections`` counts the connections, ``tries`` the attempts to connect since the last completed
-    handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the server's time
-    or frame numbers started again within a connection. ``losses`` counts by cause what was lost before any
-    output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
-    components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the first
-    of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
-    ``known_defects`` has the defects that are logged already, and ``warnings`` what the streams of the source
-    log together. ``events`` logs what the server can cause again and again.
     """
 
     components: str
+    """The stream's components, separated by spaces."""
     name: str = ""
+    """Begins the stream's log lines."""
     on_state: Callable[[StreamState], None] = lambda _former: None
+    """Called after each change of ``state``, with the former one."""
     state: StreamState = StreamState.WAITING
+    """Derived from the connection and the protocol; see ``stream_state``."""
     byte_order: str = ""
+    """The byte order of the server's frames, big or little; "" while it is unknown."""
     rate: str = ""
+    """The rate that the server has accepted; "" for its default, or while it does not stream."""
     num_state_changes: int = 0
+    """Grows with every change of ``state``."""
     session: int = 0
+    """The number of the newest connection, in every message."""
     parameters_version: int = 0
+    """The version of the server's parameters, 0 before the first; all streams of a source have the same."""
     sessions: SessionNumbers = field(default_factory=SessionNumbers)
+    """Numbers the connections of all streams of the source."""
     frames_in: int = 0
+    """The frames that have arrived, whether they are published or skipped."""
     last_frame_utime: int = 0
+    """When the newest frame arrived, in µs since the Unix epoch; 0 before the first."""
     last_frame_s: float | None = None
+    """The same on the running clock (gateway.stream.process_clock); None before the first."""
     bytes_in: int = 0
+    """The bytes that have arrived."""
     connections: int = 0
+    """How many connections were opened."""
     tries: int = 0
+    """The attempts to connect since the last completed handshake."""
     reconnects: int = 0
+    """All attempts to connect except the first."""
     restarts: int = 0
+    """How often the server's time or frame numbers started again within a connection."""
     lag_s: float = 0.0
+    """How late the newest frame was; see ServerClock.observe."""
     clock: ServerClock = field(default_factory=ServerClock)
+    """The model of the server's clock, which Ingest updates with every frame."""
     unwanted_components: str = ""
+    """The components of the newest frame if it had none of this stream's."""
     unwanted_since_s: float = 0.0
+    """When the first of these frames arrived, on the running clock."""
     losses: Losses = field(init=False)
+    """Counts by cause what was lost before any output."""
     limitations: list[str] = field(default_factory=list)
+    """What the current connection lacks."""
     last_error: str = ""
+    """The newest error, at most MAX_ERROR_LENGTH characters; "" if there was none."""
     last_error_utime: int = 0
+    """When it happened, in µs since the Unix epoch."""
     last_error_s: float = -math.inf
+    """The same on the monotonic clock."""
     known_defects: DefectLog | None = None
+    """The defects of the source that are logged already."""
     warnings: SourceWarnings | None = None
-    _phase: Phase = field(default=Phase.WAITING, init=False)
+    """What the streams of the source log together."""
     events: EventLog = field(init=False)
+    """Logs what the server can cause again and again."""
+    _phase: Phase = field(default=Phase.WAITING, init=False)
     _failures: FailureLog = field(init=False)
     _defects: DefectLog = field(init=False)
     _unknown_types: set[int] = field(default_factory=set, init=False)  # of this connection, those listed
@@ -398,21 +443,3 @@ class StreamStatus:
             self.on_state(before)
         except Exception as defect:  # noqa: BLE001 - what shows the state must not stop the stream
             self.defect(defect)
-
-
-class FrameRate:
-    """The frame rate between two calls of ``update``."""
-
-    def __init__(self) -> None:
-        self._frames = 0
-        self._time_s = time.monotonic()
-        self.rate_hz = 0.0
-        """The rate at the last call of ``update``."""
-
-    def update(self, frames: int) -> float:
-        """Return the mean rate in Hz since the last call; ``frames`` is the number of frames so far."""
-        now_s = time.monotonic()
-        elapsed_s = now_s - self._time_s
-        self.rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0
-        self._frames, self._time_s = frames, now_s
-        return self.rate_hz

@@ -27,7 +27,7 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType, described_rate_hz
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.plan import halved, stream_requests
+from gateway.stream.plan import halved, request_forms
 from gateway.stream.process_clock import running_clock
 from gateway.stream.replies import UNANSWERED, ReadParameters
 from gateway.stream.session import Session, defect_error
@@ -42,7 +42,7 @@ class _Outcome(Enum):
     NO_ANSWER = "no answer"  # not accepted, as far as the gateway knows (field note 20)
 
 
-class StreamControl:
+class StreamRequests:
     """Controls the stream of one connected session. Use once, like the session.
 
     It is the only sender of StreamFrames, so it knows what the server was asked for last. A command that the
@@ -82,7 +82,7 @@ class StreamControl:
     async def start(self) -> None:
         """Do the handshake (§5.3.1 to §5.3.3) and request frames (§5.3.5).
 
-        Also raises RequestError if the server accepts no form of StreamFrames (see ``stream_requests``).
+        Also raises RequestError if the server accepts no form of StreamFrames (see ``request_forms``).
         """
         await self._ask_optional(Version())
         if self._source.byte_order == "little":
@@ -95,7 +95,7 @@ class StreamControl:
 
     async def request_components(self, components: Sequence[ComponentType]) -> None:
         """Request frames with these components, at the full rate. Raises RequestError as ``start`` does."""
-        await self._request_any(stream_requests(self._stream.rate, components, self._frequency_hz))
+        await self._request_any(request_forms(self._stream.rate, components, self._frequency_hz))
 
     async def request(self, halvings: int) -> bool:
         """Request frames as agreed, the rate halved ``halvings`` times; return whether the server accepts."""
@@ -256,7 +256,7 @@ _MAX_RETRY_S: Final = 30.0
 logger = logging.getLogger(__name__)
 
 
-class ChangeTasks:
+class StreamTarget:
     """Decides what the server of one session should send, and asks for it, until ``cancel``.
 
     Three facts decide: whether frames are wanted, how often their rate is to be halved, and which components
@@ -270,14 +270,14 @@ class ChangeTasks:
         stream: StreamSettings,
         status: StreamStatus,
         session: Session,
-        control: StreamControl,
+        requests: StreamRequests,
         has_subscribers: Callable[[], bool],
     ) -> None:
         self._source = source
         self._stream = stream
         self._status = status
         self._session = session
-        self._control = control
+        self._requests = requests
         self._has_subscribers = has_subscribers
         self._is_wanted = True
         self._halvings = 0  # as wanted
@@ -313,7 +313,7 @@ class ChangeTasks:
     @property
     def is_full_rate(self) -> bool:
         """Whether the server was asked for the configured rate, and for nothing less since then."""
-        return not (self._control.is_stopped or self._halvings or self._requested_halvings)
+        return not (self._requests.is_stopped or self._halvings or self._requested_halvings)
 
     def cancel(self) -> None:
         """Cancel all tasks."""
@@ -357,10 +357,10 @@ class ChangeTasks:
 
     async def _apply(self) -> bool:
         """Request what is wanted now; return False if that must be repeated."""
-        control = self._control
+        requests = self._requests
         if not self._is_wanted:
-            return control.is_stopped or await self._stop()
-        if control.is_stopped:
+            return requests.is_stopped or await self._stop()
+        if requests.is_stopped:
             self._status.events.log(
                 logging.INFO, "a subscriber appeared; frames are requested again", "demand"
             )
@@ -368,20 +368,20 @@ class ChangeTasks:
         if self._components is not None:
             components, self._components = self._components, None
             self._requested_halvings = 0
-            await control.request_components(components)
+            await requests.request_components(components)
         if self._halvings != self._requested_halvings:
             await self._change_rate()
         return True
 
     async def _stop(self) -> bool:
-        is_stopped = await self._control.stop()
+        is_stopped = await self._requests.stop()
         if is_stopped:
             self._status.events.log(logging.INFO, "no subscribers; the stream is stopped", "demand")
         return is_stopped
 
     async def _request_rate(self) -> bool:
         self._requested_halvings = self._halvings
-        return await self._control.request(self._halvings)
+        return await self._requests.request(self._halvings)
 
     async def _change_rate(self) -> None:
         """Request another rate. If the server refuses, it keeps the rate, and another one may be accepted."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, NoReturn
 
@@ -12,13 +13,14 @@ from gateway.messages.host_time import host_clock
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.stream.backlog import ReadClocks
 from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.rate_check import AnnouncedRates, RateWatch
 from gateway.stream.replies import ReadParameters
-from gateway.stream.session import FileReceiver, ReadClocks, Session, defect_error
+from gateway.stream.session import FileReceiver, Session, defect_error
 from gateway.stream.state import StreamState
-from gateway.stream.status import FrameRate, StreamStatus
-from gateway.stream.stream_requests import ChangeTasks, StreamControl
+from gateway.stream.status import StreamStatus
+from gateway.stream.stream_requests import StreamRequests, StreamTarget
 from gateway.stream.tcp import Backoff, Connect, open_connection
 
 logger = logging.getLogger(__name__)
@@ -81,8 +83,8 @@ class Supervisor:
         self._read_clocks = read_clocks
         self._listener = listener or Listener()
         self._ready_session: Session | None = None  # the newest session with a completed handshake
-        self._ingest: Ingest | None = None  # of the newest session, like _changes
-        self._changes: ChangeTasks | None = None
+        self._ingest: Ingest | None = None  # of the newest session, like _target
+        self._target: StreamTarget | None = None
         self._log_fields: dict[str, str] = {}
 
     @property
@@ -103,18 +105,18 @@ class Supervisor:
         self._log_fields["stream"] = keys
         if self._ingest is not None:
             self._ingest.want(components)
-        if self.session is not None and self._changes is not None:
-            self._changes.request_components(components)
+        if self.session is not None and self._target is not None:
+            self._target.request_components(components)
 
     def check_rate(self, announced_hz: AnnouncedRates, *, reports_sharing: bool) -> None:
         """Report frames that arrive at another rate than requested or announced. Call it once a second."""
-        if self.session is not None and self._ingest is not None and self._changes is not None:
+        if self.session is not None and self._ingest is not None and self._target is not None:
             self._rate_watch.check(
                 self.settings,
                 announced_hz,
                 self._ingest.arrivals,
                 self._read_clocks()[1] / 1e6,
-                is_full_rate=self._changes.is_full_rate,
+                is_full_rate=self._target.is_full_rate,
                 reports_sharing=reports_sharing,
             )
 
@@ -184,7 +186,7 @@ class Supervisor:
             self.status,
             self._callbacks.publish,
             self._callbacks.skip,
-            lambda halvings: changes.lateness_changed(halvings),  # noqa: PLW0108 - assigned below
+            lambda halvings: target.lateness_changed(halvings),  # noqa: PLW0108 - assigned below
             self._callbacks.on_restart,
         )
         session = Session(
@@ -196,7 +198,7 @@ class Supervisor:
             self._connect,
             self._read_clocks,
         )
-        control = StreamControl(
+        requests = StreamRequests(
             self._source,
             self.settings,
             self.status,
@@ -204,31 +206,49 @@ class Supervisor:
             self._callbacks.read_parameters,
             self._planned_components,
         )
-        changes = self._changes = ChangeTasks(
+        target = self._target = StreamTarget(
             self._source,
             self.settings,
             self.status,
             session,
-            control,
+            requests,
             lambda: self._callbacks.has_subscribers(self.settings.components),
         )
         try:
             await session.connect()
-            await control.start()
-            self._listener.connected(self, control.accepted)
+            await requests.start()
+            self._listener.connected(self, requests.accepted)
             self._ready_session = session
-            if set(control.accepted.components) not in (set(), set(self.settings.components)):
-                changes.request_components(self.settings.components)  # they changed in the meantime
-            changes.start()
-            await session.monitor(control.check_silence)
+            if set(requests.accepted.components) not in (set(), set(self.settings.components)):
+                target.request_components(self.settings.components)  # they changed in the meantime
+            target.start()
+            await session.monitor(requests.check_silence)
         finally:
-            changes.cancel()
+            target.cancel()
             await session.close()
 
     def _planned_components(self, parameters: Parameters | None) -> tuple[ComponentType, ...]:
         """Return the components to request from a server with these parameters."""
         self._listener.planning(self, parameters)
         return self.settings.components
+
+
+class FrameRate:
+    """The frame rate between two calls of ``update``."""
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._time_s = time.monotonic()
+        self.rate_hz = 0.0
+        """The rate at the last call of ``update``."""
+
+    def update(self, frames: int) -> float:
+        """Return the mean rate in Hz since the last call; ``frames`` is the number of frames so far."""
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._time_s
+        self.rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0
+        self._frames, self._time_s = frames, now_s
+        return self.rate_hz
 
 
 def component_keys(components: Sequence[ComponentType]) -> str:

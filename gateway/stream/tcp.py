@@ -15,8 +15,7 @@ from typing import Any, Final
 
 from gateway.config.settings import ReconnectSettings, SourceSettings
 from gateway.errors import FILES_ADVICE, NO_FILES, ConnectError
-from gateway.stream.process_clock import running_clock
-from gateway.stream.process_timeout import running_timeout
+from gateway.stream.process_clock import RunningTimeout, running_clock
 from gateway.workers import WorkerThread, result_of
 
 MAX_ADDRESSES: Final = 8
@@ -152,7 +151,7 @@ async def open_connection(source: SourceSettings, protocol: Any) -> asyncio.Tran
 async def _addresses(source: SourceSettings) -> list[str]:
     """Return the addresses of the source's host. Raises ConnectError if they are not found in time."""
     try:
-        async with running_timeout(source.connect_timeout_s):
+        async with RunningTimeout(source.connect_timeout_s):
             return await look_up(source.host)
     except TimeoutError:
         raise ConnectError(
@@ -176,7 +175,7 @@ async def _connect(
     server = f"{source.host}:{source.port}"
     loop = asyncio.get_running_loop()
     try:
-        async with running_timeout(timeout_s):
+        async with RunningTimeout(timeout_s):
             transport, _ = await loop.create_connection(lambda: protocol, address, source.port)
             return transport
     except TimeoutError:

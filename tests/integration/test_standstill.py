@@ -27,7 +27,7 @@ ROUNDS: Final = 3
 
 WAITER: Final = """
 import asyncio, contextlib, os, uvloop
-from gateway.stream.process_timeout import running_timeout
+from gateway.stream.process_clock import RunningTimeout
 
 async def wait_for_bytes():
     loop = asyncio.get_running_loop()
@@ -35,7 +35,7 @@ async def wait_for_bytes():
         answer = loop.create_future()
         loop.add_reader(0, lambda: answer.done() or answer.set_result(os.read(0, 1)))
         try:
-            async with running_timeout(0.1):  # less than a stop counts at most
+            async with RunningTimeout(0.1):  # less than a stop counts at most
                 print("read", await answer, flush=True)
         except TimeoutError:
             with contextlib.suppress(BlockingIOError):

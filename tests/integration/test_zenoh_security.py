@@ -8,7 +8,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from gateway.config.environment import variable_name
+from gateway.config.document import variable_name
 from tests.networks import free_port
 from tests.secure_zenoh import (
     GUIDE,

@@ -8,9 +8,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.config.environment import VARIABLE_PREFIX, variable_name
+from gateway.config.document import VARIABLE_PREFIX, Location, variable_name
 from gateway.config.settings import Settings
-from gateway.config.yaml_document import Location
 from gateway.errors import ConfigError
 from tests.configurations import load
 from tests.property.test_config_properties import PIECES, SETTINGS

@@ -13,7 +13,7 @@ from typing import Final
 
 import zenoh
 
-from gateway.config.secrets import mask_secrets_in_text
+from gateway.config.words import mask_secrets_in_text
 from gateway.errors import ConfigError
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.findings import Check, Finding, MessageLoad, counted, failing_first

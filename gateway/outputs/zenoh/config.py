@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import zenoh
 
+from gateway.config.document import line_and_column_after
 from gateway.config.files import read_file
-from gateway.config.secrets import mask_secrets_in_text
-from gateway.config.yaml_document import line_and_column_after
+from gateway.config.words import mask_secrets_in_text
 from gateway.errors import ConfigError
 
 _ZENOH_MESSAGE: Final = re.compile(

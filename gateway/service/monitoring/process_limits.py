@@ -14,6 +14,7 @@ from typing import Final
 
 from gateway.errors import FILES_ADVICE, NO_FILES
 from gateway.logs.failures import HOLD_S, FailureLog
+from gateway.stream.process_clock import RunningClock, running_clock
 from gateway.workers import thread_starts
 
 MAX_FILES: Final = 65_536
@@ -137,12 +138,17 @@ class ReservedFiles:
             pass
 
 
-_PERIOD_S: Final = 0.1
+_PERIOD_S: Final = 1.0
+"""Each measurement wakes the process, which costs as much CPU time as a frame."""
+
 _WINDOW_S: Final = 60.0
 
 
 class LoopDelay:
-    """Measures every 0.1 s how late a timer fires. Call ``start`` in the running event loop."""
+    """Measures every second how late a timer fires, and takes over longer delays from the running clock.
+
+    Call ``start`` in the running event loop.
+    """
 
     def __init__(self) -> None:
         self.last_s = 0.0
@@ -150,6 +156,7 @@ class LoopDelay:
         self._max_s = self._previous_max_s = 0.0  # of this minute and of the one before
         self._window_end_s = self._due_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
+        self._running: RunningClock | None = None  # set by ``start``
 
     @property
     def max_s(self) -> float:
@@ -158,6 +165,7 @@ class LoopDelay:
 
     def start(self) -> None:
         """Start measuring."""
+        self._running = running_clock()
         self._window_end_s = time.monotonic() + _WINDOW_S
         self._schedule()
 
@@ -182,4 +190,6 @@ class LoopDelay:
     def _measure(self) -> None:
         now_s = time.monotonic()
         self.record(now_s, max(0.0, now_s - self._due_s))  # uvloop's timers may be up to 1 ms early
+        if self._running is not None:
+            self._max_s = max(self._max_s, self._running.longest_delay_s(2 * _PERIOD_S))
         self._schedule()

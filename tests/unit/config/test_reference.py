@@ -22,7 +22,7 @@ from gateway.config.settings import (
     StreamSettings,
 )
 from gateway.config.show import schema_text
-from gateway.config.transform import RollPitchYaw, TransformSettings
+from gateway.config.values import RollPitchYaw, TransformSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lsl.settings import LslSettings

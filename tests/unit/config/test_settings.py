@@ -5,8 +5,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from gateway.config.settings import SourceSettings
-from gateway.config.transform import TransformSettings
-from gateway.config.values import SourceName
+from gateway.config.values import SourceName, TransformSettings
 from gateway.config.words import describe
 from gateway.messages import topics
 from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 import yaml
 
-from gateway.config.environment import variable_name
-from gateway.config.secrets import find_secrets, mask_secrets
+from gateway.config.document import variable_name
 from gateway.config.show import shown_configuration
+from gateway.config.words import find_secrets, mask_secrets
 from gateway.errors import ConfigError
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.output import ZenohOutput

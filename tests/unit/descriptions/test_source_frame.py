@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gateway.config.settings import SourceSettings
-from gateway.config.transform import TransformSettings, Unit
+from gateway.config.values import TransformSettings, Unit
 from gateway.descriptions.source_frame import source_frame
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import metres_per_unit

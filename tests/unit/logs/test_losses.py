@@ -4,7 +4,8 @@ import logging
 
 import pytest
 
-from gateway.logs.losses import MAX_HOLD_S, MIN_HOLD_S, Losses, last_minute_text
+from gateway.logs.limits import HOLD_S, MAX_HOLD_S
+from gateway.logs.losses import Losses, last_minute_text
 from tests.losses import amounts
 from tests.settable_clock import Clock
 
@@ -86,7 +87,7 @@ def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
         losses.check()
         clock.now_s += 0.01
     assert logged(caplog) == ["WARNING lab: start zenohd"]
-    clock.now_s += MIN_HOLD_S - 0.1
+    clock.now_s += HOLD_S - 0.1
     losses.check()
     assert logged(caplog) == []
     clock.now_s += 0.1
@@ -156,7 +157,7 @@ def test_loss_that_comes_and_goes_does_not_fill_the_log(
     clock.now_s += MAX_HOLD_S
     logged(caplog)
     losses.lost("no router", "start zenohd")
-    clock.now_s += MIN_HOLD_S
+    clock.now_s += HOLD_S
     losses.check()
     assert len(logged(caplog)) == 2  # after a long pause, the wait is short again
 

@@ -12,8 +12,8 @@ from gateway.messages.encode import Stamp, encode_message, with_sequence
 from gateway.outputs.contract import Answer
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.registry import OUTPUTS
-from gateway.queries.parameter_cache import ParameterRefresh
 from gateway.queries.questions import Question
+from gateway.queries.server_requests import ParameterRefresh
 from gateway.queries.service import SourceQueryService
 from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import ComponentType

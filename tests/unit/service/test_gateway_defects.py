@@ -9,7 +9,7 @@ import pytest
 from gateway.config.settings import SourceSettings
 from gateway.logs.failures import current_log_fields
 from gateway.publish.fan_out import FanOut
-from gateway.queries.parameter_cache import ParameterRefresh
+from gateway.queries.server_requests import ParameterRefresh
 from gateway.rtc3d.client_protocol import ClientProtocol
 from gateway.rtc3d.components import ComponentType
 from gateway.service.source import Source
@@ -68,7 +68,7 @@ DEFECTS = [
     *((StreamStatus, name) for name in ("disconnected", "connecting", "reconnecting", "check")),
     *((Source, name) for name in ("publish_status", "_status_message", "_read_parameters", "_on_state")),
     *((FanOut, name) for name in ("publish", "publish_clock", "check_losses")),
-    *((Session, name) for name in ("_receive", "_report_change", "close")),
+    *((Session, name) for name in ("_on_event", "_report_change", "close")),
     *((AutomaticStreams, "check"), (Supervisor, "check_rate"), (ParameterRefresh, "_due_s")),
     *((Ingest, "receive"), (ClientProtocol, "receive")),
 ]

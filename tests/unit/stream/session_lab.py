@@ -13,7 +13,7 @@ from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.replies import Connection as ClientConnection
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
-from gateway.stream.stream_requests import ChangeTasks, StreamControl
+from gateway.stream.stream_requests import StreamRequests, StreamTarget
 from tests.servers import packet
 from tests.unit.stream.scripted_server import Answer, Connection, ScriptedServer, obliging, read_parameters
 from tests.virtual_time import EPOCH_UTIME, read_clocks
@@ -61,8 +61,8 @@ class Lab:
         stream = StreamSettings.model_validate({"components": ["3d"]} | of_stream)
         common = source, stream, self.status
         self.session = Session(*common, self._on_frames, self.files, self.server.connect, self._read_clocks)
-        self.control = StreamControl(*common, self.session, self._read_parameters)
-        self.changes = ChangeTasks(*common, self.session, self.control, self._ask_for_subscribers)
+        self.control = StreamRequests(*common, self.session, self._read_parameters)
+        self.changes = StreamTarget(*common, self.session, self.control, self._ask_for_subscribers)
 
     def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         assert utime == EPOCH_UTIME + steady_us

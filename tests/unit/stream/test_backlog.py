@@ -1,12 +1,12 @@
-"""The pace of a backlog, on a clock that only the tests advance.
+"""The pace of a backlog, which frames are published at once, and when reading from the server is paused."""
 
-Which frames are passed on at once, and when reading from the server is paused.
-"""
+import asyncio
+from typing import cast
 
 import pytest
 
 from gateway.rtc3d.frames import Frame, split_frame
-from gateway.stream.backlog import MAX_TOGETHER, Backlog, PacedFrames
+from gateway.stream.backlog import MAX_TOGETHER, Backlog
 from gateway.stream.clock import ServerClock
 from gateway.stream.process_clock import running_clock
 from tests.servers import markers_frame
@@ -25,7 +25,10 @@ def frames(count: int, first_ms: int = 0, step_ms: int = 1) -> list[Frame]:
 
 
 class Subscriber:
-    """A backlog and its clock. ``published`` has each frame's number, and when it was published, in s."""
+    """A backlog on a clock that only the tests advance, and without timers: ``run`` calls instead of them.
+
+    ``published`` has each frame's number, and when it was published, in s.
+    """
 
     def __init__(self, speed: float | None = 2.0) -> None:
         self.now_s = 100.0
@@ -34,7 +37,8 @@ class Subscriber:
         self.published: list[tuple[int, float]] = []
         self.clock = ServerClock()
         self.clock.has_clock = True
-        self.backlog = Backlog(self._publish, self.clock, speed, self.read_clocks)
+        self.backlog = Backlog(self._publish, self.clock, speed, self.read_clocks, print, print)
+        self.backlog._timer = cast("asyncio.Handle", self)
 
     def read_clocks(self) -> tuple[int, int]:
         """Do the same as HostClock.read."""
@@ -48,11 +52,11 @@ class Subscriber:
             self.now_s += self.costs_s
 
     def arrive(self, arrived: list[Frame]) -> None:
-        self.backlog.add(arrived, *self.read_clocks())
+        self.backlog.receive(arrived, *self.read_clocks())
 
     def run(self, late_s: float = 0.0) -> None:
         """Publish everything that waits, with every call ``late_s`` later than asked for."""
-        while (wait_s := self.backlog.publish_due()) is not None:
+        while (wait_s := self.backlog._publish_due()) is not None:
             self.now_s += max(wait_s, 1e-6) + late_s  # the clock has whole µs
 
     @property
@@ -87,7 +91,7 @@ def test_the_pace_continues_from_one_read_to_the_next() -> None:
 def test_frames_that_arrive_while_others_wait_follow_them() -> None:
     subscriber = Subscriber()
     subscriber.arrive(frames(20))
-    subscriber.backlog.publish_due()
+    subscriber.backlog._publish_due()
     subscriber.arrive(frames(20, 20))
     subscriber.run()
     assert subscriber.numbers == list(range(40))
@@ -109,13 +113,13 @@ def test_a_stream_that_arrives_in_batches_is_not_delayed() -> None:
 def test_a_pace_ends_after_half_a_second_without_a_backlog(pause_s: float, *, continues: bool) -> None:
     """Later frames begin a new pace: the first is due at once, and so is the one after it."""
     subscriber = Subscriber(speed=1.0)
-    subscriber.arrive(frames(2))
+    subscriber.arrive(frames(5))
     subscriber.run()
-    subscriber.now_s = 100.001 + pause_s
-    subscriber.arrive(frames(40, 2))
-    subscriber.backlog.publish_due()
+    subscriber.now_s = 100.004 + pause_s
+    subscriber.arrive(frames(40, 5))
+    subscriber.backlog._publish_due()
     late_ms = 15  # what a continued pace makes up for
-    assert (len(subscriber.numbers) - 2 > late_ms) is continues
+    assert (len(subscriber.numbers) - 5 > late_ms) is continues
 
 
 def test_a_stream_as_fast_as_the_gateway_is_never_throttled() -> None:
@@ -143,10 +147,10 @@ def test_a_second_stop_does_not_lead_to_a_burst(costs_s: float, at_once: int) ->
     subscriber = Subscriber()
     subscriber.costs_s = costs_s
     subscriber.arrive(frames(1000))
-    subscriber.backlog.publish_due()
+    subscriber.backlog._publish_due()
     subscriber.now_s += 5.0
     before = len(subscriber.published)
-    subscriber.backlog.publish_due()
+    subscriber.backlog._publish_due()
     assert len(subscriber.published) - before <= at_once
 
 
@@ -180,11 +184,8 @@ def test_unusual_time_stamps_never_cost_more_than_5_ms(timestamps_ms: list[int])
 def test_frames_without_components_have_no_time() -> None:
     subscriber = Subscriber()
     empty = split_frame(bytes(4), "big")
-    subscriber.backlog = Backlog(
-        lambda published, _utime, _steady_us: subscriber.published.extend((-1, 0.0) for _ in published),
-        subscriber.clock,
-        2.0,
-        subscriber.read_clocks,
+    subscriber.backlog._publish = lambda published, _utime, _steady_us: subscriber.published.extend(
+        (-1, 0.0) for _ in published
     )
     subscriber.arrive([empty] * 10)
     subscriber.run()
@@ -205,7 +206,7 @@ def test_one_call_publishes_only_for_a_while() -> None:
     subscriber.clock.has_clock = False
     subscriber.costs_s = 0.02 * MS
     subscriber.arrive(frames(1000))
-    assert subscriber.backlog.publish_due() == 0.0
+    assert subscriber.backlog._publish_due() == 0.0
     assert 100 <= len(subscriber.published) <= 100 + 64
 
 
@@ -215,11 +216,11 @@ def test_one_call_publishes_few_frames_that_take_long(costs_ms: float, in_one_ca
     subscriber = Subscriber()
     subscriber.clock.has_clock = False
     subscriber.costs_s = costs_ms * MS
-    subscriber.backlog.publish(frames(1), *subscriber.read_clocks())
+    subscriber.arrive(frames(1))
     subscriber.arrive(frames(100, 1))
     for first in range(1, 65, in_one_call):
         subscriber.published.clear()
-        assert subscriber.backlog.publish_due() == 0.0
+        assert subscriber.backlog._publish_due() == 0.0
         assert subscriber.numbers == list(range(first, first + in_one_call))
 
 
@@ -228,58 +229,43 @@ def test_late_frames_that_are_skipped_come_in_large_chunks_although_the_last_one
     subscriber.costs_s = 7.0 * MS
     subscriber.arrive(frames(200))
     for end in (64, 128):
-        assert subscriber.backlog.publish_due() == 0.0
+        assert subscriber.backlog._publish_due() == 0.0
         assert len(subscriber.published) == end
 
 
-def test_what_waits_can_be_hurried_and_dropped() -> None:
-    subscriber = Subscriber()
-    subscriber.arrive(frames(1000))
-    subscriber.backlog.publish_due()
-    assert 0 < len(subscriber.published) < 1000
-    subscriber.backlog.hurry()
-    assert subscriber.backlog.publish_due() is None
-    assert subscriber.numbers == list(range(1000))
-    subscriber.arrive(frames(1000))
-    subscriber.backlog.clear()
-    assert subscriber.backlog.is_empty
-    assert subscriber.backlog.publish_due() is None
-    assert len(subscriber.published) == 1000
-
-
 class Lab:
-    """Paced frames, and what they call. ``numbers`` are those of the frames that were passed on."""
+    """A backlog on the event loop, and what it calls. ``numbers`` are those of the published frames."""
 
     def __init__(self, *, has_pace: bool = True, frame_s: float = 0.0) -> None:
         self.frame_s = frame_s
-        """How long it takes to pass on a frame."""
+        """How long it takes to publish a frame."""
         clock = ServerClock()
         clock.has_clock = has_pace
-        backlog = Backlog(self._on_frames, clock, 2.0, read_clocks)
         self.numbers: list[int] = []
-        self.reading: list[bool] = []
+        self.waiting: list[bool] = []
         self.defects: list[Exception] = []
         self.defect: Exception | None = None
-        """What passing frames on raises."""
-        self.paced = PacedFrames(backlog, self.reading.append, self.defects.append)
+        """What publishing frames raises."""
+        self.backlog = Backlog(
+            self._on_frames, clock, 2.0, read_clocks, self.waiting.append, self.defects.append
+        )
 
     def _on_frames(self, passed: list[Frame], _utime: int, _steady_us: int) -> None:
         if self.defect is not None:
             raise self.defect
         self.numbers += [each.number_and_timestamp[0] for each in passed]
         stop_process(self.frame_s * len(passed))
-        stop_process(self.frame_s * len(passed))
 
     def receive(self, count: int, first: int = 0) -> None:
-        self.paced.receive(frames(count, first), *read_clocks())
+        self.backlog.receive(frames(count, first), *read_clocks())
 
 
 async def test_a_few_frames_together_are_passed_on_at_once() -> None:
     lab = Lab()
     lab.receive(MAX_TOGETHER)
     assert lab.numbers == list(range(MAX_TOGETHER))
-    assert lab.reading == []
-    assert lab.paced.caught_up_s == 0.0
+    assert lab.waiting == []
+    assert lab.backlog.caught_up_s == 0.0
 
 
 async def test_a_few_frames_that_take_long_are_passed_on_one_by_one() -> None:
@@ -287,8 +273,8 @@ async def test_a_few_frames_that_take_long_are_passed_on_one_by_one() -> None:
     lab = Lab(has_pace=False, frame_s=0.007)
     lab.receive(1)
     lab.receive(2, first=1)
-    assert (lab.numbers, lab.reading) == ([0, 1], [False])
-    await until(lambda: lab.reading[-1])
+    assert (lab.numbers, lab.waiting) == ([0, 1], [True])
+    await until(lambda: not lab.waiting[-1])
     assert lab.numbers == [0, 1, 2]
 
 
@@ -296,17 +282,17 @@ async def test_reading_is_paused_until_a_backlog_is_passed_on() -> None:
     lab = Lab()
     lab.receive(1000)
     assert 0 < len(lab.numbers) < 1000
-    assert lab.reading == [False]
-    await until(lambda: lab.reading[-1])
+    assert lab.waiting == [True]
+    await until(lambda: not lab.waiting[-1])
     assert lab.numbers == list(range(1000))
-    assert running_clock().time() - lab.paced.caught_up_s < 0.02
+    assert running_clock().time() - lab.backlog.caught_up_s < 0.02
 
 
 async def test_frames_that_arrive_during_a_backlog_wait_behind_it() -> None:
     lab = Lab()
     lab.receive(1000)
     lab.receive(1, first=1000)
-    await until(lambda: lab.reading[-1])
+    await until(lambda: not lab.waiting[-1])
     assert lab.numbers == list(range(1001))
 
 
@@ -314,14 +300,14 @@ async def test_without_a_pace_frames_wait_only_for_their_turn() -> None:
     lab = Lab(has_pace=False)
     lab.receive(1000)
     assert lab.numbers == list(range(1000))
-    assert lab.reading == [True]
-    assert lab.paced.is_empty
+    assert lab.waiting == [False]
+    assert lab.backlog.is_empty
 
 
 async def test_finishing_passes_on_everything_and_what_follows_at_once() -> None:
     lab = Lab()
     lab.receive(1000)
-    lab.paced.finish()
+    lab.backlog.finish()
     assert lab.numbers == list(range(1000))
     lab.receive(1000, first=1000)
     assert lab.numbers == list(range(2000))

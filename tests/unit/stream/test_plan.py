@@ -28,7 +28,7 @@ from gateway.stream.plan import (
     announced_rates_hz,
     halved,
     plan_streams,
-    stream_requests,
+    request_forms,
 )
 
 MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
@@ -123,7 +123,7 @@ TWO = (ComponentType.MARKERS, ComponentType.TOOLS)
 
 
 def texts(rate: Rate, components: Sequence[ComponentType], server_rate_hz: float | None) -> list[str]:
-    return [str(request) for request in stream_requests(rate, components, server_rate_hz)]
+    return [str(request) for request in request_forms(rate, components, server_rate_hz)]
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,7 @@ import asyncio
 
 import pytest
 
-from gateway.stream.process_clock import running_clock
-from gateway.stream.process_timeout import running_timeout
+from gateway.stream.process_clock import RunningTimeout, running_clock
 from tests.virtual_time import stop_process
 
 
@@ -60,6 +59,17 @@ async def test_the_longest_delay_of_the_last_half_minute_is_known() -> None:
     assert clock.longest_delay_s() == 0
 
 
+async def test_callbacks_that_tick_save_the_timer_all_its_wake_ups() -> None:
+    """At 200 Hz, its ten wake-ups a second would cost 5 % more."""
+    clock, timers = running_clock(), set()
+    for _ in range(200):
+        await asyncio.sleep(0.005)
+        clock.tick()
+        timers.add(clock._timer)
+    assert all(timer.cancelled() for timer in timers - {clock._timer})
+    assert len(timers) <= 1 + 1.0 / 0.05
+
+
 async def test_each_event_loop_has_one_clock() -> None:
     clock = running_clock()
     assert running_clock() is clock
@@ -74,14 +84,14 @@ async def test_each_event_loop_has_one_clock() -> None:
 async def test_a_timeout_ends_after_its_time() -> None:
     began_s = now_s()
     with pytest.raises(TimeoutError):
-        async with running_timeout(2.0):
+        async with RunningTimeout(2.0):
             await asyncio.sleep(10)
     assert now_s() - began_s == pytest.approx(2.0, abs=0.01)
 
 
 async def test_what_ends_in_time_is_not_disturbed_and_its_errors_are_raised() -> None:
     async def fail() -> None:
-        async with running_timeout(2.0):
+        async with RunningTimeout(2.0):
             await asyncio.sleep(1.9)
             raise ZeroDivisionError
 
@@ -93,7 +103,7 @@ async def test_what_ends_in_time_is_not_disturbed_and_its_errors_are_raised() ->
 async def test_a_stop_of_the_process_is_not_part_of_a_timeout() -> None:
     async def wait() -> float:
         with pytest.raises(TimeoutError):
-            async with running_timeout(2.0):
+            async with RunningTimeout(2.0):
                 await asyncio.sleep(100)
         return now_s()
 

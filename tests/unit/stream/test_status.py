@@ -8,9 +8,9 @@ import pytest
 from gateway.errors import ClosedError, LinkError
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.client_protocol import ProtocolState
-from gateway.stream.source_warnings import MAX_LIMITATIONS, SourceWarnings
 from gateway.stream.state import Phase, StreamState, stream_state
-from gateway.stream.status import MAX_ERROR_LENGTH, FrameRate, StreamStatus
+from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, SourceWarnings, StreamStatus
+from gateway.stream.supervisor import FrameRate
 from tests.losses import amounts
 
 SERVER = "192.0.2.20:3020"
@@ -123,7 +123,7 @@ def test_limitations_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
 @pytest.mark.interpreted
 def test_the_frame_rate_is_exact_and_zero_if_no_time_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([10.0, 12.0, 12.0, 13.0])
-    monkeypatch.setattr("gateway.stream.status.time", SimpleNamespace(monotonic=clock.__next__))
+    monkeypatch.setattr("gateway.stream.supervisor.time", SimpleNamespace(monotonic=clock.__next__))
     rate = FrameRate()
     assert [rate.update(frames) for frames in (100, 150, 170)] == [50.0, 0.0, 20.0]
 

@@ -17,7 +17,7 @@ import uvloop
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
 from gateway.stream import tcp
-from gateway.stream.process_timeout import running_timeout
+from gateway.stream.process_clock import RunningTimeout
 from gateway.stream.tcp import MAX_ADDRESSES, is_address, look_up, open_connection, set_socket_options
 from tests.networks import free_port
 from tests.unit.stream.conftest import Resolver
@@ -214,9 +214,9 @@ def test_an_address_that_does_not_answer_leaves_time_for_the_next(
 
     def noted(seconds: float) -> Any:
         limits_s.append(seconds)
-        return running_timeout(seconds)
+        return RunningTimeout(seconds)
 
-    monkeypatch.setattr(tcp, "running_timeout", noted)
+    monkeypatch.setattr(tcp, "RunningTimeout", noted)
     resolver.addresses = ["127.0.0.1", "127.0.0.3"]
     with full_server() as port, socket.create_server(("127.0.0.3", port)):
         assert uvloop.run(connected_address(port, 0.4)) == "127.0.0.3"

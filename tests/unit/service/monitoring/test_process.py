@@ -28,7 +28,7 @@ async def test_a_blocked_event_loop_is_measured() -> None:
     delay = LoopDelay()
     delay.start()
     await asyncio.sleep(0)
-    time.sleep(0.3)  # noqa: ASYNC251 - blocks the loop on purpose, 0.2 s past the timer
+    time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop on purpose, between two measurements
     await wait_until_async(lambda: delay.max_s >= 0.2)
     delay.close()
 

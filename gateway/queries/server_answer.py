@@ -1,8 +1,8 @@
-"""The parameters of one source's server as the gateway knows them, and their version."""
+"""What a server answers to SendParameters: the XML, what it says, and how it differs from before."""
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -101,125 +101,26 @@ def unreadable(
     return ServerAnswer(sections, xml[:MAX_XML_BYTES], parsed, session, version, is_readable=False)
 
 
-Announce = Callable[[ServerAnswer | None, int], Awaitable[None]]
-"""Takes new parameters, None if the former ones are void, and their version.
-
-Publishes them, and then marks the frames that follow with the version.
-"""
-
-
 class QueryHistory:
     """What queries about a source continue when the source is built again, after a reload or a defect.
 
-    See KnownParameters and Recordings.
+    See ParameterCache and Recordings.
     """
 
     def __init__(self, source: str) -> None:
         self.events = EventLog(logger, source)
+        """Logs changes of the parameters."""
         self.newest: ServerAnswer | None = None
-        self.version = 0
-        self.is_named_recording = False
-        self.end_of_recording: asyncio.Task[None] | None = None
-
-
-class KnownParameters:
-    """The newest parameters of one source's server.
-
-    ``xml_thread`` parses them. The version grows by one whenever they mean something else than before, when
-    they become void, and when another frame of poses goes with them.
-    """
-
-    def __init__(self, history: QueryHistory, xml_thread: XmlThread, announce: Announce) -> None:
-        self._history = history
-        self._events = history.events
-        self._xml_thread = xml_thread
-        self._announce = announce
-        self._lock = asyncio.Lock()  # for one change at a time
-
-    @property
-    def newest(self) -> ServerAnswer | None:
         """The newest answer for all sections; None before the first, and while the former ones are void."""
-        return self._history.newest
-
-    @property
-    def version(self) -> int:
+        self.version = 0
         """The version of ``newest``; 0 before the first."""
-        return self._history.version
-
-    @property
-    def is_void(self) -> bool:
-        """Whether there were parameters, and the server gives none now."""
-        return self.newest is None and self.version > 0
-
-    async def take(self, xml: bytes, session: int, *, announce_always: bool = False) -> ServerAnswer:
-        """Keep an answer for all sections, and announce it if it means something else than the former one.
-
-        Raises ParametersError if nothing can be read from it; then nothing changes.
-        """
-        async with self._lock:
-            before = self.newest
-            reading = await self._xml_thread.process(xml, lambda xml: _read(xml, before))
-            if reading.is_changed:
-                self._history.version += 1
-                self._log_change(reading, is_first=before is None)
-            self._history.newest = answer = ServerAnswer((), xml, reading.parsed, session, self.version)
-            if reading.is_changed or announce_always:
-                await self._announce(answer, self.version)
-            return answer
-
-    async def share(self, session: int) -> None:
-        """Announce the newest parameters again, for a new connection to the same server."""
-        async with self._lock:
-            if self.newest is not None:
-                self._history.newest = replace(self.newest, session=session)
-                await self._announce(self.newest, self.version)
-
-    async def begin_version(self) -> None:
-        """Announce the parameters as another version, because they go with another frame of poses now."""
-        async with self._lock:
-            self._history.version += 1
-            if self.newest is not None:
-                self._history.newest = replace(self.newest, version=self.version)
-            await self._announce(self.newest, self.version)
-
-    async def make_void(self, reason: str) -> None:
-        """Forget the parameters, because the server does not give any now (field note 23)."""
-        async with self._lock:
-            if self.newest is None:
-                return
-            self._history.newest = None
-            self._history.version += 1
-            self._events.log(
-                logging.WARNING,
-                f"the server gives no parameters any more: {reason}; the former names and units are void "
-                f"(parameters_version {self.version})",
-                "void",
-            )
-            await self._announce(None, self.version)
-
-    def _log_change(self, reading: "_Reading", *, is_first: bool) -> None:
-        if is_first:
-            if self.version > 1:
-                text = f"the server gives parameters again (parameters_version {self.version})"
-                self._events.log(logging.INFO, text, "given again")
-            return
-        if reading.renamed:
-            self._events.log(
-                logging.WARNING,
-                f"markers or tools were renamed on the server: {reading.renamed}; programs that use the "
-                f"names need the new ones (parameters_version {self.version})",
-                "renamed",
-            )
-        if reading.changed_sections:
-            sections = ", ".join(reading.changed_sections)
-            self._events.log(
-                logging.INFO,
-                f"the server's parameters changed: {sections} (parameters_version {self.version})",
-                "changed",
-            )
+        self.is_named_recording = False
+        """Whether a command with a name started the recording, so a command has to stop it."""
+        self.end_of_recording: asyncio.Task[None] | None = None
+        """Waits for the end of its duration, if it has one."""
 
 
-class _Reading(NamedTuple):
+class Reading(NamedTuple):
     """Parsed parameters, and how they differ from the former ones."""
 
     parsed: ParsedParameters
@@ -228,15 +129,15 @@ class _Reading(NamedTuple):
     changed_sections: Sequence[str] = ()
 
 
-def _read(xml: bytes, before: ServerAnswer | None) -> _Reading:
+def read_parameters(xml: bytes, before: ServerAnswer | None) -> Reading:
     """Parse XML and compare it with the former answer. It runs in a thread."""
     if before is None:
-        return _Reading(parse_parameters(xml), True)
+        return Reading(parse_parameters(xml), True)
     old = before.parsed
     if differ_in_statistics_only(before.xml, xml):
-        return _Reading(_with_statistics(old, xml), False)
+        return Reading(_with_statistics(old, xml), False)
     parsed = parse_parameters(xml)
-    return _Reading(
+    return Reading(
         parsed,
         without_statistics(parsed.parameters) != without_statistics(old.parameters),
         describe_renames(old.parameters, parsed.parameters),
