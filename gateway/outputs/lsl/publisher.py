@@ -128,13 +128,7 @@ class LslFramePublisher:
                 self._append(functools.partial(self.streams.open_for, more), 0)
         return self.wants(num_items)
 
-    def publish(
-        self,
-        frame: Frame,
-        stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - LSL has none
-        components: frozenset[ComponentType],
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Queue a frame. Raises OutputError if too many wait, or if receivers wait for LSL to come back."""
         if self._is_closed:
             raise OutputError("LSL is closed; ask for a new publisher", cause="closed")

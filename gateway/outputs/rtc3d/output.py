@@ -57,13 +57,7 @@ class Rtc3dPublisher:
         """See FramePublisher."""
         return self.wanted
 
-    def publish(
-        self,
-        frame: Frame,
-        stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - frames keep the server's own numbers
-        components: frozenset[ComponentType],
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand a frame over. Raises OutputError if too many wait."""
         if self._is_closed:
             raise OutputError(

@@ -77,7 +77,6 @@ class VrpnPublisher:
         self,
         frame: Frame,
         stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - VRPN has no sequence numbers
         components: frozenset[ComponentType],  # noqa: ARG002 - see ``prepare``
     ) -> None:
         """Hand over a frame with tools. Raises OutputError if too many wait, or if the unit is unknown."""

@@ -335,7 +335,7 @@ class Publisher(Streams):
         return is_wanted
 
     def publish(self, *components: bytes) -> None:
-        self.publisher.publish(frame_of(*components), STAMP, 0, ALL)
+        self.publisher.publish(frame_of(*components), STAMP, ALL)
 
 
 @pytest.fixture

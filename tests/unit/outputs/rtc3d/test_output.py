@@ -258,7 +258,7 @@ async def test_frames_are_handed_over_while_any_client_wants_some() -> None:
     for wanted in (False, True):
         server.state.wanted = wanted
         assert publisher.wants(COMPONENTS) is publisher.prepare(FRAME.layout, COMPONENTS) is wanted
-        publisher.publish(FRAME, stamp, 1, COMPONENTS)
+        publisher.publish(FRAME, stamp, COMPONENTS)
     await settle()
     assert server.taken == [(5, COMPONENTS)]
     assert output._thread is not None
@@ -266,13 +266,13 @@ async def test_frames_are_handed_over_while_any_client_wants_some() -> None:
     Thread.is_full = True
     for cause in (QUEUE_FULL, "closed"):
         with pytest.raises(OutputError) as caught:
-            publisher.publish(FRAME, stamp, 3, COMPONENTS)
+            publisher.publish(FRAME, stamp, COMPONENTS)
         assert caught.value.cause == cause
         publisher.close()
     assert not publisher.wants(COMPONENTS)
     unstarted = Rtc3dOutput(settings({"lab": LAB}))
     unstarted._state("lab").wanted = True
-    unstarted.frame_publisher("lab").publish(FRAME, stamp, 1, COMPONENTS)
+    unstarted.frame_publisher("lab").publish(FRAME, stamp, COMPONENTS)
 
 
 async def test_a_defect_in_one_frame_does_not_end_the_thread() -> None:
