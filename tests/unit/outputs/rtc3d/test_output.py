@@ -13,6 +13,7 @@ from gateway.errors import GatewayError, OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON
 from gateway.messages.encode import Stamp
+from gateway.outputs import frame_output
 from gateway.outputs.contract import CONTROL_OPTION, Answer, ServerFile, ServerParameters
 from gateway.outputs.rtc3d import output as output_module
 from gateway.outputs.rtc3d.live_server import SourceState
@@ -82,6 +83,9 @@ class Server:
     def apply_state(self) -> None:
         self.num_applied += 1
 
+    def set_max_clients(self, max_clients: int) -> None:
+        self.max_clients = max_clients
+
     def maintain(self) -> None:
         self.num_maintained += 1
 
@@ -101,7 +105,7 @@ def _scripted(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Server, name, value, raising=False)
     monkeypatch.setattr(Thread, "is_full", False)
     monkeypatch.setattr(output_module, "LiveServer", Server)
-    monkeypatch.setattr(output_module, "LoopThread", Thread)
+    monkeypatch.setattr(frame_output, "LoopThread", Thread)
 
 
 def settings(ports: Mapping[str, int], **values: Any) -> Rtc3dSettings:
@@ -270,9 +274,6 @@ async def test_frames_are_handed_over_while_any_client_wants_some() -> None:
         assert caught.value.cause == cause
         publisher.close()
     assert not publisher.wants(COMPONENTS)
-    unstarted = Rtc3dOutput(settings({"lab": LAB}))
-    unstarted._state("lab").wanted = True
-    unstarted.frame_publisher("lab").publish(FRAME, stamp, COMPONENTS)
 
 
 async def test_a_defect_in_one_frame_does_not_end_the_thread() -> None:
