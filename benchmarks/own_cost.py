@@ -23,7 +23,6 @@ from benchmarks.workloads import DENSE, Frames
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
-from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway
@@ -31,6 +30,7 @@ from gateway.simulator.simulator import Simulator
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from tests.configurations import make_settings
+from tests.memory_output import MemoryOutput
 from tests.waiting import wait_until_async
 
 TITLE: Final = "The gateway's own CPU time per frame of five components, from received bytes to messages"

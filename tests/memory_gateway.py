@@ -5,9 +5,9 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from gateway.messages.decode import decode
-from gateway.outputs.memory import MemoryOutput
 from gateway.service.gateway import Gateway
 from tests.configurations import local_settings, local_source
+from tests.memory_output import MemoryOutput
 from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
 

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final, TypeVar
 
 from gateway.config.settings import OutputSettings
-from gateway.errors import GatewayError
+from gateway.errors import PortError
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import IgnoringPublisher, Output, Publisher
@@ -84,13 +84,13 @@ class PortOpener:
     async def open(self, attempt: Callable[[], Awaitable[_Result]], opened: str) -> _Result:
         """Return what ``attempt`` returns once it does not raise, and log ``opened``.
 
-        ``attempt`` raises GatewayError, which says what to do, if the port cannot be used.
+        ``attempt`` raises PortError, which says what to do, if the port cannot be used.
         """
         delay_s = _FIRST_RETRY_S
         while True:
             try:
                 result = await attempt()
-            except GatewayError as error:
+            except PortError as error:
                 self.problem = str(error)
                 self._failures.failed(self.problem)
             except Exception as defect:  # noqa: BLE001 - the next attempt may succeed

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
-from gateway.errors import GatewayError, system_reason
+from gateway.errors import PortError, system_reason
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.client_connection import LIMITS, ClientConnection, SentCounts
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
@@ -103,7 +103,7 @@ class RtServer:
     async def start(self) -> None:
         """Listen, and start the measurement unless it waits for the first request for frames.
 
-        Raises GatewayError if the server cannot listen on the address.
+        Raises PortError if the server cannot listen on the address.
         """
         await self.listen()
         self._starts_on_request = self._once
@@ -111,12 +111,12 @@ class RtServer:
             self.start_measurement()
 
     async def listen(self) -> None:
-        """Listen for clients. Raises GatewayError if that is not possible on the address."""
+        """Listen for clients. Raises PortError if that is not possible on the address."""
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: ClientConnection(self), self.host, self.port)
         except OSError as error:
-            raise GatewayError(
+            raise PortError(
                 f"{self.name}: cannot listen on {self.host}, port {self.port}: {system_reason(error)}; "
                 "choose an address of this machine and a free port"
             ) from error

@@ -13,7 +13,6 @@ from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -21,6 +20,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from tests.lcm_relay import LcmRelay
+from tests.memory_output import MemoryOutput
 from tests.needs import need_programs
 from tests.networks import (
     add_multicast_route,

@@ -15,7 +15,6 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode, to_json
 from gateway.messages.summary import summarise
 from gateway.messages.texts import encode_within_limits
-from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
@@ -24,6 +23,7 @@ from gateway.stream.ingest import Ingest
 from gateway.stream.rate_check import RateWatch
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from tests.memory_output import MemoryOutput
 
 EDGES = [edge + near for edge in (-(2**63), -(2**32), 0, 2**31, 2**32, 2**53, 2**62) for near in (-1, 0, 1)]
 timestamps_us = st.sampled_from([edge for edge in [*EDGES, 2**63 - 1] if edge >= -(2**63)]) | st.integers(

@@ -7,9 +7,7 @@ from typing import Any, Final
 
 from gateway.outputs.findings import Finding, MessageLoad, Subject
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.listen_address import from_this_computer, host_in_url, is_loopback, listen_problem
-
-CHECKS: Final = ("package", "port")
+from gateway.outputs.listen_address import from_this_computer, host_in_url, listen_problem
 
 _PACKAGES: Final = ("foxglove-sdk", "protobuf", "websockets")
 _TIMEOUT_S: Final = 2.0
@@ -37,11 +35,6 @@ def check_foxglove(
             ]
     found = ", ".join(f"{name} {number}" for name, number in versions.items())
     return [_foxglove.passing("package", found), _check_port(settings, sources)]
-
-
-def leaves_host(settings: FoxgloveSettings) -> bool:
-    """Return whether messages may leave this computer: whether others can connect."""
-    return not is_loopback(settings.host)
 
 
 def _check_port(settings: FoxgloveSettings, sources: Sequence[str]) -> Finding:

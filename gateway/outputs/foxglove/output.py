@@ -4,7 +4,7 @@ import errno
 import logging
 from collections.abc import Callable, Mapping
 
-from gateway.errors import GatewayError, system_reason
+from gateway.errors import PortError, system_reason
 from gateway.logs.failures import DefectLog
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
@@ -41,7 +41,7 @@ class FoxgloveOutput(ServerOutput):
         try:
             await self._server.open()
         except OSError as error:
-            raise GatewayError(f"cannot listen on {self._address}: {_bind_problem(error)}") from error
+            raise PortError(f"cannot listen on {self._address}: {_bind_problem(error)}") from error
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return a new publisher of a source."""

@@ -14,11 +14,9 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.settings import LslSettings
+from gateway.outputs.lsl.settings import LSL, LslSettings
 from gateway.outputs.lsl.supervisor import lsl_environment
 from gateway.rtc3d.parameters import Parameters, ParametersEvents
-
-CHECKS: Final = ("opens", "found", "gateway")
 
 _TEST_SOURCE: Final = "doctor"
 _POLL_S: Final = 0.05
@@ -67,9 +65,9 @@ def check_lsl(
 def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]:
     """Return the streams that can be found within ``seconds``, by another process. Raises OutputError.
 
-    See find.py for what each has.
+    See process.py for what each has.
     """
-    command = [sys.executable, "-m", "gateway.outputs.lsl.find", str(seconds)]
+    command = [sys.executable, "-m", "gateway.outputs.lsl.process", str(seconds)]
     try:
         result = subprocess.run(  # noqa: S603 - our own module
             command,
@@ -92,7 +90,7 @@ def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]
 
 def _not_open(found: str, remedy: str) -> list[Finding]:
     remedy = as_sentence(remedy) if remedy else "Correct lsl in the configuration."
-    others = [_lsl.not_tested(check, "it needs opens, which failed") for check in CHECKS[1:]]
+    others = [_lsl.not_tested(check, "it needs opens, which failed") for check in LSL.checks[1:]]
     return [_lsl.failing("opens", found, remedy), *others]
 
 

@@ -10,8 +10,6 @@ from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
 
-CHECKS: Final = ("sources", "ports")
-
 _MAX_REPLY_BYTES: Final = 64 * 1024
 
 _rtc3d: Final = Subject("rtc3d")

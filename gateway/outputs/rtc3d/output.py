@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Final
 
-from gateway.errors import GatewayError, OutputError
+from gateway.errors import OutputError, PortError
 from gateway.logs.failures import DefectLog, log_fields
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
@@ -289,8 +289,8 @@ class Rtc3dOutput(ServerOutput):
         server = LiveServer(state, host, port, self.settings.max_clients, on_wanted, self._control_recording)
         try:
             await server.listen()
-        except GatewayError as error:
-            raise GatewayError(f"RTC3D clients cannot connect: {error}") from error
+        except PortError as error:
+            raise PortError(f"RTC3D clients cannot connect: {error}") from error
         return server
 
 

@@ -11,8 +11,6 @@ from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
 from gateway.outputs.vrpn.server import bind
 from gateway.outputs.vrpn.settings import VrpnSettings
 
-CHECKS: Final = ("port", "access")
-
 _TIMEOUT_S: Final = 2.0
 
 _vrpn: Final = Subject("vrpn")
@@ -23,11 +21,6 @@ def check_vrpn(
 ) -> list[Finding]:
     """Check that the port can be used, and say who can connect."""
     return [_check_port(settings), _check_access(settings)]
-
-
-def leaves_host(settings: VrpnSettings) -> bool:
-    """Return whether other computers can connect."""
-    return not is_loopback(settings.host)
 
 
 def _check_port(settings: VrpnSettings) -> Finding:
@@ -60,7 +53,7 @@ def _is_served(settings: VrpnSettings) -> bool:
 
 
 def _check_access(settings: VrpnSettings) -> Finding:
-    if not leaves_host(settings):
+    if is_loopback(settings.host):
         return _vrpn.passing("access", "only programs on this computer can connect")
     return _vrpn.note(
         "access",

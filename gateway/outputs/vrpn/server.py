@@ -11,7 +11,7 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Any, Final, cast
 
-from gateway.errors import GatewayError, PeerError
+from gateway.errors import PeerError, PortError
 from gateway.logs.failures import DefectLog, EventLog
 from gateway.messages.host_time import now_utime
 from gateway.outputs.frame_output import PortOpener
@@ -103,7 +103,7 @@ class VrpnServer:
                 requests.close()
 
     async def _bind_both(self) -> tuple[socket.socket, socket.socket]:
-        """Return the sockets for TCP and UDP. Raises GatewayError."""
+        """Return the sockets for TCP and UDP. Raises PortError."""
         tcp = await self._bind(socket.SOCK_STREAM, "TCP")
         try:
             return tcp, await self._bind(socket.SOCK_DGRAM, "UDP")
@@ -116,7 +116,7 @@ class VrpnServer:
             loop = asyncio.get_running_loop()
             return bind(await loop.getaddrinfo(self._host, self._port, type=kind), kind)
         except OSError as error:
-            raise GatewayError(
+            raise PortError(
                 f"cannot listen on {self._host}, {protocol} port {self._port}: {error.strerror or error}; "
                 "stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
                 "computer and a free port"

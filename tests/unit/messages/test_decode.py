@@ -6,7 +6,7 @@ import math
 import pytest
 
 from gateway.errors import ProtocolError
-from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, json_text, to_json
+from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, json_bytes, json_text, to_json
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 from tests.message_vectors import VECTORS
 from tests.unit.messages.samples import component_message, tool_pose_messages
@@ -74,3 +74,11 @@ def test_values_as_json(value: object, text: str) -> None:
 def test_parameters_are_objects_of_their_fields() -> None:
     parameters = Parameters(force=ParametersForce((Plate("1", corners=(Point(x=1.0),)),)))
     assert json.loads(json_text(parameters)) == to_json(parameters)
+
+
+def test_json_is_compact_and_in_utf8_and_has_only_its_own_numbers() -> None:
+    expected = '{"name":"Käfig","values":[1,2.5,null]}'.encode()
+    assert json_bytes({"name": "Käfig", "values": [1, 2.5, None]}) == expected
+    for value in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            json_bytes([value])

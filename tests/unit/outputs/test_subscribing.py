@@ -14,12 +14,12 @@ from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import channel_pattern
-from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import key_patterns
+from tests.memory_output import MemoryOutput
 from tests.networks import add_multicast_route, free_endpoint, lcm_url, remove_multicast_route, zenoh_keys
 from tests.waiting import wait_until
 

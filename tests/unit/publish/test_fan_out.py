@@ -10,12 +10,12 @@ from gateway.errors import OutputError
 from gateway.messages.decode import decode
 from gateway.messages.encode import Stamp, encode_message
 from gateway.messages.topics import Topic
-from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut, ItemCounts
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from tests.losses import amounts
+from tests.memory_output import MemoryOutput
 from tests.server_parameters import in_metres
 from tests.settable_clock import Clock
 from tests.toy_output import ToyOutput

@@ -4,11 +4,11 @@ import asyncio
 from pathlib import Path
 
 from gateway.messages.encode import Stamp
-from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.takes.output import TakesOutput
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
+from tests.memory_output import MemoryOutput
 from tests.recording_output import frames, settings_in
 from tests.vectors import FULL_FRAME
 from tests.waiting import wait_until_async

@@ -16,12 +16,12 @@ from gateway.errors import ConfigError
 from gateway.messages.decode import decode
 from gateway.outputs.contract import Output
 from gateway.outputs.kind import SubscriptionRequest
-from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.service.gateway import Gateway
 from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
+from tests.memory_output import MemoryOutput
 from tests.servers import c3d_file, packet
 from tests.unit.service.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML, silent_to

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from gateway.errors import GatewayError, OutputError
+from gateway.errors import OutputError, PortError
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON
 from gateway.messages.encode import Stamp
@@ -72,7 +72,7 @@ class Server:
     async def listen(self) -> None:
         self.attempts_s.append(asyncio.get_running_loop().time())
         if self.port in self.busy:
-            raise GatewayError(f"port {self.port} is in use")
+            raise PortError(f"port {self.port} is in use")
         self.events.append(f"open {self.host} {self.port}")
         self.opened[self.state.source] = self
 

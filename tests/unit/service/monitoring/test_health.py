@@ -10,7 +10,6 @@ import pytest
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.logs.losses import Losses
 from gateway.outputs.contract import OutputHealth
-from gateway.outputs.memory import MemoryOutput
 from gateway.rtc3d.components import ComponentType
 from gateway.service.gateway import Gateway
 from gateway.service.monitoring.health import health_page, loss_lines, output_lines, source_line, status_lines
@@ -18,6 +17,7 @@ from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.configurations import make_settings
+from tests.memory_output import MemoryOutput
 
 MARKERS, ANALOG, EVENT = ((ComponentType.MARKERS,), (ComponentType.ANALOG,), (ComponentType.EVENT,))
 STALL_TIMEOUT_S = 3.0
