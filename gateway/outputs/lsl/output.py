@@ -15,7 +15,7 @@ from gateway.errors import ConfigError, OutputError
 from gateway.logs.failures import DefectLog
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
-from gateway.messages.host_time import HostClock, host_clock, now_steady_us
+from gateway.messages.host_time import HostClock, clock_difference_us, host_clock, now_steady_us
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
 from gateway.outputs.frame_output import FrameOutput
 from gateway.outputs.kind import missing_package
@@ -278,9 +278,6 @@ class LslFramePublisher:
 
 # Times --------------------------------------------------------------------------------------
 
-_READINGS: Final = 5
-"""How many pairs of readings are compared: the process may be interrupted between two clocks."""
-
 _MEASURE_S: Final = 1.0
 _CHANGE_US: Final = 1_000
 """The two clocks differ only while the computer is suspended, so a smaller change is an error of reading."""
@@ -317,7 +314,7 @@ class SuspendedTime:
     """How much the steady clock is ahead of the monotonic one: it also counts while the computer sleeps."""
 
     def __init__(self) -> None:
-        self._us = _measured_difference_us()
+        self._us = clock_difference_us(now_steady_us, _monotonic_us)
         self._measured_s = time.monotonic()
 
     def read_us(self) -> int:
@@ -325,19 +322,11 @@ class SuspendedTime:
         now_s = time.monotonic()
         if now_s - self._measured_s >= _MEASURE_S:
             self._measured_s = now_s
-            difference_us = _measured_difference_us()
+            difference_us = clock_difference_us(now_steady_us, _monotonic_us)
             if abs(difference_us - self._us) >= _CHANGE_US:
                 self._us = difference_us
         return self._us
 
 
-def _measured_difference_us() -> int:
-    """Return steady clock minus monotonic clock, from the reading that was interrupted least."""
-    best_us, difference_us = -1, 0
-    for _ in range(_READINGS):
-        before_us = time.monotonic_ns() // 1000
-        steady_us = now_steady_us()
-        duration_us = time.monotonic_ns() // 1000 - before_us
-        if best_us < 0 or duration_us < best_us:
-            best_us, difference_us = duration_us, steady_us - before_us
-    return difference_us
+def _monotonic_us() -> int:
+    return time.monotonic_ns() // 1000

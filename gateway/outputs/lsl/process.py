@@ -32,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.logs.safe_text import safe_text
+from gateway.messages.host_time import clock_difference_us
 
 HEADER: Final = struct.Struct("<BII")
 _COUNT: Final = struct.Struct("<I")
@@ -157,7 +158,7 @@ _POLL_S: Final = 0.1
 
 _RETRY_S: Final = 1.0
 _READ_BYTES: Final = 1 << 20
-_READINGS: Final = 5
+_SAME_CLOCK_US: Final = 1000
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -275,18 +276,11 @@ def _append(element: Any, children: Any) -> None:
 
 
 def _lsl_minus_monotonic_s(pylsl: Any) -> float:
-    """Return LSL's clock minus the monotonic one, from the reading that was interrupted least.
-
-    In liblsl for Linux, both are the same clock.
-    """
-    best_s, difference_s = -1.0, 0.0
-    for _ in range(_READINGS):
-        before_s = time.monotonic()
-        lsl_s = pylsl.local_clock()
-        duration_s = time.monotonic() - before_s
-        if best_s < 0 or duration_s < best_s:
-            best_s, difference_s = duration_s, lsl_s - before_s
-    return 0.0 if abs(difference_s) < 1e-3 else difference_s
+    """Return LSL's clock minus the monotonic one. In liblsl for Linux, both are the same clock."""
+    difference_us = clock_difference_us(
+        lambda: round(pylsl.local_clock() * 1e6), lambda: time.monotonic_ns() // 1000
+    )
+    return 0.0 if abs(difference_us) < _SAME_CLOCK_US else difference_us / 1e6
 
 
 def _limit(kind: int, most: int) -> None:

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Final
 
 from gateway.errors import OutputError, PortError
-from gateway.logs.failures import DefectLog, log_fields
+from gateway.logs.failures import log_fields
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import (
@@ -110,7 +110,6 @@ class Rtc3dOutput(ServerOutput):
         self._on_wanted: dict[str, Callable[[], None]] = {}
         self._queries: QueryService | None = None
         self._loop: asyncio.AbstractEventLoop | None = None  # of the gateway
-        self._defects = DefectLog(_log, self.name)
 
     # The core -------------------------------------------------------------------------------
 
@@ -135,6 +134,11 @@ class Rtc3dOutput(ServerOutput):
             self._states[source] = SourceState(source)
         return self._states[source]
 
+    def _server(self, source: str) -> LiveServer | None:
+        """Return the server of a source, in the thread; None while its port is not open."""
+        served = self._served.get(source)
+        return None if served is None else served.server
+
     # Maintenance ----------------------------------------------------------------------------
 
     def maintain(self) -> None:
@@ -142,10 +146,10 @@ class Rtc3dOutput(ServerOutput):
         self._offer(self._maintain)
 
     def _maintain(self) -> None:
-        for served in list(self._served.values()):
-            if served.server is not None:
-                served.server.apply_state()
-                served.server.maintain()
+        for source in list(self._served):
+            if (server := self._server(source)) is not None:
+                server.apply_state()
+                server.maintain()
 
     def is_configured_like(self, other: Output) -> bool:
         """Any settings can be taken over."""
@@ -205,17 +209,12 @@ class Rtc3dOutput(ServerOutput):
             self._thread.run(self._send_file(source, file))  # not _offer, which can be refused
 
     async def _send_file(self, source: str, file: ServerFile) -> None:
-        served = self._served.get(source)
-        if served is not None and served.server is not None:
-            served.server.send_file(file.path)
+        if (server := self._server(source)) is not None:
+            server.send_file(file.path)
 
     def _take(self, source: str, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
-        try:
-            served = self._served.get(source)
-            if served is not None and served.server is not None:
-                served.server.take(frame, stream, wanted)
-        except Exception as defect:  # noqa: BLE001 - the next frame may be different
-            self._defects.log(defect)
+        if (server := self._server(source)) is not None:
+            server.take(frame, stream, wanted)
 
     # Recordings -----------------------------------------------------------------------------
 
@@ -252,9 +251,8 @@ class Rtc3dOutput(ServerOutput):
             self._offer(partial(self._set_max_clients, source, self.settings.max_clients))
 
     def _set_max_clients(self, source: str, max_clients: int) -> None:
-        served = self._served.get(source)
-        if served is not None and served.server is not None:
-            served.server.set_max_clients(max_clients)
+        if (server := self._server(source)) is not None:
+            server.set_max_clients(max_clients)
 
     def _close_ports(self, sources: list[str]) -> None:
         for source in sources:
