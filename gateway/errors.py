@@ -114,6 +114,10 @@ class ClosedError(LinkError):
     """The connection was closed."""
 
 
+class PortError(GatewayError):
+    """A server cannot listen on its port. The text says what to do."""
+
+
 class OutputError(GatewayError):
     """An output did not open or did not accept a message; such a drop is counted under ``cause``."""
 

@@ -104,7 +104,7 @@ class ExamplePublisher:
 
 
 class ExampleFramePublisher:
-    """Publishes the whole frames of a source: the sequence number in four bytes, then the frame's body."""
+    """Publishes the whole frames of a source: the frame's body."""
 
     def __init__(self, publisher: ExamplePublisher) -> None:
         self._publisher = publisher
@@ -117,11 +117,9 @@ class ExampleFramePublisher:
         """Publish all frames, whether or not anybody has subscribed."""
         return True
 
-    def publish(
-        self, frame: Frame, _stamp: Stamp, sequence: int, _components: frozenset[ComponentType]
-    ) -> None:
+    def publish(self, frame: Frame, _stamp: Stamp, _components: frozenset[ComponentType]) -> None:
         """See FramePublisher."""
-        self._publisher.publish(sequence.to_bytes(4) + frame.body)
+        self._publisher.publish(frame.body)
 
     def close(self) -> None:
         """Close the publisher."""

@@ -24,6 +24,7 @@ _LOGGED_CLASSES: Final = {
     *("LinkError", "ConnectError", "ReplyTimeoutError", "SilenceError", "ClosedError"),
     *("RequestError", "DefectError", "StreamPlan", "RateDifference"),
     *("PacketError", "OutputError", "OutputHealth", "SpoolError", "SessionTexts"),
+    *("PortError", "PortOpener"),
 }
 """Classes whose texts are logged as WARNING or ERROR."""
 

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Callable
 from typing import Final
 
 from gateway.logs.limits import Repeats
@@ -45,7 +46,7 @@ class HostClock:
     """
 
     def __init__(self) -> None:
-        self.offset_us = _measured_offset_us()
+        self.offset_us = clock_difference_us(now_utime, now_steady_us)
         """Wall clock minus steady clock, at the newest reading."""
         self.steps = 0
         """How often the wall clock was set since this object was made."""
@@ -65,7 +66,7 @@ class HostClock:
 
     def _follow(self, steady_us: int) -> None:
         """Measure the offset again; if the wall clock was set, count and log it."""
-        offset_us = _measured_offset_us()
+        offset_us = clock_difference_us(now_utime, now_steady_us)
         change_us = offset_us - self.offset_us
         if abs(change_us) <= _TOLERANCE_US:  # only the reading was interrupted
             return
@@ -83,16 +84,16 @@ class HostClock:
         )
 
 
-def _measured_offset_us() -> int:
-    """Return wall clock minus steady clock, from the reading that was interrupted least."""
-    best_us, offset_us = -1, 0
+def clock_difference_us(clock: Callable[[], int], base: Callable[[], int]) -> int:
+    """Return ``clock`` minus ``base``, both in µs, from the reading that was interrupted least."""
+    best_us, difference_us = -1, 0
     for _ in range(_READINGS):
-        before_us = now_steady_us()
-        utime = now_utime()
-        duration_us = now_steady_us() - before_us
+        before_us = base()
+        time_us = clock()
+        duration_us = base() - before_us
         if best_us < 0 or duration_us < best_us:
-            best_us, offset_us = duration_us, utime - before_us
-    return offset_us
+            best_us, difference_us = duration_us, time_us - before_us
+    return difference_us
 
 
 host_clock: Final = HostClock()

@@ -6,14 +6,15 @@ tests/contract/ hold every output to it, and ``guard`` keeps an output that brea
 
 ``registry`` lists the outputs. Each has a package with the same modules:
 
-- ``settings``: its section of the configuration.
+- ``settings``: its section of the configuration, and its entry in the registry, unless that is in ``kind``.
+  Every command imports the settings, so they do not import the output itself.
 - ``output``: the class that the contract describes, and often its publishers.
 - ``checks``: what the doctor checks.
-- ``kind``: its entry in the registry.
 
-What several outputs need is here: ``admission`` limits the questions of peers, ``threads`` has a thread for
-calls that may block and one with an event loop of its own, ``listen_address`` says who can connect to a
-server, ``pacing`` leaves out frames, and ``memory`` is an output for tests.
+What several outputs need is here: ``frame_output`` has what outputs of whole frames and servers have in
+common, ``query_admission`` limits the questions of peers, ``threads`` has a thread for calls that may block
+and one with an event loop of its own, ``listen_address`` says who can connect to a server, and ``pacing``
+leaves out frames.
 
 Calls of the contract come from the gateway's event loop and must not block there. An output that may wait for
 a network or a disk does so in a thread, behind a queue with a limit, and counts what it drops.

@@ -96,13 +96,10 @@ class FramePublisher(Protocol):
         output that learns from frames which items there are does so here.
         """
 
-    def publish(
-        self, frame: Frame, stamp: Stamp, sequence: int, components: frozenset[ComponentType]
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Send the ``components`` of one frame without blocking.
 
-        ``sequence`` counts the frames of the source from 0, including those that are skipped. Raises
-        OutputError if the output does not accept the frame.
+        Raises OutputError if the output does not accept the frame.
         """
 
     def close(self) -> None:

@@ -1,14 +1,12 @@
 """A wrapper around an output that may raise although the contract forbids it: nobody else must suffer."""
 
-import asyncio
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from logging import getLogger
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from gateway.errors import OutputError
 from gateway.logs.failures import DefectLog, defect_text
-from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import (
     Command,
@@ -16,9 +14,6 @@ from gateway.outputs.contract import (
     Output,
     OutputHealth,
     Publisher,
-    QueryService,
-    ServerFile,
-    ServerParameters,
 )
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import FrameLayout
@@ -27,6 +22,19 @@ _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
 logger = getLogger(__name__)
+
+
+def _guarded(
+    method: Callable[Concatenate[Output, _Parameters], _Result], otherwise: _Result
+) -> Callable[Concatenate["GuardedOutput", _Parameters], _Result]:
+    """Return ``method`` of Output for a GuardedOutput: a call that returns ``otherwise`` after a defect."""
+    name = method.__name__
+
+    def call(self: "GuardedOutput", /, *args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        inner: Callable[_Parameters, _Result] = getattr(self.output, name)
+        return self.try_once(inner, otherwise, *args, **kwargs)
+
+    return call
 
 
 class GuardedOutput(Output):
@@ -47,7 +55,7 @@ class GuardedOutput(Output):
         self._defects = DefectLog(logger, output.name)
         self._damage = ""
 
-    def _try_once(
+    def try_once(
         self,
         call: Callable[_Parameters, _Result],
         otherwise: _Result,
@@ -62,16 +70,37 @@ class GuardedOutput(Output):
             self._damage = self._damage or defect_text(defect)
             return otherwise
 
-    # The core.
+    # Calls that are not made again: a defect damages the output.
 
-    def start(self) -> None:
-        """See Output."""
-        self._try_once(self.output.start, None)
+    start = _guarded(Output.start, None)
+    close = _guarded(Output.close, None)
+    count_losses = _guarded(Output.count_losses, None)
+    watch_wanted = _guarded(Output.watch_wanted, otherwise=False)  # then everything is published
+    announce = _guarded(Output.announce, None)
+    withdraw = _guarded(Output.withdraw, None)
+    show_streaming = _guarded(Output.show_streaming, None)
+    show_measurement = _guarded(Output.show_measurement, None)
+    publish_parameters = _guarded(Output.publish_parameters, None)
+    announce_file = _guarded(Output.announce_file, None)
+    serve_queries = _guarded(Output.serve_queries, None)
 
     def publisher(self, topic: Topic) -> Publisher:
         """See Output. After a defect, the publisher accepts nothing, so that every message counts as lost."""
-        publisher = self._try_once(self.output.publisher, _Refusal(topic.source), topic)
+        publisher = self.try_once(self.output.publisher, _Refusal(topic.source), topic)
         return _GuardedPublisher(publisher, self._defects)
+
+    def frame_publisher(self, source: str) -> FramePublisher | None:
+        """See Output. After a defect, the publisher accepts nothing, so that every frame counts as lost."""
+        publisher = self.try_once(self.output.frame_publisher, _Refusal(source), source)
+        return None if publisher is None else _GuardedFramePublisher(publisher, self._defects)
+
+    def take_over(self, other: Output) -> bool:
+        """See Output."""
+        differs = self.try_once(self.output.take_over, True, _inner(other))
+        self.has_tool_poses = self.output.has_tool_poses
+        return differs
+
+    # Calls that are made again and again.
 
     def health(self) -> OutputHealth:
         """See Output. A defect is a problem of the output."""
@@ -85,75 +114,18 @@ class GuardedOutput(Output):
             self._defects.log(defect)
             return OutputHealth(False, f"{defect_text(defect)}; report this with the log")
 
-    def close(self) -> None:
-        """See Output."""
-        self._try_once(self.output.close, None)
-
-    # Maintenance.
-
-    def maintain(self) -> None:
-        """See Output."""
-        self._defects.attempt(self.output.maintain, None)
-
     def is_configured_like(self, other: Output) -> bool:
         """See Output. One that a defect has damaged is like no other, so that a reload replaces it."""
         is_like = partial(self.output.is_configured_like, _inner(other))
         return not self._damage and self._defects.attempt(is_like, False)
 
-    def take_over(self, other: Output) -> bool:
+    def maintain(self) -> None:
         """See Output."""
-        differs = self._try_once(self.output.take_over, True, _inner(other))
-        self.has_tool_poses = self.output.has_tool_poses
-        return differs
-
-    def count_losses(self, source: str, losses: Losses) -> None:
-        """See Output."""
-        self._try_once(self.output.count_losses, None, source, losses)
-
-    def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
-        """See Output. After a defect, everything is published."""
-        return self._try_once(self.output.watch_wanted, False, source, on_change)
-
-    # Liveliness.
-
-    def announce(self, source: str) -> None:
-        """See Output."""
-        self._try_once(self.output.announce, None, source)
-
-    def withdraw(self, source: str) -> None:
-        """See Output."""
-        self._try_once(self.output.withdraw, None, source)
-
-    def show_streaming(self, source: str, is_streaming: bool) -> None:
-        """See Output."""
-        self._try_once(self.output.show_streaming, None, source, is_streaming)
-
-    # Whole frames instead of components.
-
-    def frame_publisher(self, source: str) -> FramePublisher | None:
-        """See Output. After a defect, the publisher accepts nothing, so that every frame counts as lost."""
-        publisher = self._try_once(self.output.frame_publisher, _Refusal(source), source)
-        return None if publisher is None else _GuardedFramePublisher(publisher, self._defects)
-
-    # Parameters and files from the server.
-
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
-        """See Output."""
-        return self._try_once(self.output.publish_parameters, None, source, parameters)
+        self._defects.attempt(self.output.maintain, None)
 
     def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
         """See Output."""
         return self._defects.attempt(partial(self.output.topic_names, source), {})
-
-    def announce_file(self, source: str, file: ServerFile) -> None:
-        """See Output."""
-        self._try_once(self.output.announce_file, None, source, file)
-
-    # Recordings and measurements of the server.
-
-    def show_measurement(self, source: str, is_running: bool | None) -> None:
-        """See Output."""
-        self._try_once(self.output.show_measurement, None, source, is_running)
 
     async def follow_recording(self, source: str, *, start: bool, name: str) -> Mapping[str, Any]:
         """See Output. After a defect, the recording starts nevertheless."""
@@ -162,12 +134,6 @@ class GuardedOutput(Output):
         except Exception as defect:  # noqa: BLE001 - other outputs continue
             self._defects.log(defect)
             return {}
-
-    # Queries of peers.
-
-    def serve_queries(self, service: QueryService) -> None:
-        """See Output."""
-        self._try_once(self.output.serve_queries, None, service)
 
     async def stop_queries(self) -> None:
         """See Output."""

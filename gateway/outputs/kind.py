@@ -6,6 +6,7 @@ is left out of that command.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -22,6 +23,19 @@ def missing_package(output: str, extra: str, error: ImportError) -> ConfigError:
         f"{output}.enabled is true, but the package {package!r} is not installed; install it with "
         f"pip install 'rtc3d-gateway[{extra}]', or set {output}.enabled to false"
     )
+
+
+def imported_late(path: str) -> Callable[..., Any]:
+    """Return the function or class ``MODULE:NAME``, which is imported when it is called.
+
+    So the registry does not import the outputs that the configuration does not enable.
+    """
+    module, _, name = path.partition(":")
+
+    def call(*arguments: Any) -> Any:
+        return getattr(import_module(module), name)(*arguments)
+
+    return call
 
 
 Receive = Callable[[str, bytes], None]

@@ -14,14 +14,14 @@ from gateway.config.settings import OutputSettings, Settings, settings_model
 from gateway.errors import ConfigError
 from gateway.logs.safe_text import safe_text
 from gateway.outputs.contract import Output
-from gateway.outputs.foxglove.kind import FOXGLOVE
+from gateway.outputs.foxglove.settings import FOXGLOVE
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.kind import LCM
-from gateway.outputs.lsl.kind import LSL
+from gateway.outputs.lsl.settings import LSL
 from gateway.outputs.ros2.kind import ROS2
-from gateway.outputs.rtc3d.kind import RTC3D
+from gateway.outputs.rtc3d.settings import RTC3D
 from gateway.outputs.takes.kind import TAKES
-from gateway.outputs.vrpn.kind import VRPN
+from gateway.outputs.vrpn.settings import VRPN
 from gateway.outputs.zenoh.kind import ZENOH
 
 GROUP: Final = "rtc3d_gateway.outputs"

@@ -160,7 +160,6 @@ class FanOut:
         self.on_items_changed = on_items_changed
         self._source = source
         self._components = {component: _Component(component) for component in MESSAGE_TYPES}
-        self._frame_sequence = 0
         self._routes: list[OutputRoute] = []
         self._frame_routes: list[FrameRoute] = []
         self._last_routes: dict[str, OutputRoute] = {}  # by the output's name, including closed ones
@@ -233,8 +232,7 @@ class FanOut:
         if not plan.components:
             return
         for frame_route in plan.frame_routes:
-            frame_route.publish(frame, stamp, self._frame_sequence, wanted)
-        self._frame_sequence += 1
+            frame_route.publish(frame, stamp, wanted)
         for component in plan.components:
             message = component.next_message(frame, stamp)
             for route in component.routes:
@@ -250,7 +248,6 @@ class FanOut:
         plan = self._plan_of(frame, stamp, components)
         if not plan.components:
             return 0
-        self._frame_sequence += 1
         num_lost = self._tool_poses.skip(frame, plan.tool_indices)
         for component in plan.components:
             message = component.next_message(frame, stamp)

@@ -203,10 +203,10 @@ class FrameRoute:
         """Return whether to publish frames of ``layout``."""
         return self.publisher.prepare(layout, wanted)
 
-    def publish(self, frame: Frame, stamp: Stamp, sequence: int, wanted: frozenset[ComponentType]) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""
         try:
-            self.publisher.publish(frame, stamp, sequence, wanted)
+            self.publisher.publish(frame, stamp, wanted)
         except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
             self._output_route.count_loss(error, stamp)
         else:

@@ -1,94 +1,65 @@
-"""One client's TCP connection."""
+"""One client's TCP connection, and how much it may use up."""
 
 import asyncio
 import logging
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
-from typing import Final, Protocol, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import gateway
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketReader, PacketType
 from gateway.rtc3d.parameters import General
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
-from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.rtc3d_server.frame_schedule import SentCounts
-from gateway.rtc3d_server.scene import FrameSource, Scene
+from gateway.rtc3d_server.connection_filter import ConnectionFilter
+from gateway.server_limits import ServerLimits
 from gateway.token_bucket import TokenBucket
+
+if TYPE_CHECKING:
+    from gateway.rtc3d_server.server import RtServer
 
 MAX_COMMAND_BYTES: Final = 64 * 1024
 """The largest packet that a client may send."""
 
-MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
-"""How many bytes are kept at most for a client that does not read; beyond this, its frames are dropped."""
+LIMITS: Final = ServerLimits(
+    clients=128, handshake_s=10.0, unread_bytes=4 * 1024 * 1024, unread_s=300.0, close_s=1.0
+)
+"""4 MiB are a second of the largest streams. A person may type the first command, or debug a client.
+
+Only servers of live sources bound the number of clients, because the simulator is for one's own programs.
+"""
 
 MAX_COMMANDS_PER_S: Final = 1000.0
 """How many packets of one client are answered in a second; further ones wait."""
-
-_READ_BYTES: Final = 4096
-"""How much is read from a client at once. The next bytes are read when all packets in these are answered, so
-that little waits in memory, however many clients send too much."""
 
 _COMMANDS_PAUSE_S: Final = 0.05  # for a client that sends too many
 _MAX_LOGGED_BYTES: Final = 200  # of a command
 _log = logging.getLogger(__name__)
 
 
-class ConnectionOwner(Protocol):
-    """What a connection needs from its server."""
+class SentCounts:
+    """Counts data frames and the components in them."""
 
-    name: str
-    """The server's name in the General parameters."""
+    def __init__(self) -> None:
+        self._frames: Counter[tuple[ComponentType, ...]] = Counter()
 
-    sent_counts: SentCounts
-    """What was sent to all clients."""
-
-    @property
-    def max_unread_bytes(self) -> int:
-        """How many bytes are kept for a client that does not read."""
-        ...
+    def add(self, components: tuple[ComponentType, ...]) -> None:
+        """Count one frame with these components."""
+        self._frames[components] += 1
 
     @property
-    def scene(self) -> Scene:
-        """The scene that is served."""
-        ...
+    def frames(self) -> int:
+        """The number of frames."""
+        return self._frames.total()
 
-    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
-        """Return the frames with these components; an empty sequence means all."""
-        ...
-
-    def elapsed_us(self) -> int | None:
-        """Return the measurement's time in µs, negative before it begins; None while none runs."""
-        ...
-
-    def frames_requested(self) -> int | None:
-        """Start the measurement if it waits for the first request for frames; return ``elapsed_us``."""
-        ...
-
-    def connection_opened(self, connection: "ClientConnection") -> int:
-        """Add a new connection; return its number."""
-        ...
-
-    def connection_closed(self, connection: "ClientConnection", error: Exception | None) -> None:
-        """Remove a connection that has ended, because of ``error`` or regularly."""
-        ...
-
-    def reading_stopped(self, connection: "ClientConnection", *, is_first: bool) -> None:
-        """Note that a client does not read, for the first time or again."""
-        ...
-
-    def reading_resumed(self, connection: "ClientConnection") -> None:
-        """Note that a client reads again."""
-        ...
-
-    def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
-        """Return the filter for a new connection."""
-        ...
-
-    def schedule(self) -> None:
-        """Set the timer again soon, because the connection's ``due_us`` may have changed."""
-        ...
+    @property
+    def components(self) -> Counter[str]:
+        """How often each component was in a frame, by its key."""
+        counts: Counter[str] = Counter()
+        for components, frames in self._frames.items():
+            counts.update({component.key: frames for component in components})
+        return counts
 
 
 class ClientConnection(asyncio.BufferedProtocol):
@@ -108,11 +79,12 @@ class ClientConnection(asyncio.BufferedProtocol):
     number: int
     """The connection's number since the server's start, from 1."""
 
-    def __init__(self, owner: ConnectionOwner) -> None:
+    def __init__(self, owner: "RtServer") -> None:
         self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
-        self._read_buffer = bytearray(_READ_BYTES)
+        # The next bytes are read when all packets in these are answered, so that little waits in memory.
+        self._read_buffer = bytearray(LIMITS.read_bytes)
         self._inbox: deque[Packet] = deque()
         self._commands = TokenBucket(MAX_COMMANDS_PER_S)
         self._is_processing = False  # whether _process_inbox is to be called
@@ -144,7 +116,7 @@ class ClientConnection(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
         self.transport = cast(asyncio.Transport, transport)
-        self.transport.set_write_buffer_limits(high=self._owner.max_unread_bytes)
+        self.transport.set_write_buffer_limits(high=self._owner.limits.unread_bytes_each)
         peer = transport.get_extra_info("peername")
         if peer is not None:  # the client has not reset the connection already
             address, port = peer[:2]

@@ -6,13 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
-from gateway.errors import GatewayError, system_reason
+from gateway.errors import PortError, system_reason
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
+from gateway.rtc3d_server.client_connection import LIMITS, ClientConnection, SentCounts
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.rtc3d_server.frame_schedule import SentCounts
 from gateway.rtc3d_server.measurement import Measurement
 from gateway.rtc3d_server.scene import FrameSource, Scene
 
@@ -27,7 +26,6 @@ def call_after_us(delay_us: float, callback: Callable[[], object]) -> asyncio.Ti
     return asyncio.get_running_loop().call_later(delay_ms / 1000, callback)
 
 
-_CLOSING_S: Final = 1.0  # how long close() waits for clients to read what was sent
 _log = logging.getLogger(__name__)
 
 
@@ -58,6 +56,8 @@ class RtServer:
         self.host = host
         self.port = port
         self.name = name
+        """The name in the General parameters."""
+        self.limits = LIMITS
         self.connections: set[ClientConnection] = set()
         self.sent_counts = SentCounts()
         """What was sent to all clients."""
@@ -75,11 +75,6 @@ class RtServer:
     def scene(self) -> Scene:
         """The scene that is served."""
         return self._measurement.scene
-
-    @property
-    def max_unread_bytes(self) -> int:
-        """How many bytes are kept for a client that does not read."""
-        return MAX_UNREAD_BYTES
 
     @property
     def is_listening(self) -> bool:
@@ -108,7 +103,7 @@ class RtServer:
     async def start(self) -> None:
         """Listen, and start the measurement unless it waits for the first request for frames.
 
-        Raises GatewayError if the server cannot listen on the address.
+        Raises PortError if the server cannot listen on the address.
         """
         await self.listen()
         self._starts_on_request = self._once
@@ -116,12 +111,12 @@ class RtServer:
             self.start_measurement()
 
     async def listen(self) -> None:
-        """Listen for clients. Raises GatewayError if that is not possible on the address."""
+        """Listen for clients. Raises PortError if that is not possible on the address."""
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: ClientConnection(self), self.host, self.port)
         except OSError as error:
-            raise GatewayError(
+            raise PortError(
                 f"{self.name}: cannot listen on {self.host}, port {self.port}: {system_reason(error)}; "
                 "choose an address of this machine and a free port"
             ) from error
@@ -138,7 +133,7 @@ class RtServer:
         for connection in connections:
             connection.close()
         if connections:
-            await asyncio.wait([connection.closed for connection in connections], timeout=_CLOSING_S)
+            await asyncio.wait([connection.closed for connection in connections], timeout=self.limits.close_s)
         for connection in connections:
             connection.transport.abort()
         await self._server.wait_closed()
@@ -202,17 +197,17 @@ class RtServer:
         self.schedule()
 
     def elapsed_us(self) -> int | None:
-        """Return the time since the measurement's start in µs, None if none is running."""
+        """Return the measurement's time in µs, negative before it begins; None while none runs."""
         return self._measurement.elapsed_us()
 
     # For connections ------------------------------------------------------------------------
 
     def frames(self, components: Sequence[ComponentType]) -> FrameSource:
-        """See ConnectionOwner."""
+        """Return the frames with these components; an empty sequence means all."""
         return self._measurement.frames(components)
 
     def frames_requested(self) -> int | None:
-        """See ConnectionOwner."""
+        """Start the measurement if it waits for the first request for frames; return ``elapsed_us``."""
         if self._starts_on_request:
             self.start_measurement()
         else:
@@ -220,11 +215,11 @@ class RtServer:
         return self.elapsed_us()
 
     def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
-        """See ConnectionOwner."""
+        """Return the filter for a new connection."""
         return self._new_filter(connection)
 
     def connection_opened(self, connection: ClientConnection) -> int:
-        """See ConnectionOwner."""
+        """Add a new connection; return its number."""
         self._num_accepted += 1
         self.connections.add(connection)
         self.log_opened(connection)
@@ -233,23 +228,23 @@ class RtServer:
         return self._num_accepted
 
     def connection_closed(self, connection: ClientConnection, error: Exception | None) -> None:
-        """See ConnectionOwner."""
+        """Remove a connection that has ended, because of ``error`` or regularly."""
         self.connections.discard(connection)
         self._dropped_for_closed += connection.session.frames_dropped
         self.log_closed(connection, error)
         self.schedule()
 
     def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
-        """See ConnectionOwner."""
+        """Note that a client does not read, for the first time or again."""
         _log.log(
             logging.WARNING if is_first else logging.DEBUG,
             "%s does not read: %d MiB wait for it; dropping its frames until it reads again",
             connection.name,
-            MAX_UNREAD_BYTES >> 20,
+            self.limits.unread_bytes_each >> 20,
         )
 
     def reading_resumed(self, connection: ClientConnection) -> None:
-        """See ConnectionOwner."""
+        """Note that a client reads again."""
         _log.info(
             "%s reads again; %d of its frames were dropped",
             connection.name,

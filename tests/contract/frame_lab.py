@@ -208,7 +208,7 @@ async def returns(call: Callable[[], Any]) -> None:
 def offered(publisher: FramePublisher, to_publish: Frame) -> str:
     """Publish a frame; return the cause if it is refused, "" otherwise."""
     try:
-        publisher.publish(to_publish, stamp(), 0, ALL)
+        publisher.publish(to_publish, stamp(), ALL)
     except OutputError as error:
         return error.cause if str(error) else "an error without a text"
     return ""

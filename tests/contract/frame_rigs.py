@@ -328,8 +328,7 @@ class ExampleRig(FrameRig):
         source, _, key = name.rpartition("/")
         if key != "frame":
             return
-        body = message[4:]
-        for each in split_frame(body, detect_byte_order(body, "big")).components:
+        for each in split_frame(message, detect_byte_order(message, "big")).components:
             if each.type is ComponentType.TOOLS:
                 xs = each.items()["x"].tolist()
                 self._received += [(source, x / 1000) for x in xs if not math.isnan(x)]

@@ -13,7 +13,7 @@ import pytest
 from gateway.errors import GatewayError
 from gateway.rtc3d.parameters import General
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
+from gateway.rtc3d_server.client_connection import LIMITS
 from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
@@ -208,7 +208,7 @@ async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it
         async with connected(simulator) as reading:
             await reading.ask("StreamFrames 6D")
             assert consecutive(await reading.frames(300))
-        assert full.transport.get_write_buffer_size() < MAX_UNREAD_BYTES + 2**20
+        assert full.transport.get_write_buffer_size() < LIMITS.unread_bytes + 2**20
         assert simulator.frames_dropped > 100
 
         silent.resume()

@@ -6,16 +6,14 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
-from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.listen_address import from_this_computer, host_in_url, is_loopback, listen_problem
-
-CHECKS: Final = ("package", "port")
+from gateway.outputs.foxglove.settings import FOXGLOVE, FoxgloveSettings
+from gateway.outputs.listen_address import from_this_computer, host_in_url, listen_problem
 
 _PACKAGES: Final = ("foxglove-sdk", "protobuf", "websockets")
 _TIMEOUT_S: Final = 2.0
 _MAX_MESSAGES: Final = 20
 
-_PACKAGE, _PORT = (Check("foxglove", name) for name in CHECKS)
+_PACKAGE, _PORT = (Check("foxglove", name) for name in FOXGLOVE.checks)
 
 
 def check_foxglove(
@@ -29,14 +27,9 @@ def check_foxglove(
         except PackageNotFoundError:
             remedy = "Install it with: pip install 'rtc3d-gateway[foxglove]'"
             failing = _PACKAGE.failing(f"the package {name} is not installed", remedy)
-            return failing_first(failing, CHECKS[1:])
+            return failing_first(failing, FOXGLOVE.checks[1:])
     found = ", ".join(f"{name} {number}" for name, number in versions.items())
     return [_PACKAGE.passing(found), _check_port(settings, sources)]
-
-
-def leaves_host(settings: FoxgloveSettings) -> bool:
-    """Return whether messages may leave this computer: whether others can connect."""
-    return not is_loopback(settings.host)
 
 
 def _check_port(settings: FoxgloveSettings, sources: Sequence[str]) -> Finding:

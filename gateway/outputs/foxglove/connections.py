@@ -23,7 +23,7 @@ from gateway.foxglove_schemas.topics import Topic
 from gateway.logs.failures import EventLog
 from gateway.messages.decode import json_text
 from gateway.outputs.listen_address import foreign_page
-from gateway.token_bucket import TokenBucket
+from gateway.server_limits import Clients, ServerLimits
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 
@@ -129,20 +129,14 @@ def _number(value: Any) -> int:
     raise QueryError(f"an id is not a whole number from 0 to {_MAX_ID}")
 
 
-MAX_CLIENTS: Final = 32
-"""How many viewers may be connected; others get the HTTP status 503."""
+LIMITS: Final = ServerLimits(clients=32, handshakes=64, received_burst_bytes=512 * 1024.0)
+"""A viewer may subscribe to thousands of topics at once, and is disconnected if it sends more than that.
 
-MAX_HANDSHAKES: Final = 64
-"""How many connections may have no complete handshake; one more ends the oldest of these."""
-
-HANDSHAKE_TIMEOUT_S: Final = 5.0
+1 MiB waiting are a second of 69 channels at 2000 Hz. The status 503 says that there are too many viewers.
+"""
 
 MAX_REQUEST_BYTES: Final = 64 * 1024
 """The size limit of a message from a viewer: about 1000 subscriptions."""
-
-_RECEIVED_BYTES_PER_S: Final = 16 * 1024
-_RECEIVED_BURST_BYTES: Final = 512 * 1024
-"""A viewer sends some kB when a panel opens. One that sends more than this is disconnected."""
 
 _BYTES_PER_FRAME: Final = 128
 """Added to the size of each frame: an empty one has 6 bytes, but takes as much time as others."""
@@ -150,20 +144,11 @@ _BYTES_PER_FRAME: Final = 128
 MAX_FRAGMENTS: Final = 1000
 """How many frames a message may have. websockets limits their bytes only, and keeps even empty ones."""
 
-_PIECE_BYTES: Final = 4096
-"""Data is parsed in pieces of this size: one read may have 256 kB, or 40 000 empty frames to count."""
-
-MAX_WAITING_BYTES: Final = 1024 * 1024
-"""How much may wait for a viewer that does not read fast enough; then it loses messages."""
-
-MAX_CONTROL_BYTES: Final = 8 * MAX_WAITING_BYTES
-"""How much may wait with the messages about channels, which are not left out; then it is disconnected."""
+_CONTROL_SHARE: Final = 8
+"""So many times ``unread_bytes`` may wait with the messages about channels, which are not left out."""
 
 _FLUSH_BYTES: Final = 64 * 1024
 """How many bytes are collected for one system call. After a delay, many messages come at once."""
-
-MAX_STALL_S: Final = 30.0
-"""A viewer that has read nothing for this long, while so much waits, is disconnected."""
 
 _FOXGLOVE: Final = re.compile(r"https://([a-z0-9-]+\.)*foxglove\.dev")
 _DESKTOP: Final = "file://"
@@ -179,24 +164,10 @@ class ViewerAdmission:
     """Decides which connections may stay open, and logs why others end."""
 
     def __init__(self, host: str, origins: Collection[str]) -> None:
+        self.clients: Clients[ServerConnection] = Clients(LIMITS, lambda each: each.transport.abort())
         self._host = host
         self._origins = frozenset(origin.lower() for origin in origins)
         self._events = EventLog(logger, "foxglove")
-        self.num_clients = 0
-        """How many viewers have completed the handshake."""
-        self._handshakes: dict[ServerConnection, None] = {}  # oldest first
-
-    def begin(self, connection: ServerConnection) -> None:
-        """Admit a new connection to the handshake."""
-        if len(self._handshakes) >= MAX_HANDSHAKES:
-            oldest = next(iter(self._handshakes))
-            del self._handshakes[oldest]
-            oldest.transport.abort()
-        self._handshakes[connection] = None
-
-    def end(self, connection: ServerConnection) -> None:
-        """Take note that the handshake is complete, or has failed."""
-        self._handshakes.pop(connection, None)
 
     def refuse(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
@@ -209,11 +180,12 @@ class ViewerAdmission:
             text = f"{_address(connection)} is refused: {reason}"
             self._events.log(logging.WARNING, text, "foreign page")
             return connection.respond(403, f"{reason}\n")
-        if self.num_clients < MAX_CLIENTS:
+        if not self.clients.is_full:
             return None
-        text = f"{_address(connection)} is refused: {MAX_CLIENTS} viewers are connected; close one of them"
+        most = self.clients.limits.clients
+        text = f"{_address(connection)} is refused: {most} viewers are connected; close one of them"
         self._events.log(logging.WARNING, text, "refused")
-        return connection.respond(503, f"{MAX_CLIENTS} viewers are connected already; close one of them.\n")
+        return connection.respond(503, f"{most} viewers are connected already; close one of them.\n")
 
     def _is_of_a_viewer(self, origin: str) -> bool:
         """Return whether pages of this origin are viewers: Foxglove's, from the disk, or configured."""
@@ -234,23 +206,24 @@ class Connection(ServerConnection):
     def __init__(self, admission: ViewerAdmission, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._admission = admission
-        self._received = TokenBucket(_RECEIVED_BYTES_PER_S, _RECEIVED_BURST_BYTES)
+        self._received = admission.clients.limits.new_received_budget()
         self._num_fragments = 0  # of the message that is not complete yet
 
     def connection_made(self, transport: Any) -> None:
         """See asyncio.Protocol."""
         super().connection_made(transport)
-        self._admission.begin(self)
+        self._admission.clients.open(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
-        self._admission.end(self)
+        self._admission.clients.close(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """See asyncio.Protocol."""
-        for start in range(0, len(data), _PIECE_BYTES):
-            piece = data[start : start + _PIECE_BYTES]
+        """See asyncio.Protocol. Data is parsed in pieces: one read may have 40 000 empty frames to count."""
+        piece_bytes = self._admission.clients.limits.read_bytes
+        for start in range(0, len(data), piece_bytes):
+            piece = data[start : start + piece_bytes]
             self._count_received(len(piece))
             if self.transport.is_closing():
                 return
@@ -286,6 +259,8 @@ class Viewer:
         """The numbers of channels by those of subscriptions."""
         self._connection = connection
         self._admission = admission
+        self._max_waiting_bytes = admission.clients.limits.unread_bytes_each
+        self._unread_s = admission.clients.limits.unread_s
         self._queued_bytes = 0  # for the next ``_flush``
         self._was_slow = False
         self._stalled_s: float | None = None  # since when too much waits, on the monotonic clock
@@ -297,7 +272,7 @@ class Viewer:
 
     def send_data(self, subscription: int, utime: int, data: bytes) -> bool:
         """Send a message of a channel, or return False if too much waits already: then it is lost."""
-        if self._waiting_bytes > MAX_WAITING_BYTES:
+        if self._waiting_bytes > self._max_waiting_bytes:
             self._stall()
             return False
         self._stalled_s = None
@@ -309,16 +284,16 @@ class Viewer:
         now_s = time.monotonic()
         if self._stalled_s is None:
             self._stalled_s = now_s
-        elif now_s - self._stalled_s > MAX_STALL_S:
+        elif now_s - self._stalled_s > self._unread_s:
             # A ping of websockets would wait until it is sent.
-            self._disconnect(f"it has not read what waits for it for {MAX_STALL_S:g} s")
+            self._disconnect(f"it has not read what waits for it for {self._unread_s:g} s")
         if not self._was_slow:
             self._was_slow = True
             self.send_control(warning(_SLOW))
 
     def send_control(self, message: str) -> None:
         """Send a message about channels, which the viewer must not miss."""
-        if self._waiting_bytes > MAX_CONTROL_BYTES:
+        if self._waiting_bytes > _CONTROL_SHARE * self._max_waiting_bytes:
             self._disconnect("it does not read what it must know about the topics")
         else:
             self._send(message.encode(), is_text=True)

@@ -324,13 +324,7 @@ class FoxglovePublisher:
         is_lost = any(map(has_too_many_numbers, found)) and bool(self._source.wanted)
         return self.wants([each.type for each in found]) or is_lost
 
-    def publish(
-        self,
-        frame: Frame,
-        stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - the signature is that of FramePublisher
-        components: frozenset[ComponentType],
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand over a frame; see FramePublisher."""
         if self._is_closed:
             raise OutputError(f"foxglove: {self._name} is closed; ask for a new publisher", cause="closed")

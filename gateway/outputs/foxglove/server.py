@@ -20,7 +20,7 @@ from gateway.foxglove_schemas.topics import Topic
 from gateway.logs.failures import DefectLog
 from gateway.outputs.foxglove import connections
 from gateway.outputs.foxglove.connections import (
-    HANDSHAKE_TIMEOUT_S,
+    LIMITS,
     MAX_REQUEST_BYTES,
     Connection,
     Viewer,
@@ -29,7 +29,6 @@ from gateway.outputs.foxglove.connections import (
 
 SERVER_NAME: Final = "rtc3d-gateway"
 
-_CLOSE_TIMEOUT_S: Final = 0.5
 _PING_INTERVAL_S: Final = 10.0
 _PING_TIMEOUT_S: Final = 20.0
 """A viewer that does not answer a ping for this long is disconnected: its computer may have gone."""
@@ -89,10 +88,10 @@ class FoxgloveServer:
             subprotocols=[Subprotocol(name) for name in connections.SUBPROTOCOLS],
             compression=None,  # it would cost more than a network in a laboratory
             process_request=self._admission.refuse,
-            open_timeout=HANDSHAKE_TIMEOUT_S,
+            open_timeout=LIMITS.handshake_s,
             ping_interval=_PING_INTERVAL_S,
             ping_timeout=_PING_TIMEOUT_S,
-            close_timeout=_CLOSE_TIMEOUT_S,
+            close_timeout=LIMITS.close_s,
             max_size=MAX_REQUEST_BYTES,
             logger=_library_logger,
             create_connection=create,
@@ -133,10 +132,9 @@ class FoxgloveServer:
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve a viewer until it disconnects."""
-        self._admission.end(connection)
+        self._admission.clients.serve(connection)
         viewer = Viewer(connection, self._admission)
         logger.debug("foxglove: %s connected", viewer.address)
-        self._admission.num_clients += 1
         self._viewers.add(viewer)
         try:
             viewer.send_control(self._info)
@@ -148,7 +146,7 @@ class FoxgloveServer:
         except Exception as defect:  # noqa: BLE001 - the other viewers are served nevertheless
             self._defects.log(defect)
         finally:
-            self._admission.num_clients -= 1
+            self._admission.clients.close(connection)  # it may have ended before this began
             self._viewers.discard(viewer)
             for number in list(viewer.subscriptions):
                 self._unsubscribe(viewer, number)

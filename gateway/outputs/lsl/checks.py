@@ -14,18 +14,16 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
 from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.settings import LslSettings
+from gateway.outputs.lsl.settings import LSL, LslSettings
 from gateway.outputs.lsl.supervisor import lsl_environment
 from gateway.rtc3d.parameters import Parameters, ParametersEvents
-
-CHECKS: Final = ("opens", "found", "gateway")
 
 _TEST_SOURCE: Final = "doctor"
 _POLL_S: Final = 0.05
 _MIN_SEARCH_S: Final = 2.0
 _START_S: Final = 10.0
 
-_OPENS, _FOUND, _GATEWAY = (Check("lsl", name) for name in CHECKS)
+_OPENS, _FOUND, _GATEWAY = (Check("lsl", name) for name in LSL.checks)
 
 
 def check_lsl(
@@ -65,9 +63,9 @@ def check_lsl(
 def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]:
     """Return the streams that can be found within ``seconds``, by another process. Raises OutputError.
 
-    See find.py for what each has.
+    See process.py for what each has.
     """
-    command = [sys.executable, "-m", "gateway.outputs.lsl.find", str(seconds)]
+    command = [sys.executable, "-m", "gateway.outputs.lsl.process", str(seconds)]
     try:
         result = subprocess.run(  # noqa: S603 - our own module
             command,
@@ -90,7 +88,7 @@ def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]
 
 def _not_open(problem: str) -> list[Finding]:
     failing = _OPENS.problem(problem, "Correct lsl in the configuration.")
-    return failing_first(failing, CHECKS[1:])
+    return failing_first(failing, LSL.checks[1:])
 
 
 def _found(names: set[tuple[str, str]]) -> Finding:

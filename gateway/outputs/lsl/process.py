@@ -1,10 +1,14 @@
-"""The process for LSL: it has liblsl and its ports, and nothing else of the gateway.
+"""The processes that use liblsl, and the messages between them and the gateway.
 
 liblsl bounds neither the number of its clients nor what it reads from them before a line ends, so anyone on
 the network can exhaust the memory and the file descriptors of a process that uses it. Here that is only this
 process. It has limits of its own, and the gateway starts another one if it ends.
 
-    python -m gateway.outputs.lsl.process     with a connected socket as standard input
+    python -m gateway.outputs.lsl.process            with a connected socket as standard input
+    python -m gateway.outputs.lsl.process SECONDS    for the doctor: finds streams and prints them as JSON
+
+To the process, the gateway sends a header (kind, number of the stream, bytes that follow) and content. The
+process sends lines of JSON, see ``Report``.
 """
 
 import contextlib
@@ -16,12 +20,129 @@ import resource
 import select
 import signal
 import socket
+import struct
+import sys
 import threading
 import time
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from gateway.logs.safe_text import safe_text
-from gateway.outputs.lsl.wire import REPORT_INTERVAL_S, Kind, Message, MessageReader, Report, decode_samples
+from gateway.messages.host_time import clock_difference_us
+
+HEADER: Final = struct.Struct("<BII")
+_COUNT: Final = struct.Struct("<I")
+
+
+class Kind(IntEnum):
+    """The kind of a message to the process."""
+
+    OPEN = 1
+    """Open a stream; the content is JSON: its facts, and its tree as [name, text or children]."""
+    CLOSE = 2
+    """Close a stream; no content."""
+    SAMPLES = 3
+    """Push samples: their number, their times (float64), their values (float32)."""
+    TEXTS = 4
+    """Push samples of one text each; the content is JSON: a list of times and one of texts."""
+
+
+class Message(NamedTuple):
+    """A message to the process. Times are on the system's monotonic clock, in s."""
+
+    kind: Kind
+    stream: int
+    content: bytes = b""
+
+    def encode(self) -> bytes:
+        """Return the bytes to send."""
+        return HEADER.pack(self.kind, self.stream, len(self.content)) + self.content
+
+
+REPORT_INTERVAL_S: Final = 1.0
+"""The process repeats its report this often, even if nothing has changed, to show that it does not hang."""
+
+
+class Report(NamedTuple):
+    """What the process reports. ``wanted`` are the numbers of the streams that somebody receives.
+
+    ``ready`` is the version of liblsl, "" while it is not loaded. ``not_opened`` is a stream that liblsl
+    cannot open, and why. ``failure`` says why the process ends.
+    """
+
+    ready: str = ""
+    wanted: tuple[int, ...] = ()
+    not_opened: str = ""
+    failure: str = ""
+
+    def encode(self) -> bytes:
+        """Return one line of JSON."""
+        return json.dumps(self._asdict()).encode() + b"\n"
+
+    @classmethod
+    def decode(cls, line: bytes) -> "Report":
+        """Return the report of one line."""
+        fields = json.loads(line)
+        return cls(**{**fields, "wanted": tuple(fields["wanted"])})
+
+
+def samples_content(times_s: Sequence[float], values: npt.NDArray[np.float32]) -> bytes:
+    """Return the content of SAMPLES; ``values`` has the shape (samples, channels)."""
+    times = np.asarray(times_s, "<f8").tobytes()
+    return _COUNT.pack(len(times_s)) + times + values.astype("<f4", copy=False).tobytes()
+
+
+def decode_samples(content: bytes) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float32]]:
+    """Return the times and the values, shape (samples, channels)."""
+    (count,) = _COUNT.unpack_from(content)
+    times = np.frombuffer(content, "<f8", count, _COUNT.size)
+    values = np.frombuffer(content, "<f4", -1, _COUNT.size + times.nbytes)
+    return times, values.reshape(count, -1)
+
+
+def json_content(value: Any) -> bytes:
+    """Return the content of TEXTS."""
+    return json.dumps(value).encode()
+
+
+def opening_content(facts: Mapping[str, Any], tree: Sequence[Any]) -> bytes:
+    """Return the content of OPEN."""
+    return f"[{json.dumps(facts)}, [{', '.join(map(_tree_json, tree))}]]".encode()
+
+
+def _tree_json(element: tuple[str, Any]) -> str:
+    # One call of json.dumps for thousands of channels would keep all other threads waiting.
+    name, content = element
+    if isinstance(content, str):
+        return json.dumps(element)
+    return f'["{name}", [{", ".join(map(_tree_json, content))}]]'
+
+
+class MessageReader:
+    """Cuts the bytes that the process receives into messages."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[Message]:
+        """Return the messages that are complete with ``data``."""
+        self._buffer += data
+        start = 0
+        while len(self._buffer) - start >= HEADER.size:
+            kind, stream, size = HEADER.unpack_from(self._buffer, start)
+            end = start + HEADER.size + size
+            if end > len(self._buffer):
+                break
+            yield Message(Kind(kind), stream, bytes(self._buffer[start + HEADER.size : end]))
+            start = end
+        del self._buffer[:start]
+
+
+# The process that serves streams --------------------------------------------------------------
 
 MAX_MEMORY_BYTES: Final = 768 * 1024 * 1024
 MAX_FILES: Final = 4096
@@ -37,7 +158,7 @@ _POLL_S: Final = 0.1
 
 _RETRY_S: Final = 1.0
 _READ_BYTES: Final = 1 << 20
-_READINGS: Final = 5
+_SAME_CLOCK_US: Final = 1000
 _PR_SET_PDEATHSIG: Final = 1
 
 
@@ -155,18 +276,11 @@ def _append(element: Any, children: Any) -> None:
 
 
 def _lsl_minus_monotonic_s(pylsl: Any) -> float:
-    """Return LSL's clock minus the monotonic one, from the reading that was interrupted least.
-
-    In liblsl for Linux, both are the same clock.
-    """
-    best_s, difference_s = -1.0, 0.0
-    for _ in range(_READINGS):
-        before_s = time.monotonic()
-        lsl_s = pylsl.local_clock()
-        duration_s = time.monotonic() - before_s
-        if best_s < 0 or duration_s < best_s:
-            best_s, difference_s = duration_s, lsl_s - before_s
-    return 0.0 if abs(difference_s) < 1e-3 else difference_s
+    """Return LSL's clock minus the monotonic one. In liblsl for Linux, both are the same clock."""
+    difference_us = clock_difference_us(
+        lambda: round(pylsl.local_clock() * 1e6), lambda: time.monotonic_ns() // 1000
+    )
+    return 0.0 if abs(difference_us) < _SAME_CLOCK_US else difference_us / 1e6
 
 
 def _limit(kind: int, most: int) -> None:
@@ -193,7 +307,7 @@ def _end_with_gateway() -> None:
         libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
 
 
-def main() -> None:
+def _serve() -> None:
     """Run until the gateway closes the socket. Only that ends the process, not a signal to the service."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -210,9 +324,30 @@ def main() -> None:
         text = safe_text(f"{type(error).__name__}: {error}", 300)
         with contextlib.suppress(OSError):
             gateway.sendall(Report(failure=text).encode())
-    # liblsl would wait for each of its threads. The connections end with the process.
-    os._exit(0)
+
+
+def _find(seconds: float) -> None:
+    """Print what the streams are that liblsl finds."""
+    import pylsl  # noqa: PLC0415 - only here and in ``_serve``
+
+    found = [
+        {
+            "name": info.name(),
+            "type": info.type(),
+            "source_id": info.source_id(),
+            "computer": info.hostname(),
+            "rate_hz": info.nominal_srate(),
+            "num_channels": info.channel_count(),
+        }
+        for info in pylsl.resolve_streams(seconds)
+    ]
+    print(json.dumps(found), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) > 1:
+        _find(float(sys.argv[1]))
+    else:
+        _serve()
+    # liblsl would wait for each of its threads. The connections end with the process.
+    os._exit(0)

@@ -1,12 +1,13 @@
-"""The section ``lsl`` of the configuration."""
+"""The section ``lsl`` of the configuration, and the output in the registry."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
 from gateway.config.section import expects
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
+from gateway.outputs.kind import OutputKind, imported_late
 
 
 def _absolute_path(text: str) -> str:
@@ -34,3 +35,13 @@ class LslSettings(OutputSettings):
 
     buffer_s: BufferSeconds = 30
     """How many seconds of samples liblsl keeps for a receiver that is too slow; it loses older ones."""
+
+
+LSL: Final = OutputKind(
+    name="lsl",
+    settings=LslSettings,
+    create=imported_late("gateway.outputs.lsl.output:LslOutput"),
+    checks=("opens", "found", "gateway"),
+    run_checks=imported_late("gateway.outputs.lsl.checks:check_lsl"),
+)
+"""Its ports are open on every network interface."""

@@ -18,6 +18,7 @@ from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import MAX_FLOAT, NO_ROTATION, CoordinateFrame, product
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
+from gateway.outputs.lsl.process import Kind, Message, json_content, opening_content, samples_content
 from gateway.outputs.lsl.streams import (
     MAX_CHANNELS,
     DescribedSource,
@@ -27,7 +28,6 @@ from gateway.outputs.lsl.streams import (
     lsl_stream,
     num_labels,
 )
-from gateway.outputs.lsl.wire import Kind, Message, json_content, opening_content, samples_content
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters

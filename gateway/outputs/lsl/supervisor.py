@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.logs.failures import FailureLog
+from gateway.outputs.lsl.process import Message, Report
 from gateway.outputs.lsl.settings import LslSettings
-from gateway.outputs.lsl.wire import Message, Report
 from gateway.workers import module_environment, thread_starts
 
 SILENCE_S: Final = 10.0

@@ -91,13 +91,7 @@ class RosSource:
             self._num_items |= more
         return self.wants(counts)
 
-    def publish(
-        self,
-        frame: Frame,
-        stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - of the contract; each topic has its own
-        components: frozenset[ComponentType],
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand a frame to the sending thread. Raises OutputError if too many wait there."""
         if self._router.is_cut_off or self._is_closed:
             raise self._refusal()

@@ -199,7 +199,7 @@ class Arrivals:
         if composition.measured:
             rate = self.rates.get(stream)
             if rate is None:
-                rate = self._new_stream(stream)
+                rate = self.rates[stream] = StreamRate()
             rate.add(arrival)
             for component in composition.measured:
                 if self.stream_of.get(component) != stream:
@@ -215,10 +215,6 @@ class Arrivals:
             self.began_us = -_LONG_AGO_US
         for rate in self.rates.values():
             rate.restart()
-
-    def _new_stream(self, stream: int) -> StreamRate:
-        rate = self.rates[stream] = StreamRate()
-        return rate
 
     def _move(self, component: ComponentType, stream: int) -> None:
         """Note that a component comes on another stream now, and forget streams that have ended."""

@@ -6,15 +6,13 @@ from typing import Final
 
 from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.listen_address import from_this_computer, listen_problem
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
 from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
 
-CHECKS: Final = ("sources", "ports")
-
 _MAX_REPLY_BYTES: Final = 64 * 1024
 
-_SOURCES, _PORTS = (Check("rtc3d", name) for name in CHECKS)
+_SOURCES, _PORTS = (Check("rtc3d", name) for name in RTC3D.checks)
 
 
 def check_rtc3d(

@@ -1,13 +1,11 @@
 """What the gateway adds to the connection of an RTC3D client: limits, control of recordings, C3D files."""
 
 import asyncio
-import contextlib
 import logging
-import socket
 from collections.abc import Callable, Coroutine
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 from gateway.errors import CommandError, FrameError, QueryError
 from gateway.logs.failures import DefectLog
@@ -22,10 +20,10 @@ from gateway.rtc3d.packets import (
 )
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS, error_packet, recording_switch
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.workers import WorkerThread
+from gateway.server_limits import notice_vanished
 
-FIRST_COMMAND_S: Final = 10.0
-"""A client that has sent no command of the protocol within this time is disconnected."""
+if TYPE_CHECKING:
+    from gateway.outputs.rtc3d.live_server import LiveServer
 
 _CONTROL_S: Final = 30.0
 """How long a client waits at most for the start or the end of a recording."""
@@ -41,15 +39,6 @@ MAX_HELD_PACKETS: Final = MAX_FRAME_REQUESTS + 24
 
 _LONGEST_NAME: Final = 32  # of a command, in bytes
 
-_VANISHED: Final = {
-    "TCP_KEEPIDLE": 10,  # s
-    "TCP_KEEPINTVL": 5,  # s
-    "TCP_KEEPCNT": 3,
-    "TCP_USER_TIMEOUT": 300_000,  # ms
-}
-"""The options of sockets by which the system notices that a client's computer has vanished. The last one is
-for a client to which data is being sent. It also ends connections on which nothing is read for so long."""
-
 _log = logging.getLogger(__name__)
 
 ControlRecording = Callable[[str, bool, str], Coroutine[Any, Any, str]]
@@ -58,49 +47,23 @@ ControlRecording = Callable[[str, bool, str], Coroutine[Any, Any, str]]
 Returns the text of the server's reply, "" if it sent none."""
 
 
-class FilterOwner(Protocol):
-    """What a filter needs from its server."""
-
-    disk: WorkerThread
-    """Reads C3D files."""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether anything is known of the source."""
-
-    async def wait_until_known(self) -> None:
-        """Wait until ``is_known``, but not for long."""
-
-    def apply_parameters(self) -> None:
-        """Serve the newest parameters of the source."""
-
-    def control_recording(self, *, start: bool, options: str) -> Coroutine[Any, Any, str]:
-        """Start or stop a recording on the source's server; return its reply or "". Raises QueryError."""
-
-    def file_lost(self, client: str, path: Path, reason: str) -> None:
-        """Count and log a C3D file that a client does not get."""
-
-    def packet_lost(self, client: str) -> None:
-        """Count and log a packet that a client does not get, because it reads a C3D file too slowly."""
-
-    def check_wanted(self) -> None:
-        """Note whether any client asks for frames now."""
-
-
 class ClientFilter(ConnectionFilter):
     """Limits what a client can do without a command, and lets it control recordings and get files."""
 
-    def __init__(self, connection: FilteredConnection, owner: FilterOwner) -> None:
+    def __init__(self, connection: FilteredConnection, owner: "LiveServer") -> None:
         super().__init__(connection)
         self._owner = owner
-        self.has_greeted = False
-        """Whether the client has sent a command of the protocol."""
         self._files: list[Path] = []
         self._held: list[bytes] = []  # packets that wait for the end of a file
         self._tasks: set[asyncio.Task[None]] = set()
         self._defects = DefectLog(_log, "rtc3d")
-        self._greeting = asyncio.get_running_loop().call_later(FIRST_COMMAND_S, self._give_up)
-        _keep_alive(connection.transport.get_extra_info("socket"))
+        self._greeting = asyncio.get_running_loop().call_later(owner.limits.handshake_s, self._give_up)
+        notice_vanished(connection.transport.get_extra_info("socket"), owner.limits)
+
+    @property
+    def has_greeted(self) -> bool:
+        """Whether the client has sent a command of the protocol."""
+        return self in self._owner.clients.served
 
     def send(self, packet: bytes) -> None:
         """Send a packet, or hold it until the end of a file."""
@@ -136,18 +99,23 @@ class ClientFilter(ConnectionFilter):
 
     def connection_lost(self) -> None:
         """End what is done for the client."""
+        self._owner.clients.close(self)
         self._greeting.cancel()
         for task in self._tasks:
             task.cancel()
 
+    def abort(self) -> None:
+        """Disconnect the client at once."""
+        self.connection.transport.abort()
+
     def _greet(self) -> None:
-        self.has_greeted = True
+        self._owner.clients.serve(self)
         self._greeting.cancel()
 
     def _give_up(self) -> None:
-        name = self.connection.name
-        _log.debug("%s sent no command within %g s; closing", name, FIRST_COMMAND_S)
-        self.connection.write(error_packet(f"No command within {FIRST_COMMAND_S:g} s; closing"))
+        wait_s = self._owner.limits.handshake_s
+        _log.debug("%s sent no command within %g s; closing", self.connection.name, wait_s)
+        self.connection.write(error_packet(f"No command within {wait_s:g} s; closing"))
         self.connection.transport.close()
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
@@ -266,11 +234,3 @@ def asks_for_parameters(packet: Packet) -> bool:
 
 def _done(control: commands.ControlRecording) -> str:
     return "started" if control.start else "stopped"
-
-
-def _keep_alive(tcp: socket.socket) -> None:
-    """Let the system find out when the client's computer has vanished."""
-    with contextlib.suppress(OSError):
-        tcp.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _VANISHED.items():
-            tcp.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -5,9 +5,9 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable, Coroutine, Sequence
-from operator import attrgetter
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from gateway.logs.failures import EventLog
 from gateway.logs.losses import Losses
@@ -17,11 +17,12 @@ from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
 from gateway.outputs.rtc3d.live_scene import LiveScene
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
-from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
+from gateway.rtc3d_server.client_connection import LIMITS, ClientConnection
 from gateway.rtc3d_server.client_session import error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.scene import FrameSource
 from gateway.rtc3d_server.server import RtServer
+from gateway.server_limits import Clients
 from gateway.workers import WorkerThread
 
 SLOW_CLIENT: Final = "slow client"
@@ -29,9 +30,6 @@ SLOW_CLIENT: Final = "slow client"
 
 FILE: Final = "C3D file"
 """The cause of C3D files that a client did not get."""
-
-_MAX_UNREAD_IN_ALL: Final = 512 * 1024 * 1024
-"""How many bytes are kept at most for all clients of a source together."""
 
 _NO_FRAMES_S: Final = 2.0
 """How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
@@ -87,7 +85,8 @@ class LiveServer(RtServer):
     ) -> None:
         self._live_scene = LiveScene(state.source)
         super().__init__(self._live_scene, host, port, name=f"rtc3d.ports.{state.source}")
-        self.max_clients = max_clients
+        self.clients: Clients[ClientFilter] = Clients(LIMITS, ClientFilter.abort)
+        self.set_max_clients(max_clients)
         self._state = state
         self._applied_parameters: ServerParameters | None = None
         self._wanted_changed = wanted_changed
@@ -103,6 +102,10 @@ class LiveServer(RtServer):
         """Reads C3D files."""
 
     # From the gateway -----------------------------------------------------------------------
+
+    def set_max_clients(self, max_clients: int) -> None:
+        """Serve so many clients at most from now on; those that are connected may stay."""
+        self.limits = self.clients.limits = replace(LIMITS, clients=max_clients)
 
     def take(self, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
         """Send a frame that has just arrived on this stream to the clients that want it."""
@@ -163,10 +166,8 @@ class LiveServer(RtServer):
 
     def send_file(self, path: Path) -> None:
         """Send a C3D file to every client that has sent a command."""
-        for connection in self.connections:
-            client = connection.filter
-            if isinstance(client, ClientFilter) and client.has_greeted:
-                client.send_file(path)
+        for client in self.clients.served:
+            client.send_file(path)
 
     def maintain(self) -> None:
         """Count the frames that slow clients have lost. Call it once a second."""
@@ -181,13 +182,8 @@ class LiveServer(RtServer):
         elapsed_us = super().elapsed_us()
         return None if elapsed_us is None else max(elapsed_us, self._live_scene.newest_us)
 
-    @property
-    def max_unread_bytes(self) -> int:
-        """See RtServer."""
-        return min(MAX_UNREAD_BYTES, _MAX_UNREAD_IN_ALL // self.max_clients)
-
     def frames(self, components: Sequence[ComponentType]) -> FrameSource:
-        """See ConnectionOwner. Frames that no client asks for are not made."""
+        """See RtServer. Frames that no client asks for are not made."""
         return self._live_scene.frames(components)
 
     def next_frame_us(self) -> int | None:
@@ -201,7 +197,7 @@ class LiveServer(RtServer):
             super().send_frames(elapsed_us)
 
     def frames_requested(self) -> int | None:
-        """See ConnectionOwner."""
+        """See RtServer."""
         if self.elapsed_us() is None and not self._state.has_no_measurement:
             self.start_measurement()
             if not self._state.is_streaming:
@@ -209,7 +205,7 @@ class LiveServer(RtServer):
         return self.elapsed_us()
 
     def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
-        """See ConnectionOwner."""
+        """See RtServer."""
         return ClientFilter(connection, self)
 
     async def close(self) -> None:
@@ -252,33 +248,20 @@ class LiveServer(RtServer):
 
     def log_opened(self, connection: ClientConnection) -> None:
         """Log a new client, and turn away one that is too many."""
-        num_clients = len(self.connections)
-        if num_clients <= self.max_clients or self._close_silent_client(connection):
-            text = f"client {connection.name} connected ({num_clients} now)"
+        if not self.clients.is_full:
+            self.clients.open(cast(ClientFilter, connection.filter))
+            text = f"client {connection.name} connected ({len(self.clients)} now)"
             self._events.log(logging.INFO, text, "connected")
             return
+        most = self.limits.clients
         self._events.log(
             logging.WARNING,
-            f"client {connection.name} was turned away: {self.max_clients} clients are connected; close "
-            "some, or raise rtc3d.max_clients",
+            f"client {connection.name} was turned away: {most} clients are connected; close some, or raise "
+            "rtc3d.max_clients",
             "too many",
         )
-        connection.write(error_packet(f"This gateway serves {self.max_clients} clients at most; closing"))
+        connection.write(error_packet(f"This gateway serves {most} clients at most; closing"))
         connection.close()
-
-    def _close_silent_client(self, newest: ClientConnection) -> bool:
-        """Close the oldest connection that has sent no command yet; return whether there is one."""
-        silent = [
-            connection
-            for connection in self.connections
-            if isinstance(connection.filter, ClientFilter)
-            and not connection.filter.has_greeted
-            and connection is not newest
-            and not connection.transport.is_closing()
-        ]
-        if silent:
-            min(silent, key=attrgetter("number")).transport.abort()
-        return bool(silent)
 
     def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:
         """Log that a client has gone, and count what it lost."""
@@ -289,15 +272,16 @@ class LiveServer(RtServer):
         self._events.log(logging.INFO, f"client {connection.name} disconnected{reason}", "disconnected")
 
     def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
-        """See ConnectionOwner."""
+        """See RtServer."""
+        mib = self.limits.unread_bytes_each / 2**20
         text = (
-            f"client {connection.name} does not read: {self.max_unread_bytes / 2**20:.2g} MiB wait for it; "
+            f"client {connection.name} does not read: {mib:.2g} MiB wait for it; "
             "its frames are dropped until it reads again; check that program, or the network to it"
         )
         self._events.log(logging.WARNING if is_first else logging.DEBUG, text, "slow")
 
     def reading_resumed(self, connection: ClientConnection) -> None:
-        """See ConnectionOwner."""
+        """See RtServer."""
         self._count_dropped(connection)
         num_dropped = connection.session.frames_dropped
         text = f"client {connection.name} reads again; {num_dropped} of its frames were dropped"

@@ -6,22 +6,20 @@ from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Final
 
-from gateway.errors import GatewayError, OutputError
-from gateway.logs.failures import DefectLog, FailureLog, defect_text, log_fields
+from gateway.errors import OutputError, PortError
+from gateway.logs.failures import log_fields
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
-from gateway.messages.topics import Topic
 from gateway.outputs.contract import (
     CONTROL_OPTION,
     FramePublisher,
-    IgnoringPublisher,
     Output,
     OutputHealth,
-    Publisher,
     QueryService,
     ServerFile,
     ServerParameters,
 )
+from gateway.outputs.frame_output import PortOpener, ServerOutput
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT, LiveServer, SourceState
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.threads import LoopThread, in_this_loop
@@ -38,9 +36,11 @@ Take = Callable[[str, Frame, int, frozenset[ComponentType]], None]
 class Rtc3dPublisher:
     """Hands frames of one source over, while any client wants frames."""
 
-    def __init__(self, state: SourceState, thread: Callable[[], LoopThread | None], take: Take) -> None:
+    def __init__(
+        self, state: SourceState, offer: Callable[[Callable[[], None], int], bool], take: Take
+    ) -> None:
         self._state = state
-        self._thread = thread
+        self._offer = offer
         self._take = take
         self._is_closed = False
 
@@ -57,23 +57,14 @@ class Rtc3dPublisher:
         """See FramePublisher."""
         return self.wanted
 
-    def publish(
-        self,
-        frame: Frame,
-        stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - frames keep the server's own numbers
-        components: frozenset[ComponentType],
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand a frame over. Raises OutputError if too many wait."""
         if self._is_closed:
             raise OutputError(
                 f"rtc3d: {self._state.source} is closed; ask for a new publisher", cause="closed"
             )
-        thread = self._thread()
-        if not self._state.wanted or thread is None:
-            return
         call = partial(self._take, self._state.source, frame, stamp.session, components)
-        if not thread.offer(call, len(frame.body)):
+        if self._state.wanted and not self._offer(call, len(frame.body)):
             raise OutputError(
                 f"rtc3d: the frames of {self._state.source} arrive faster than they can be sent to all "
                 "clients; let fewer clients connect, or let them ask for fewer frames",
@@ -85,11 +76,6 @@ class Rtc3dPublisher:
         self._is_closed = True
 
 
-_FIRST_RETRY_S: Final = 0.2
-_MAX_RETRY_S: Final = 1.0
-"""How long to wait before a port that was in use is tried again: longer each time, up to this."""
-
-_CLOSING_S: Final = 3.0
 _RECORDING: Final = ("recording",)
 
 _log = logging.getLogger(__name__)
@@ -98,23 +84,25 @@ _log = logging.getLogger(__name__)
 class _Served:
     """A source that is served: its port, its server while that is open, and the task that keeps it open."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, source: str, port: int) -> None:
         self.port = port
+        self.opener = PortOpener(_log, f"{source} to rtc3d", f"port {port} is not open yet")
         self.server: LiveServer | None = None
-        self.problem = f"port {port} is not open yet"
         self.task: asyncio.Task[None] | None = None
         self.is_stopped = False
         self.closed = asyncio.Event()
 
 
-class Rtc3dOutput(Output):
+class Rtc3dOutput(ServerOutput):
     """Serves RTC3D clients in a thread of its own. They share the gateway's session with each server."""
 
     name = "rtc3d"
     drop_causes = (SLOW_CLIENT, QUEUE_FULL, FILE)
+    close_s = 3.0
 
     def __init__(self, settings: Rtc3dSettings) -> None:
-        self._settings = settings
+        super().__init__()
+        self.settings: Rtc3dSettings = settings
         self._states: dict[str, SourceState] = {}
         self._announced: set[str] = set()
         self._served: dict[str, _Served] = {}  # by source; replaced when the settings change
@@ -122,57 +110,46 @@ class Rtc3dOutput(Output):
         self._on_wanted: dict[str, Callable[[], None]] = {}
         self._queries: QueryService | None = None
         self._loop: asyncio.AbstractEventLoop | None = None  # of the gateway
-        self._thread: LoopThread | None = None
-        self._is_closed = False
-        self._defects = DefectLog(_log, self.name)
 
     # The core -------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Open the ports."""
-        if self._thread is None and not self._is_closed:
-            self._thread = LoopThread(self.name)
-            self._open_ports()
-            for source in self._settings.ports.keys() - self._announced:
-                _log.warning("rtc3d.ports has a port for %s, which is no source; correct its name", source)
-
-    def publisher(self, topic: Topic) -> Publisher:  # noqa: ARG002 - the protocol has no topics
-        """Return a publisher that ignores status and clock."""
-        return IgnoringPublisher()
+    def _serve(self, thread: LoopThread) -> None:  # noqa: ARG002 - see _open_ports
+        self._open_ports()
+        for source in self.settings.ports.keys() - self._announced:
+            _log.warning("rtc3d.ports has a port for %s, which is no source; correct its name", source)
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return a publisher of whole frames."""
-        return Rtc3dPublisher(self._state(source), lambda: self._thread, self._take)
+        return Rtc3dPublisher(self._state(source), self._offer, self._take)
 
     def health(self) -> OutputHealth:
         """Return whether clients can connect to all sources that have a port."""
         if self._thread is None or self._is_closed:
             return OutputHealth(False, "rtc3d is not open")
-        problems = [served.problem for served in list(self._served.values()) if served.problem]
+        problems = [each.opener.problem for each in list(self._served.values()) if each.opener.problem]
         return OutputHealth(not problems, "; ".join(problems))
-
-    def close(self) -> None:
-        """Close all connections and ports."""
-        self._is_closed = True
-        if self._thread is not None:
-            self._thread.close(self._stop_all, _CLOSING_S)
 
     def _state(self, source: str) -> SourceState:
         if source not in self._states:
             self._states[source] = SourceState(source)
         return self._states[source]
 
+    def _server(self, source: str) -> LiveServer | None:
+        """Return the server of a source, in the thread; None while its port is not open."""
+        served = self._served.get(source)
+        return None if served is None else served.server
+
     # Maintenance ----------------------------------------------------------------------------
 
     def maintain(self) -> None:
         """Let the thread count what slow clients have lost."""
-        self._call(self._maintain)
+        self._offer(self._maintain)
 
     def _maintain(self) -> None:
-        for served in list(self._served.values()):
-            if served.server is not None:
-                served.server.apply_state()
-                served.server.maintain()
+        for source in list(self._served):
+            if (server := self._server(source)) is not None:
+                server.apply_state()
+                server.maintain()
 
     def is_configured_like(self, other: Output) -> bool:
         """Any settings can be taken over."""
@@ -181,10 +158,10 @@ class Rtc3dOutput(Output):
     def take_over(self, other: Output) -> bool:
         """Apply other settings. Clients of sources whose address stays the same notice nothing."""
         assert isinstance(other, Rtc3dOutput)  # noqa: S101 - is_configured_like says so
-        before, self._settings = self._settings, other._settings  # noqa: SLF001 - the same class
-        if before == self._settings:
+        before, self.settings = self.settings, other.settings
+        if before == self.settings:
             return False
-        if before.host != self._settings.host:
+        if before.host != self.settings.host:
             self._close_ports(list(self._served))
         self._open_ports()
         return True
@@ -214,39 +191,30 @@ class Rtc3dOutput(Output):
     def show_streaming(self, source: str, is_streaming: bool) -> None:
         """Let clients know when frames end."""
         self._state(source).is_streaming = is_streaming
-        self._call(self._maintain)
+        self._offer(self._maintain)
 
     def show_measurement(self, source: str, is_running: bool | None) -> None:
         """Let clients know when a measurement ends."""
         self._state(source).is_measuring = is_running
-        self._call(self._maintain)
+        self._offer(self._maintain)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Serve these parameters to clients that ask for them."""
         self._state(source).parameters = parameters
-        self._call(self._maintain)
+        self._offer(self._maintain)
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Pass a C3D file on to the clients."""
         if self._thread is not None:
-            self._thread.run(self._send_file(source, file))  # not _call, which can be refused
+            self._thread.run(self._send_file(source, file))  # not _offer, which can be refused
 
     async def _send_file(self, source: str, file: ServerFile) -> None:
-        served = self._served.get(source)
-        if served is not None and served.server is not None:
-            served.server.send_file(file.path)
+        if (server := self._server(source)) is not None:
+            server.send_file(file.path)
 
     def _take(self, source: str, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
-        try:
-            served = self._served.get(source)
-            if served is not None and served.server is not None:
-                served.server.take(frame, stream, wanted)
-        except Exception as defect:  # noqa: BLE001 - the next frame may be different
-            self._defects.log(defect)
-
-    def _call(self, call: Callable[[], None]) -> None:
-        if self._thread is not None:
-            self._thread.offer(call)
+        if (server := self._server(source)) is not None:
+            server.take(frame, stream, wanted)
 
     # Recordings -----------------------------------------------------------------------------
 
@@ -269,7 +237,7 @@ class Rtc3dOutput(Output):
 
     def _open_ports(self) -> None:
         """Open the ports of the sources that are announced, and close others."""
-        ports = {source: port for source, port in self._settings.ports.items() if source in self._announced}
+        ports = {source: port for source, port in self.settings.ports.items() if source in self._announced}
         self._close_ports(
             [source for source, served in self._served.items() if ports.get(source) != served.port]
         )
@@ -277,15 +245,14 @@ class Rtc3dOutput(Output):
             return
         for source, port in ports.items():
             if source not in self._served:
-                served = self._served[source] = _Served(port)
+                served = self._served[source] = _Served(source, port)
                 self._closing = [former for former in self._closing if not former.closed.is_set()]
                 self._thread.run(self._keep_open(self._state(source), served, tuple(self._closing)))
-            self._call(partial(self._set_max_clients, source, self._settings.max_clients))
+            self._offer(partial(self._set_max_clients, source, self.settings.max_clients))
 
     def _set_max_clients(self, source: str, max_clients: int) -> None:
-        served = self._served.get(source)
-        if served is not None and served.server is not None:
-            served.server.max_clients = max_clients
+        if (server := self._server(source)) is not None:
+            server.set_max_clients(max_clients)
 
     def _close_ports(self, sources: list[str]) -> None:
         for source in sources:
@@ -295,47 +262,34 @@ class Rtc3dOutput(Output):
                 self._closing.append(served)
                 self._thread.run(_stop(served))
 
-    async def _stop_all(self) -> None:
+    async def _stop(self) -> None:
         await asyncio.gather(*(_stop(served) for served in self._served.values()))
 
     async def _keep_open(self, state: SourceState, served: _Served, closing: Sequence[_Served]) -> None:
-        """Listen on the port until stopped; try again while that is not possible.
-
-        Wait for those that are ``closing`` first.
-        """
+        """Listen on the port until stopped. Wait for those that are ``closing`` first."""
         served.task = asyncio.current_task()
         for former in closing:
             await former.closed.wait()
-        host, port = self._settings.host, served.port
-        failures = FailureLog(_log, f"{state.source} to rtc3d")
-        delay_s = _FIRST_RETRY_S
+        if served.is_stopped:
+            return
+        host, port = self.settings.host, served.port
+        listen = partial(self._listen, state, host, port)
         with log_fields(source=state.source):
-            while not served.is_stopped:
-                server = LiveServer(
-                    state,
-                    host,
-                    port,
-                    self._settings.max_clients,
-                    self._on_wanted.get(state.source, lambda: None),
-                    self._control_recording,
-                )
-                try:
-                    await server.listen()
-                except Exception as error:  # noqa: BLE001 - the next try may succeed
-                    reason = str(error) if isinstance(error, GatewayError) else defect_text(error)
-                    served.problem = f"RTC3D clients cannot connect: {reason}"
-                    failures.failed(served.problem)
-                    await asyncio.sleep(delay_s)
-                    delay_s = min(2 * delay_s, _MAX_RETRY_S)
-                    continue
-                served.problem = ""
-                served.server = server
-                failures.succeeded(f"clients can connect to {host}, port {port}")
-                try:
-                    await asyncio.Event().wait()  # until cancelled
-                finally:
-                    served.server = None
-                    await server.close()
+            served.server = await served.opener.open(listen, f"clients can connect to {host}, port {port}")
+            try:
+                await asyncio.Event().wait()  # until cancelled
+            finally:
+                server, served.server = served.server, None
+                await server.close()
+
+    async def _listen(self, state: SourceState, host: str, port: int) -> LiveServer:
+        on_wanted = self._on_wanted.get(state.source, lambda: None)
+        server = LiveServer(state, host, port, self.settings.max_clients, on_wanted, self._control_recording)
+        try:
+            await server.listen()
+        except PortError as error:
+            raise PortError(f"RTC3D clients cannot connect: {error}") from error
+        return server
 
 
 async def _stop(served: _Served) -> None:

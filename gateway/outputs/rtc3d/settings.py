@@ -1,4 +1,4 @@
-"""The section ``rtc3d`` of the configuration."""
+"""The section ``rtc3d`` of the configuration, and the output in the registry."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Final, Self
@@ -8,6 +8,8 @@ from pydantic import AfterValidator, Field, PlainSerializer, model_validator
 from gateway.config.section import expects, validation_error
 from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, SourceName, Switch
+from gateway.outputs.kind import OutputKind, imported_late
+from gateway.outputs.listen_address import is_loopback
 
 DEFAULT_MAX_CLIENTS: Final = 128
 
@@ -61,3 +63,13 @@ class Rtc3dSettings(OutputSettings):
                 "found nothing; expected a port for each source that is served, as in {lab: 3120}", "ports"
             )
         return self
+
+
+RTC3D: Final = OutputKind(
+    name="rtc3d",
+    settings=Rtc3dSettings,
+    create=imported_late("gateway.outputs.rtc3d.output:Rtc3dOutput"),
+    checks=("sources", "ports"),
+    run_checks=imported_late("gateway.outputs.rtc3d.checks:check_rtc3d"),
+    leaves_host=lambda settings: not is_loopback(settings.host),
+)

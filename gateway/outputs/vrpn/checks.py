@@ -9,13 +9,11 @@ from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
 from gateway.outputs.vrpn.server import bind
-from gateway.outputs.vrpn.settings import VrpnSettings
-
-CHECKS: Final = ("port", "access")
+from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
 
 _TIMEOUT_S: Final = 2.0
 
-_PORT, _ACCESS = (Check("vrpn", name) for name in CHECKS)
+_PORT, _ACCESS = (Check("vrpn", name) for name in VRPN.checks)
 
 
 def check_vrpn(
@@ -23,11 +21,6 @@ def check_vrpn(
 ) -> list[Finding]:
     """Check that the port can be used, and say who can connect."""
     return [_check_port(settings), _check_access(settings)]
-
-
-def leaves_host(settings: VrpnSettings) -> bool:
-    """Return whether other computers can connect."""
-    return not is_loopback(settings.host)
 
 
 def _check_port(settings: VrpnSettings) -> Finding:
@@ -59,7 +52,7 @@ def _is_served(settings: VrpnSettings) -> bool:
 
 
 def _check_access(settings: VrpnSettings) -> Finding:
-    if not leaves_host(settings):
+    if is_loopback(settings.host):
         return _ACCESS.passing("only programs on this computer can connect")
     return _ACCESS.note(
         f"any computer that reaches {settings.host} can connect: VRPN has no password and no encryption",

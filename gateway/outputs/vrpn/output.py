@@ -10,15 +10,8 @@ from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
-from gateway.messages.topics import Topic
-from gateway.outputs.contract import (
-    FramePublisher,
-    IgnoringPublisher,
-    Output,
-    OutputHealth,
-    Publisher,
-    ServerParameters,
-)
+from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
+from gateway.outputs.frame_output import ServerOutput
 from gateway.outputs.threads import LoopThread, in_this_loop
 from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import VrpnServer
@@ -77,7 +70,6 @@ class VrpnPublisher:
         self,
         frame: Frame,
         stamp: Stamp,
-        sequence: int,  # noqa: ARG002 - VRPN has no sequence numbers
         components: frozenset[ComponentType],  # noqa: ARG002 - see ``prepare``
     ) -> None:
         """Hand over a frame with tools. Raises OutputError if too many wait, or if the unit is unknown."""
@@ -150,36 +142,26 @@ def _tool_indices(layout: FrameLayout) -> list[int]:
     return [index for index, each in components if each.type is ComponentType.TOOLS and each.num_items]
 
 
-_CLOSING_S: Final = 1.0
-
-
-class VrpnOutput(Output):
+class VrpnOutput(ServerOutput):
     """A VRPN server in a thread of its own, and a publisher for each source."""
 
     name = "vrpn"
     drop_causes = ("slow client", "queue full", "unknown unit", "too many tools")
 
     def __init__(self, settings: VrpnSettings) -> None:
-        self.settings = settings
+        super().__init__()
+        self.settings: VrpnSettings = settings
         self._server = VrpnServer(settings.host, settings.port, settings.tracker_names, self._wanted_changed)
         self._publishers: dict[str, VrpnPublisher] = {}  # by source
-        self._thread: LoopThread | None = None
         self._on_wanted: dict[str, Callable[[], None]] = {}  # by source
 
-    def start(self) -> None:
-        """Start to listen."""
-        self._thread = LoopThread(self.name)
-        self._thread.run(self._server.serve())
+    def _serve(self, thread: LoopThread) -> None:
+        thread.run(self._server.serve())
         for publisher in self._publishers.values():
             publisher.name_trackers()
 
-    def _offer(self, call: Callable[[], None], num_bytes: int) -> bool:
-        """See LoopThread.offer."""
-        return self._thread is not None and self._thread.offer(call, num_bytes)
-
-    def publisher(self, topic: Topic) -> Publisher:  # noqa: ARG002 - of no topic
-        """Return a publisher that does nothing: VRPN has no status and no clock."""
-        return IgnoringPublisher()
+    async def _stop(self) -> None:
+        await self._server.close()
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return a new publisher of the frames of ``source``, whose tools become trackers."""
@@ -224,12 +206,3 @@ class VrpnOutput(Output):
         """Return whether clients can connect."""
         problem = self._server.problem
         return OutputHealth(not problem, problem)
-
-    def is_configured_like(self, other: Output) -> bool:
-        """Return whether ``other`` has the same settings."""
-        return isinstance(other, VrpnOutput) and self.settings == other.settings
-
-    def close(self) -> None:
-        """Disconnect all clients and stop listening."""
-        if self._thread is not None:
-            self._thread.close(self._server.close, _CLOSING_S)

@@ -1,4 +1,4 @@
-"""The section ``vrpn`` of the configuration."""
+"""The section ``vrpn`` of the configuration, and the output in the registry."""
 
 from collections.abc import Sequence
 from typing import Annotated, Final
@@ -6,6 +6,8 @@ from typing import Annotated, Final
 from gateway.config.section import expects
 from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, Switch
+from gateway.outputs.kind import OutputKind, imported_late
+from gateway.outputs.listen_address import is_loopback
 from gateway.outputs.vrpn.trackers import TrackerNames
 
 DEFAULT_VRPN_PORT: Final = 3883
@@ -30,3 +32,13 @@ class VrpnSettings(OutputSettings):
     def listens_on(self) -> Sequence[ListenAddress]:
         """See OutputSettings."""
         return [ListenAddress(("port",), self.host, self.port)]
+
+
+VRPN: Final = OutputKind(
+    name="vrpn",
+    settings=VrpnSettings,
+    create=imported_late("gateway.outputs.vrpn.output:VrpnOutput"),
+    checks=("port", "access"),
+    run_checks=imported_late("gateway.outputs.vrpn.checks:check_vrpn"),
+    leaves_host=lambda settings: not is_loopback(settings.host),
+)

@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 from gateway.errors import NO_FILES
 from gateway.logs.failures import DefectLog
 from gateway.outputs.listen_address import foreign_request
+from gateway.server_limits import Clients, ServerLimits
 from gateway.service.monitoring.process_limits import ReservedFiles
 
 logger = logging.getLogger(__name__)
@@ -25,11 +26,8 @@ logger = logging.getLogger(__name__)
 MAX_REQUEST_BYTES: Final = 8192
 """The size limit of a request's head; a connection that exceeds it is closed."""
 
-MAX_CONNECTIONS: Final = 128
-"""How many connections may be open; one more disconnects the oldest, which has had the most time."""
-
-REQUEST_TIMEOUT_S: Final = 5.0
-"""How long a connection may last."""
+LIMITS: Final = ServerLimits(clients=128)
+"""A connection counts as in the handshake until it ends: one too many disconnects the oldest."""
 
 MAX_PAGE_AGE_S: Final = 0.1
 """How long a page is served again: building it takes the event loop some ms, however many clients ask."""
@@ -69,8 +67,7 @@ class HttpPages:
         self._built: dict[str, tuple[float, Page]] = {}
         """The newest page of each path, and when it was built, on the monotonic clock in s."""
         self._defects = DefectLog(logger, "metrics")
-        self._connections: dict[asyncio.Task[None], None] = {}
-        """The open connections, oldest first."""
+        self._connections: Clients[asyncio.Task[None]] = Clients(LIMITS, asyncio.Task.cancel)
 
     async def start(self, addresses: Sequence[str], port: int) -> None:
         """Listen on IP addresses; raises OSError if one of them or the port cannot be bound."""
@@ -109,14 +106,12 @@ class HttpPages:
             connection = self._accepted(listening)
         except OSError as error:
             if error.errno in NO_FILES:
-                self._disconnect_oldest()
+                self._connections.disconnect_oldest()
                 loop.remove_reader(listening)
                 loop.call_later(_ACCEPT_PAUSE_S, self._resume, listening)
             return
-        if len(self._connections) >= MAX_CONNECTIONS:
-            self._disconnect_oldest()
         task = loop.create_task(self._serve(connection))
-        self._connections[task] = None
+        self._connections.open(task)
         task.add_done_callback(functools.partial(self._end, connection))
 
     def _accepted(self, listening: socket.socket) -> socket.socket:
@@ -131,16 +126,10 @@ class HttpPages:
 
     def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
         connection.close()
-        self._connections.pop(task, None)
+        self._connections.close(task)
         self._reserve.refill()
         if not task.cancelled() and (defect := task.exception()) is not None:
             self._defects.log(defect)
-
-    def _disconnect_oldest(self) -> None:
-        oldest = next(iter(self._connections), None)
-        if oldest is not None:
-            del self._connections[oldest]
-            oldest.cancel()
 
     async def _serve(self, connection: socket.socket) -> None:
         loop = asyncio.get_running_loop()
@@ -154,7 +143,7 @@ class HttpPages:
             transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
             writer = asyncio.StreamWriter(transport, protocol, reader, loop)
             try:
-                async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                async with asyncio.timeout(self._connections.limits.handshake_s):
                     head = await reader.readuntil(b"\r\n\r\n")
                     writer.write(self._response(head))
                     await writer.drain()

@@ -73,14 +73,10 @@ class FrameOutput(ToyOutput):
         self.received = ALL
         self.prepared: list[tuple[FrameLayout, frozenset[ComponentType]]] = []
         self.on_change: Callable[[], None] = lambda: None
-        self.frames: list[tuple[Frame, Stamp, int, frozenset[ComponentType]]] = []
+        self.frames: list[tuple[Frame, Stamp, frozenset[ComponentType]]] = []
         self.sources: list[str] = []
         self.closed = 0
         self.losses: dict[str, Losses] = {}
-
-    @property
-    def sequences(self) -> list[int]:
-        return [sequence for _, _, sequence, _ in self.frames]
 
     def frame_publisher(self, source: str) -> "FrameOutputPublisher":
         self.sources.append(source)
@@ -107,12 +103,10 @@ class FrameOutputPublisher:
             raise self._output.error
         return not components.isdisjoint(self._output.received)
 
-    def publish(
-        self, frame: Frame, stamp: Stamp, sequence: int, components: frozenset[ComponentType]
-    ) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         if self._output.error is not None:
             raise self._output.error
-        self._output.frames.append((frame, stamp, sequence, components))
+        self._output.frames.append((frame, stamp, components))
 
     def close(self) -> None:
         self._output.closed += 1

@@ -1,4 +1,4 @@
-"""Outputs that take whole frames: what they get, how it is numbered and counted, and how they close."""
+"""Outputs that take whole frames: what they get, how it is counted, and how they close."""
 
 from gateway.errors import OutputError
 from gateway.outputs.guard import GuardedOutput
@@ -23,23 +23,23 @@ from tests.unit.publish.rig import (
 )
 
 
-def test_whole_frames_have_one_number_each_and_skipped_ones_are_a_gap() -> None:
+def test_frames_without_wanted_components_are_not_published_and_skipped_messages_are_counted() -> None:
     output = FrameOutput()
     fan_out = FanOut("lab", [output])
-    fan_out.publish(frame(0), stamp(0), frozenset({EVENT}))  # it has none, and uses up no number
+    fan_out.publish(frame(0), stamp(0), frozenset({EVENT}))  # it has none
     assert fan_out.skip(frame(0), stamp(0), frozenset({EVENT})) == 0
     publish(fan_out, 1)
     assert fan_out.skip(frame(2), stamp(2), ALL) == 2
     publish(fan_out, 3)
-    assert output.sequences == [0, 2]
+    assert [published.body for published, _, _ in output.frames] == [frame(1).body, frame(3).body]
 
 
-def test_each_frame_arrives_whole_with_its_stamp_number_and_wanted_components() -> None:
+def test_each_frame_arrives_whole_with_its_stamp_and_wanted_components() -> None:
     output = FrameOutput()
     fan_out = FanOut("lab", [output])
     publish_full(fan_out)
     publish_full(fan_out, ONLY_MARKERS)
-    assert output.frames == [(FULL, STAMP, 0, ALL), (FULL, STAMP, 1, ONLY_MARKERS)]
+    assert output.frames == [(FULL, STAMP, ALL), (FULL, STAMP, ONLY_MARKERS)]
     assert output.sources == ["lab"]
 
 
@@ -67,7 +67,7 @@ def test_frames_that_nobody_receives_are_neither_published_nor_counted() -> None
     output.received = ONLY_MARKERS
     publish_full(fan_out)
     publish_full(fan_out, ALL - ONLY_MARKERS)
-    assert [components for _, _, _, components in output.frames] == [ALL]
+    assert [components for _, _, components in output.frames] == [ALL]
     assert fan_out.outputs[0][1].messages == {"frame": 1}
     assert fan_out.skip(FULL, STAMP, ALL - ONLY_MARKERS) == 0
 
@@ -95,17 +95,16 @@ def test_an_output_with_a_defect_in_preparing_gets_the_frames_and_others_are_not
     assert amounts(fan_out.outputs[0][1].losses) == {"ZeroDivisionError": (1, 1)}
 
 
-def test_a_frame_that_is_not_accepted_is_counted_and_uses_up_its_number() -> None:
+def test_a_frame_that_is_not_accepted_is_counted_and_the_next_one_is_published() -> None:
     output = FrameOutput()
     fan_out = FanOut("lab", [output])
     for output.error in (None, OutputError("the disk is full", cause="disk full"), None):
         publish_full(fan_out)
     [(_, status)] = fan_out.outputs
     assert (amounts(status.losses), status.messages) == ({"disk full": (1, 1)}, {"frame": 2})
-    assert output.sequences == [0, 2]
 
 
-def test_a_replacement_continues_the_numbers_and_the_former_one_is_closed() -> None:
+def test_a_replacement_continues_the_counters_and_the_former_one_is_closed() -> None:
     components, before, after = ToyOutput(), FrameOutput(), FrameOutput()
     fan_out = FanOut("lab", [components])
     for output in (components, before, after, components):
@@ -114,7 +113,7 @@ def test_a_replacement_continues_the_numbers_and_the_former_one_is_closed() -> N
         if output is after:
             assert fan_out.outputs[0][1].messages["frame"] == 2
             assert (before.closed, after.closed) == (1, 0)
-    assert (before.sequences, after.sequences, sequences(components, "3d")) == ([1], [2], [0, 3])
+    assert (len(before.frames), len(after.frames), sequences(components, "3d")) == (1, 1, [0, 3])
 
 
 def test_losses_that_an_output_counts_itself_outlive_it() -> None:

@@ -10,9 +10,8 @@ import pytest
 from gateway.errors import ConfigError
 from gateway.outputs.findings import Finding, Result
 from gateway.outputs.foxglove import checks
-from gateway.outputs.foxglove.checks import check_foxglove, leaves_host
-from gateway.outputs.foxglove.kind import FOXGLOVE
-from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.outputs.foxglove.checks import check_foxglove
+from gateway.outputs.foxglove.settings import FOXGLOVE, FoxgloveSettings
 from tests.networks import free_port
 from tests.unit.outputs.foxglove.live import serving
 
@@ -74,4 +73,4 @@ def test_a_package_that_is_missing_is_named_with_what_to_do(monkeypatch: pytest.
 
 def test_data_leaves_the_computer_unless_the_address_is_loopback() -> None:
     hosts = ("127.0.0.1", "::1", "::", "lab.example.org")
-    assert [leaves_host(FoxgloveSettings(host=host)) for host in hosts] == [False, False, True, True]
+    assert [FOXGLOVE.leaves_host(FoxgloveSettings(host=host)) for host in hosts] == [False, False, True, True]

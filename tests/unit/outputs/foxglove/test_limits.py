@@ -6,10 +6,11 @@ import re
 import socket
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager
+from dataclasses import replace
 
 import pytest
 
-from gateway.outputs.foxglove import connections
+from gateway.outputs.foxglove.connections import LIMITS, MAX_FRAGMENTS, MAX_REQUEST_BYTES
 from gateway.rtc3d.components import ComponentType
 from tests.foxglove_viewer import (
     CONTINUATION,
@@ -96,11 +97,11 @@ async def test_a_slow_viewer_is_told_once_and_gets_the_messages_that_found_a_pla
 
 
 async def test_a_viewer_that_reads_nothing_for_long_is_disconnected(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(connections, "MAX_STALL_S", 0.1)
     async with serving("lab") as (port, [lab]):
+        lab.output._server._admission.clients.limits = replace(LIMITS, unread_s=0.1)
         with stalled_viewer(port):
             await lab.wait_until_wanted()
 
@@ -135,10 +136,10 @@ async def test_thousands_of_subscriptions_may_come_at_once_each_in_a_message() -
 
 
 async def test_one_viewer_too_many_is_refused_with_a_reason(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(connections, "MAX_CLIENTS", 3)
-    async with serving("lab") as (port, _):
+    async with serving("lab") as (port, [lab]):
+        lab.output._server._admission.clients.limits = replace(LIMITS, clients=3)
         async with AsyncExitStack() as stack:
             for _ in range(3):
                 await stack.enter_async_context(viewing(port))
@@ -153,7 +154,7 @@ async def test_one_viewer_too_many_is_refused_with_a_reason(
 async def test_handshakes_that_are_not_completed_end_in_favour_of_others() -> None:
     async with serving("lab") as (port, _):
         with ExitStack() as stack:
-            num_silent = connections.MAX_HANDSHAKES + 10
+            num_silent = (LIMITS.handshakes or 0) + 10
             silent = [
                 stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(num_silent)
             ]
@@ -180,11 +181,11 @@ EMPTY = piece(b"", CONTINUATION, is_last=False)
             id="flood of empty frames",
         ),
         pytest.param(
-            piece(b"", TEXT, is_last=False) + EMPTY * (connections.MAX_FRAGMENTS + 1),
+            piece(b"", TEXT, is_last=False) + EMPTY * (MAX_FRAGMENTS + 1),
             "is disconnected: it sends a message in more than 1000 pieces",
             id="pieces",  # each needs memory until the message is complete, even if it is empty
         ),
-        pytest.param(client_frame(b'"' + b"x" * connections.MAX_REQUEST_BYTES + b'"'), "", id="too large"),
+        pytest.param(client_frame(b'"' + b"x" * MAX_REQUEST_BYTES + b'"'), "", id="too large"),
         pytest.param(bytes((0x81, 0xFF)) + b"\x7f" + b"\xff" * 7 + bytes(4), "", id="8 EB"),
         pytest.param(bytes((0x81, 0x05)) + b"plain", "", id="not masked (RFC 6455, 5.1)"),
         pytest.param(client_frame(b"\xff\xfe"), "", id="no UTF-8"),

@@ -13,7 +13,6 @@ import pytest
 
 from gateway.foxglove_schemas import forces, messages, topics
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.outputs.foxglove import output as output_module
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
@@ -411,7 +410,6 @@ async def test_no_failure_ends_the_attempts_to_listen(
     error: Exception, problem: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     errors, opened = [error, error], FoxgloveServer.open
-    monkeypatch.setattr(output_module, "_RETRY_S", 0.1)
 
     async def open_or_fail(server: FoxgloveServer) -> None:
         if errors:

@@ -11,9 +11,8 @@ import pytest
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
 from gateway.messages.host_time import HostClock, now_steady_us
-from gateway.outputs.lsl.publisher import CaptureTimes, SuspendedTime
-from gateway.outputs.lsl.source_streams import samples
-from gateway.outputs.lsl.wire import (
+from gateway.outputs.lsl.output import CaptureTimes, SuspendedTime
+from gateway.outputs.lsl.process import (
     Kind,
     Message,
     MessageReader,
@@ -23,6 +22,7 @@ from gateway.outputs.lsl.wire import (
     opening_content,
     samples_content,
 )
+from gateway.outputs.lsl.source_streams import samples
 from gateway.rtc3d.components import ITEM_DTYPES, MISSING, WIRE_ORDER, ComponentType
 
 MARKERS, TOOLS, ANALOG, FORCE, _ = WIRE_ORDER

@@ -13,12 +13,12 @@ from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.lsl.publisher import MAX_WAITING, LslFramePublisher
+from gateway.outputs.lsl.output import MAX_WAITING, LslFramePublisher
+from gateway.outputs.lsl.process import Kind, Message, Report, decode_samples
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.source_streams import MAX_BUFFER_BYTES, CapturedFrame, SourceStreams
 from gateway.outputs.lsl.streams import lsl_stream
 from gateway.outputs.lsl.supervisor import LslProcesses
-from gateway.outputs.lsl.wire import Kind, Message, Report, decode_samples
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
     LONG_EVENT,
@@ -335,7 +335,7 @@ class Publisher(Streams):
         return is_wanted
 
     def publish(self, *components: bytes) -> None:
-        self.publisher.publish(frame_of(*components), STAMP, 0, ALL)
+        self.publisher.publish(frame_of(*components), STAMP, ALL)
 
 
 @pytest.fixture

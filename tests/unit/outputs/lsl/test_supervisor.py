@@ -18,9 +18,9 @@ import pytest
 from gateway.errors import ConfigError
 from gateway.outputs.lsl import supervisor
 from gateway.outputs.lsl.output import LslOutput
+from gateway.outputs.lsl.process import Kind, Message, Report
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import LslProcesses
-from gateway.outputs.lsl.wire import Kind, Message, Report
 from tests.lsl_receiver import lsl_config
 from tests.waiting import wait_until
 

@@ -162,7 +162,7 @@ class Source:
                 topic._on_matching(is_there)
 
     def offer(self, frame: Frame, components: frozenset[ComponentType] = ALL) -> None:
-        self.publisher.publish(frame, stamp(), 0, components)
+        self.publisher.publish(frame, stamp(), components)
 
     def send(self, frame: Frame, components: frozenset[ComponentType] = ALL) -> None:
         self.offer(frame, components)

@@ -120,7 +120,7 @@ async def test_subscribers_of_shared_topics_concern_every_source(monkeypatch: py
         assert sorted(changes) == ["hall", "lab"]
         changes.clear()
     for publisher in publishers:
-        publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
+        publisher.publish(tools_frame((1, 2, 3)), stamp(), ALL)
     lab.sender.run()
     assert lab.node.sent == {"/tf": [1, 2]}
 
@@ -229,7 +229,7 @@ def test_nodes_see_and_hear_topics_of_a_domain_namespace_distribution_and_qos(
             *(lab.peer, f"{domain}/**/pose/**", received.append), history=history, subscriber_detection=True
         )
         wait_until(lambda: publisher.wants(ALL))
-        publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
+        publisher.publish(tools_frame((1, 2, 3)), stamp(), ALL)
         wait_until(lambda: received)
         assert str(received[0].key_expr) == key
         [node] = [each for each in lab.tokens() if "/NN/" in each]

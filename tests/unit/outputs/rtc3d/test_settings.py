@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from gateway.outputs.findings import Finding, Result
-from gateway.outputs.rtc3d.checks import CHECKS, check_rtc3d
-from gateway.outputs.rtc3d.kind import RTC3D
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.rtc3d.checks import check_rtc3d
+from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
 from gateway.simulator.simulator import Simulator
 from tests.networks import free_port
 from tests.settings import mistakes
@@ -52,7 +51,7 @@ def test_mistakes_have_their_place(values: dict[str, Any], place: str, text: str
 
 def findings(sources: list[str], ports: dict[str, int], host: str = "127.0.0.1") -> list[Finding]:
     found = check_rtc3d(Rtc3dSettings(enabled=True, host=host, ports=ports), sources, [], 0.3)
-    assert [each.check for each in found][:2] == list(CHECKS)
+    assert [each.check for each in found][:2] == list(RTC3D.checks)
     return found
 
 

@@ -4,16 +4,16 @@ import socket
 import threading
 
 from gateway.outputs.findings import Result
-from gateway.outputs.vrpn.checks import CHECKS, check_vrpn, leaves_host
+from gateway.outputs.vrpn.checks import check_vrpn
 from gateway.outputs.vrpn.output import VrpnOutput
-from gateway.outputs.vrpn.settings import VrpnSettings
+from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
 from tests.networks import free_port
 from tests.waiting import wait_until
 
 
 def check(settings: VrpnSettings) -> dict[str, tuple[Result, str, str]]:
     findings = check_vrpn(settings, ["lab"], [], 0.1)
-    assert [finding.check for finding in findings] == list(CHECKS)
+    assert [finding.check for finding in findings] == list(VRPN.checks)
     return {finding.check: (finding.result, finding.found, finding.remedy) for finding in findings}
 
 
@@ -61,4 +61,4 @@ def test_access_is_a_note_if_others_can_connect() -> None:
     assert result is Result.NOTE
     assert found.startswith("any computer that reaches 0.0.0.0 can connect")
     assert check(settings)["access"][:2] == (Result.PASSING, "only programs on this computer can connect")
-    assert [leaves_host(VrpnSettings(host=host)) for host in ("lab-pc", "localhost")] == [True, False]
+    assert [VRPN.leaves_host(VrpnSettings(host=host)) for host in ("lab-pc", "localhost")] == [True, False]

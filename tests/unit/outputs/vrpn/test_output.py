@@ -90,7 +90,7 @@ class Lab:
             self.calls.pop(0)[0]()
 
     def offer(self, frame: Frame) -> None:
-        self.publisher.publish(frame, STAMP, 0, TOOLS)
+        self.publisher.publish(frame, STAMP, TOOLS)
 
     def send(self, *components: Sequence[float], order: ByteOrder = "big") -> None:
         self.offer(frame(*components, order=order))

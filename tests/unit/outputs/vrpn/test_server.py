@@ -5,22 +5,14 @@ import contextlib
 import logging
 import socket
 from collections.abc import AsyncIterator
+from dataclasses import replace
 
 import pytest
 import pytest_asyncio
 
-from gateway.outputs.vrpn import client as client_module
-from gateway.outputs.vrpn import server as server_module
+from gateway.outputs.vrpn.callbacks import MAX_CALLS, MAX_CALLS_PER_HOST, CallbackRequests
 from gateway.outputs.vrpn.protocol import encode_pose
-from gateway.outputs.vrpn.server import (
-    MAX_CALLS,
-    MAX_CALLS_PER_HOST,
-    MAX_CLIENTS,
-    MAX_HANDSHAKES,
-    CallbackRequests,
-    VrpnServer,
-    bind,
-)
+from gateway.outputs.vrpn.server import LIMITS, VrpnServer, bind
 from gateway.token_bucket import TokenBucket
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE, Pose, VrpnClient, send_datagram
@@ -55,7 +47,7 @@ async def running(caplog: pytest.LogCaptureFixture) -> AsyncIterator[Running]:
 
 
 async def ready(server: VrpnServer, count: int) -> None:
-    await wait_until_async(lambda: len(server._ready) == count)
+    await wait_until_async(lambda: len(server.clients.served) == count)
 
 
 # Requests by UDP ----------------------------------------------------------------------------
@@ -131,7 +123,7 @@ async def test_refused_calls_are_logged_few_times(running: Running, caplog: pyte
 
 async def test_flood_of_udp_calls_is_read_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
-    monkeypatch.setattr("gateway.outputs.vrpn.server.callback_port", read.append)
+    monkeypatch.setattr("gateway.outputs.vrpn.callbacks.callback_port", read.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         for _ in range(3000):
             udp.sendto(b"127.0.0.1 5000\0", ("127.0.0.1", running[1]))
@@ -218,13 +210,13 @@ async def test_slow_client_misses_its_own_poses_only(running: Running) -> None:
 
 
 async def test_client_that_stops_reading_is_disconnected(
-    running: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    running: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(client_module, "UNREAD_TIMEOUT_S", 0.05)
     server, port = running
     with socket.create_connection(("127.0.0.1", port)) as slow:
         slow.sendall(COOKIE)
         await ready(server, 1)
+        server.clients.limits = replace(LIMITS, unread_s=0.05)  # not for the system, which is asked before
         await wait_until_async(lambda: server.send(ONE * 1000))
         await ready(server, 0)
     assert "it has read nothing for 0.05 s" in caplog.text
@@ -239,18 +231,14 @@ async def test_client_that_stops_reading_is_disconnected(
     ],
 )
 async def test_client_that_breaks_the_protocol_is_disconnected(
-    running: Running,
-    caplog: pytest.LogCaptureFixture,
-    begin: bytes,
-    text: str,
-    monkeypatch: pytest.MonkeyPatch,
+    running: Running, caplog: pytest.LogCaptureFixture, begin: bytes, text: str
 ) -> None:
-    monkeypatch.setattr(client_module, "HANDSHAKE_TIMEOUT_S", 0.05)
     server, port = running
+    server.clients.limits = replace(LIMITS, handshake_s=0.05)
     async with await VrpnClient.connect(port, begin) as client:
         await wait_until_async(lambda: client.has_ended)
     assert text in caplog.text
-    await wait_until_async(lambda: not server._clients)
+    await wait_until_async(lambda: not server.clients)
 
 
 async def test_oldest_handshake_makes_room_for_a_new_one(running: Running) -> None:
@@ -258,20 +246,17 @@ async def test_oldest_handshake_makes_room_for_a_new_one(running: Running) -> No
     async with contextlib.AsyncExitStack() as stack:
         waiting = [
             await stack.enter_async_context(await VrpnClient.connect(port, b""))
-            for _ in range(MAX_HANDSHAKES)
+            for _ in range(LIMITS.handshakes or 0)
         ]
-        await wait_until_async(lambda: len(server._clients) == MAX_HANDSHAKES)
+        await wait_until_async(lambda: len(server.clients) == LIMITS.handshakes)
         async with await VrpnClient.connect(port) as client:
             await wait_until_async(lambda: client.trackers and waiting[0].has_ended)
             assert not waiting[1].has_ended
 
 
-async def test_number_of_clients_is_bounded(
-    running: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert MAX_CLIENTS >= 32
-    monkeypatch.setattr(server_module, "MAX_CLIENTS", 2)
+async def test_number_of_clients_is_bounded(running: Running, caplog: pytest.LogCaptureFixture) -> None:
     server, port = running
+    server.clients.limits = replace(LIMITS, clients=2)
     async with await VrpnClient.connect(port):
         async with await VrpnClient.connect(port):
             await ready(server, 2)
@@ -283,9 +268,9 @@ async def test_number_of_clients_is_bounded(
             await wait_until_async(lambda: third.trackers)
 
 
-async def test_flood_of_pings_is_read_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "_READ_BURST_BYTES", 8192.0)
+async def test_flood_of_pings_is_read_slowly(running: Running) -> None:
     server, port = running
+    server.clients.limits = replace(LIMITS, received_burst_bytes=8192.0)
     async with await VrpnClient.connect(port) as flood, await VrpnClient.connect(port) as client:
         await wait_until_async(lambda: client.trackers)
         flood.describe("wand")
@@ -312,7 +297,7 @@ async def test_connections_are_accepted_slowly(running: Running, monkeypatch: py
         for count in range(1, 20):
             first.ping(0)
             await wait_until_async(lambda count=count: len(first.pongs) == count)  # type: ignore[misc]
-        assert len(server._clients) == 1 + 3
+        assert len(server.clients) == 1 + 3
         monkeypatch.setattr(server, "_accepts", TokenBucket(1000.0))
         await wait_until_async(lambda: all(client.trackers for client in clients))
 
@@ -322,10 +307,9 @@ async def test_connections_are_accepted_slowly(running: Running, monkeypatch: py
 
 @pytest.mark.parametrize("protocol", ["TCP", "UDP"])
 async def test_port_in_use_is_a_problem_until_it_is_free(
-    protocol: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    protocol: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(server_module, "_RETRY_S", 0.02)
     port = free_port()
     kind = {"TCP": socket.SOCK_STREAM, "UDP": socket.SOCK_DGRAM}[protocol]
     async with contextlib.AsyncExitStack() as stack:

@@ -3,13 +3,14 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from http import HTTPStatus
 
 import pytest
 import pytest_asyncio
 
 from gateway.service.monitoring import http_pages
-from gateway.service.monitoring.http_pages import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPages, Page
+from gateway.service.monitoring.http_pages import LIMITS, MAX_REQUEST_BYTES, HttpPages, Page
 from tests.networks import free_port
 from tests.waiting import wait_until_async
 
@@ -115,19 +116,17 @@ async def test_other_requests_get_an_error(site: Site, status: int, request_line
     assert b"/page\n" in await site.send(b"GET / HTTP/1.1\r\n\r\n")
 
 
-async def test_a_request_that_is_too_large_or_never_ends_is_disconnected(
-    site: Site, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_request_that_is_too_large_or_never_ends_is_disconnected(site: Site) -> None:
     assert await site.send(b"GET /page HTTP/1.1\r\nX: " + b"x" * (MAX_REQUEST_BYTES + 1)) == b""
     assert await site.send(b"x" * 1_000_000) == b""
-    monkeypatch.setattr(http_pages, "REQUEST_TIMEOUT_S", 0.05)
+    site.pages._connections.limits = replace(LIMITS, handshake_s=0.05)
     assert await site.send(b"GET /page HTTP/1.1\r\n") == b""
 
 
 async def test_one_connection_too_many_disconnects_the_oldest(site: Site) -> None:
-    connections = [await site.connect() for _ in range(MAX_CONNECTIONS + 10)]
+    connections = [await site.connect() for _ in range(LIMITS.clients + 10)]
     assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
-    assert len(site.pages._connections) <= MAX_CONNECTIONS
+    assert len(site.pages._connections) <= LIMITS.clients
     for reader, _ in connections[:10]:
         with contextlib.suppress(ConnectionError):
             assert await reader.read() == b""
