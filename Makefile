@@ -39,7 +39,7 @@ test-slow: .venv/installed build/wheelhouse/complete
 COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/logs/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d stream) \
-    $(addprefix tests/unit/,subscriber takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
+    $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
 
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))

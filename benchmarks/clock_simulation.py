@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gateway.stream.clock import ServerClock
-from tests.clock_simulation import Frames, Numbers, Observed, observe, percentile_95_us, simulate
+from tests.support.clock_simulation import Frames, Numbers, Observed, observe, percentile_95_us, simulate
 
 PLOT: Final = Path(__file__).parent.parent / "docs" / "explanation" / "clocks.png"
 SEEDS: Final = 50

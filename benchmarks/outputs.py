@@ -32,8 +32,8 @@ from gateway.outputs.ros2.topic import Declared, RosTopic
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
-from tests.lsl_receiver import lsl_config
-from tests.networks import free_port
+from tests.support.lsl_receiver import lsl_config
+from tests.support.networks import free_port
 
 TITLE: Final = "CPU time per frame of five components at 1000 Hz, by output"
 RELAY: Final = "relay"

@@ -28,9 +28,9 @@ from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
-from tests.configurations import make_settings
-from tests.memory_output import MemoryOutput
-from tests.waiting import wait_until_async
+from tests.support.configurations import make_settings
+from tests.support.memory_output import MemoryOutput
+from tests.support.waiting import wait_until_async
 
 TITLE: Final = "The gateway's own CPU time per frame of five components, from received bytes to messages"
 GATEWAY: Final = "frame_per_read"

@@ -16,7 +16,7 @@ from benchmarks.processes import Program, Worker, zenoh_session_config
 from benchmarks.subscribers import Received, Subscription, subscribe
 from benchmarks.workloads import LAB, LAB_STREAMS, Blast, Paced, Sent, Workload, cuts, send
 from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
-from tests.networks import free_port
+from tests.support.networks import free_port
 
 GATEWAY: Final = "lab"
 RELAY: Final = "raw"

@@ -18,7 +18,7 @@ from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling, Scheduling
 
 from gateway.logs.limits import HOLD_S
-from tests.needs import need
+from tests.support.needs import need
 
 # uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection
 # that finds a Zenoh session there waits for threads that the child does not have; the parent waits for it.

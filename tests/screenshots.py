@@ -10,9 +10,9 @@ from typing import Final
 
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
-from tests.browser import CHROMIUM, FLAGS
-from tests.documents import ROOT
-from tests.gateway_process import gateway_process, simulator
+from tests.support.browser import CHROMIUM, FLAGS
+from tests.support.documents import ROOT
+from tests.support.gateway_process import gateway_process, simulator
 from tests.view.view_process import view_process
 
 _SIZE: Final[ViewportSize] = {"width": 1200, "height": 700}

@@ -23,9 +23,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tests.configurations import write_config
-from tests.gateway_process import PROGRAM, simulator
-from tests.networks import free_endpoint, lcm_url, zenoh_keys
+from tests.support.configurations import write_config
+from tests.support.gateway_process import PROGRAM, simulator
+from tests.support.networks import free_endpoint, lcm_url, zenoh_keys
 
 MAX_STOP_S: Final = 2.0
 _START_TIMEOUT_S: Final = 60.0

@@ -14,7 +14,7 @@ from benchmarks.workloads import DENSE, Frames, cuts
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
-from tests.documents import ROOT
+from tests.support.documents import ROOT
 
 FRAMES = 200
 

@@ -10,8 +10,8 @@ from gateway.outputs.contract import Output
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from tests.contract.frame_rigs import SOURCES, ListeningRig
-from tests.foxglove_viewer import Viewer, client_frame, upgrade_request
-from tests.networks import free_port
+from tests.support.foxglove_viewer import Viewer, client_frame, upgrade_request
+from tests.support.networks import free_port
 
 TOPICS = tuple(f"/{source}/tools" for source in SOURCES)
 

@@ -36,8 +36,8 @@ from tests.contract.frame_rigs import (
     server_parameters,
     stamp,
 )
-from tests.losses import amounts
-from tests.waiting import wait_until_async
+from tests.support.statuses import amounts
+from tests.support.waiting import wait_until_async
 
 RETURNS_WITHIN_S: Final = 60.0
 MAINTENANCE_S: Final = 0.1

@@ -45,8 +45,8 @@ from gateway.rtc3d.parameters import (
     Tool,
 )
 from gateway.rtc3d.parameters_xml import encode_parameters
-from tests.example_output import ExampleOutput, ExampleSettings, ExampleSubscription
-from tests.networks import free_port
+from tests.support.example_output import ExampleOutput, ExampleSettings, ExampleSubscription
+from tests.support.networks import free_port
 
 LAB: Final = "lab"
 HALL: Final = "hall-2"

@@ -12,7 +12,7 @@ from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from tests.contract.frame_rigs import SOURCES, FrameRig, Received
 from tests.contract.memory_lsl import MemoryRig
-from tests.lsl_receiver import LslReceiver, lsl_config
+from tests.support.lsl_receiver import LslReceiver, lsl_config
 
 _PER_TOOL: Final = 8
 _REQUEST: Final = (

@@ -19,10 +19,10 @@ from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber
 from gateway.takes.files.event_log import EventLogReader
-from tests.lcm_relay import LcmRelay
-from tests.memory_output import MemoryOutput
-from tests.needs import need_programs
-from tests.networks import (
+from tests.support.lcm_relay import LcmRelay
+from tests.support.memory_output import MemoryOutput
+from tests.support.needs import need_programs
+from tests.support.networks import (
     add_multicast_route,
     free_endpoint,
     lcm_url,
@@ -30,7 +30,7 @@ from tests.networks import (
     remove_multicast_route,
     zenoh_keys,
 )
-from tests.waiting import wait_until
+from tests.support.waiting import wait_until
 
 MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
 ANALOG = Topic("lab", ("analog",), "rtc3d.analog_t")

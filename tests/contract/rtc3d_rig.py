@@ -13,9 +13,9 @@ from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from tests.contract.frame_rigs import HALL, LAB, ListeningRig
-from tests.networks import free_port
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until
 from tests.unit.rtc3d_server.wire import DATA, command
-from tests.waiting import wait_until
 
 HEADER: Final = struct.Struct(">II")
 

@@ -16,8 +16,8 @@ from gateway.outputs.contract import Publisher
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.contract.rigs import MARKERS
-from tests.networks import free_endpoint, zenoh_keys
-from tests.waiting import wait_until_async
+from tests.support.networks import free_endpoint, zenoh_keys
+from tests.support.waiting import wait_until_async
 
 MESSAGE = bytes(1200)
 NUM_IN_BURST = 400

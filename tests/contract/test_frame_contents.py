@@ -24,7 +24,7 @@ from tests.contract.frame_rigs import (
     tools,
     world,
 )
-from tests.waiting import wait_until_async
+from tests.support.waiting import wait_until_async
 
 __all__ = ["lab"]
 

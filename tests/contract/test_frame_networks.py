@@ -22,7 +22,7 @@ from tests.contract.frame_lab import (
     returns,
 )
 from tests.contract.frame_rigs import LAB, SOURCES, FrameRig, component, frame_of
-from tests.waiting import wait_until_async
+from tests.support.waiting import wait_until_async
 
 __all__ = ["lab"]
 

@@ -11,7 +11,7 @@ from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
 from tests.contract.frame_lab import RIGS, Lab, every_real_rig, every_rig, is_exact, knows_peers, lab, offered
 from tests.contract.frame_rigs import ALL, HALL, LAB, SOURCES, frame, labelled, odd_frames, stamp
-from tests.waiting import wait_until_async
+from tests.support.waiting import wait_until_async
 
 __all__ = ["lab"]
 

@@ -19,7 +19,7 @@ from tests.contract.rigs import (
     TakesRig,
     ZenohRig,
 )
-from tests.waiting import wait_until
+from tests.support.waiting import wait_until
 
 NETWORKED = [
     pytest.param(ZenohRig, id="zenoh"),

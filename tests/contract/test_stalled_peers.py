@@ -25,9 +25,9 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.contract.rigs import ANALOG, MARKERS
-from tests.lcm_relay import LcmRelay
-from tests.networks import free_endpoint, lcm_url, zenoh_keys
-from tests.waiting import wait_until_async
+from tests.support.lcm_relay import LcmRelay
+from tests.support.networks import free_endpoint, lcm_url, zenoh_keys
+from tests.support.waiting import wait_until_async
 
 RETURNS_WITHIN_S = 8
 NUM_MESSAGES = 12_000

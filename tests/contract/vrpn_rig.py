@@ -10,8 +10,8 @@ from gateway.outputs.contract import Output
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
 from tests.contract.frame_rigs import ListeningRig
-from tests.networks import free_port
-from tests.vrpn_client import COOKIE
+from tests.support.networks import free_port
+from tests.support.vrpn_client import COOKIE
 
 HEADER: Final = struct.Struct(">IIIiiI")
 BODY: Final = struct.Struct(">ii7d")

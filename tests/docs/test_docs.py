@@ -23,10 +23,10 @@ from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
 from gateway.messages.encode import ITEMS_OFFSET, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.simulator import load_scenario
-from tests.configurations import MODEL, load
-from tests.documents import ROOT, Block, all_blocks, blocks, documents
-from tests.fresh_clones import clone_into, files_in
-from tests.log_messages import message_patterns
+from tests.support.configurations import MODEL, load
+from tests.support.documents import ROOT, Block, all_blocks, blocks, documents
+from tests.support.fresh_clones import clone_into, files_in
+from tests.support.log_messages import message_patterns
 
 OPERATIONS = (ROOT / "docs/operations.md").read_text()
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()

@@ -13,9 +13,9 @@ import pytest
 import zenoh
 
 from gateway.takes.files.reader import TakeReader
-from tests.documents import ROOT
-from tests.fresh_clones import pip_environment
-from tests.terminals import Terminal, folder, follow, terminals
+from tests.support.documents import ROOT
+from tests.support.fresh_clones import pip_environment
+from tests.support.terminals import Terminal, folder, follow, terminals
 from tests.unit.takes.export.exported import read_ezc3d
 from tests.unit.takes.export.read_mcap import read_mcap
 from tests.unit.takes.export.test_trc import read_trc

@@ -37,9 +37,9 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.takes import open_take
     from gateway.takes.files.event_log import encode_event
     from gateway.takes.files.statistics import take_statistics
-    from tests.configurations import load
+    from tests.support.configurations import load
 
-from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
+from tests.support.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
 
 ROOT = Path(__file__).parents[2]
 STAMP = Stamp(1, 2, 3, 4)

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import pytest
 
-from tests.gateway_process import simulator
 from tests.hostile.gateway_under_attack import HEALTHY_SCENE, GatewayUnderAttack, RunningGateway, run_gateway
+from tests.support.gateway_process import simulator
 
 _PROPERTY: Final = "the healthy source"
 

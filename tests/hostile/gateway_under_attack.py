@@ -41,9 +41,9 @@ from typing import Any, Final
 
 import yaml
 
-from tests.gateway_process import PROGRAM
 from tests.hostile.recorder import FRAME_COMPONENTS
-from tests.networks import free_port, lcm_url, zenoh_keys
+from tests.support.gateway_process import PROGRAM
+from tests.support.networks import free_port, lcm_url, zenoh_keys
 
 HEALTHY_SCENE: Final = ("--rate", "200", "--analog-rate", "200")
 """The options of ``simulate`` for the healthy source."""

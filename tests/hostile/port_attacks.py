@@ -17,10 +17,10 @@ import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Final
 
-from tests.foxglove_viewer import PING, client_frame, upgrade_request
-from tests.networks import free_port
+from tests.support.foxglove_viewer import PING, client_frame, upgrade_request
+from tests.support.networks import free_port
+from tests.support.vrpn_client import COOKIE, PING_TYPE, description, message
 from tests.unit.rtc3d_server.wire import DATA, EVENT, command, packet
-from tests.vrpn_client import COOKIE, PING_TYPE, description, message
 
 Attack = Callable[[int], Awaitable[None]]
 """Attacks a port on this computer until it is cancelled. If it ends, or raises OSError, it begins again."""

@@ -22,7 +22,7 @@ import zenoh
 
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import QUEUE_MESSAGES
-from tests.networks import wait_for_zenoh
+from tests.support.networks import wait_for_zenoh
 
 FRAME_COMPONENTS: Final = ("3d", "6d", "analog", "force")
 """The components that every frame of the healthy source has; events are rare."""

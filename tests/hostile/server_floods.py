@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 
 from gateway.rtc3d.parameters_xml import MAX_XML_BYTES
 from tests.hostile.servers import close_at_once, replying, streaming, streaming_flood
-from tests.servers import Client, Script, error, markers_frame, ok, packet
-from tests.spec_parameters import in_root
+from tests.support.parameters import in_root
+from tests.support.servers import Client, Script, error, markers_frame, ok, packet
 
 MARKERS: Final = 1
 EVENT: Final = 5

@@ -11,8 +11,8 @@ import struct
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Final
 
-from tests.servers import Client, Script, error, markers_frame, ok, packet
-from tests.spec_parameters import in_root
+from tests.support.parameters import in_root
+from tests.support.servers import Client, Script, error, markers_frame, ok, packet
 
 MIB: Final = 1 << 20
 BLOCK_BYTES: Final = 20_000

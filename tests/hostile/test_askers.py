@@ -17,7 +17,7 @@ import rtc3d
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway, printed, python
-from tests.waiting import wait_until_async
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

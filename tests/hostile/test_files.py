@@ -11,8 +11,8 @@ from typing import Final
 import pytest
 
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway
-from tests.servers import Client, Script, ScriptedServer, c3d_file, ok, packet
-from tests.waiting import wait_until_async
+from tests.support.servers import Client, Script, ScriptedServer, c3d_file, ok, packet
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway
-from tests.name_server import dead_name_server
-from tests.waiting import wait_until_async
+from tests.support.networks import dead_name_server
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

@@ -14,10 +14,10 @@ import pytest
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, printed, python
 from tests.hostile.server_floods import EVENT, MARKERS, component, frame
 from tests.hostile.servers import streaming
-from tests.networks import free_endpoint, zenoh_keys
-from tests.proxy import FuzzingProxy
-from tests.servers import Client, ScriptedServer
-from tests.waiting import wait_until_async
+from tests.support.networks import free_endpoint, zenoh_keys
+from tests.support.proxy import FuzzingProxy
+from tests.support.servers import Client, ScriptedServer
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

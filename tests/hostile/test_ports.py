@@ -14,15 +14,15 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from tests.foxglove_viewer import viewing
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, num_missing, python, rss_kib
 from tests.hostile.port_attacks import ATTACKS, Attack, attacking
 from tests.integration.raw_client import connected, consecutive
-from tests.lsl_receiver import LslReceiver, lsl_config
-from tests.networks import free_port
+from tests.support.foxglove_viewer import viewing
+from tests.support.lsl_receiver import LslReceiver, lsl_config
+from tests.support.networks import free_port
+from tests.support.vrpn_client import VrpnClient
+from tests.support.waiting import wait_until_async
 from tests.unit.rtc3d_server.wire import COMMAND
-from tests.vrpn_client import VrpnClient
-from tests.waiting import wait_until_async
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(300)]
 

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import pytest
 
-from tests.gateway_process import simulator
 from tests.hostile.gateway_under_attack import (
     GatewayUnderAttack,
     RunningGateway,
@@ -19,9 +18,10 @@ from tests.hostile.gateway_under_attack import (
 )
 from tests.hostile.server_floods import BREAKING, FLOODS, Group
 from tests.hostile.servers import SERVERS
-from tests.networks import free_port
-from tests.servers import ScriptedServer
-from tests.waiting import wait_until_async
+from tests.support.gateway_process import simulator
+from tests.support.networks import free_port
+from tests.support.servers import ScriptedServer
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
@@ -93,7 +93,7 @@ async def test_servers_that_break_again_and_again(gateway_under_attack: GatewayU
 SUBSCRIBER: Final = """
 import json, sys, zenoh
 
-from tests.networks import zenoh_keys
+from tests.support.networks import zenoh_keys
 
 with zenoh.open(zenoh.Config.from_json5(json.dumps(zenoh_keys("client", connect=sys.argv[1])))) as session:
     session.declare_subscriber("mocap/**", lambda sample: None)

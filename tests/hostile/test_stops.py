@@ -16,13 +16,13 @@ from typing import Any, Final
 import pytest
 import yaml
 
-from tests.gateway_process import PROGRAM
 from tests.hostile.gateway_under_attack import MAX_STOP_S, printed, python
-from tests.lcm_relay import LcmRelay
-from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
-from tests.servers import Client, Script, ScriptedServer, markers_frame, ok, packet
 from tests.stops import report, run_stops
-from tests.waiting import wait_until_async
+from tests.support.gateway_process import PROGRAM
+from tests.support.lcm_relay import LcmRelay
+from tests.support.networks import free_endpoint, free_port, lcm_url, zenoh_keys
+from tests.support.servers import Client, Script, ScriptedServer, markers_frame, ok, packet
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

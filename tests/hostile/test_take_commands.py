@@ -10,9 +10,9 @@ import rtc3d
 
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
-from tests.gateway_process import simulator
 from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway
 from tests.hostile.test_askers import MAX_GROWTH_MIB, ask, still_answers, wait_for_frames
+from tests.support.gateway_process import simulator
 
 pytestmark = pytest.mark.netns
 

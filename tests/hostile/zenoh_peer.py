@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import zenoh
 
-from tests.networks import open_zenoh, zenoh_keys
+from tests.support.networks import open_zenoh, zenoh_keys
 
 _BUFFER_BYTES: Final = 4096
 """The receive buffer: small, so that a peer that does not read is noticed soon."""

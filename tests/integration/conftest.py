@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.networks import free_endpoint, open_zenoh
-from tests.secure_zenoh import SecureRouter, make_certificates, run_secure_router
+from tests.support.networks import free_endpoint, open_zenoh
+from tests.support.secure_zenoh import SecureRouter, make_certificates, run_secure_router
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.faults.control import KINDS
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.memory_gateway import MemoryGateway, run_gateway
-from tests.networks import free_port
-from tests.proxy import FuzzingProxy
-from tests.waiting import wait_until_async
+from tests.support.gateways import MemoryGateway, run_gateway
+from tests.support.networks import free_port
+from tests.support.proxy import FuzzingProxy
+from tests.support.waiting import wait_until_async
 
 _Result = TypeVar("_Result")
 

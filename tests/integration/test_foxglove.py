@@ -14,10 +14,10 @@ from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob, export_take
-from tests.configurations import local_settings, local_source
-from tests.foxglove_viewer import viewing
-from tests.networks import free_port
-from tests.running_gateway import running_gateway
+from tests.support.configurations import local_settings, local_source
+from tests.support.foxglove_viewer import viewing
+from tests.support.gateways import running_gateway
+from tests.support.networks import free_port
 
 SCENE = SyntheticScene(markers=20, tools=3, analog=12, plates=2, rate_hz=100, analog_rate_hz=500)
 FRAMES = ("markers", "tools", "analog", "loads", "forces", "events")

@@ -6,9 +6,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
-from tests.needs import need_programs
-from tests.waiting import wait_until
+from tests.support.gateway_process import GatewayProcess, gaps, gateway_process, simulator
+from tests.support.needs import need_programs
+from tests.support.waiting import wait_until
 
 RATE_HZ: Final = 200
 

@@ -14,11 +14,11 @@ import zenoh
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.display.live.live_data import LiveData
 from gateway.takes.files.event_log import EventLogReader
-from tests.command_process import run_command
-from tests.configurations import write_config
-from tests.gateway_process import program, simulator
-from tests.networks import free_endpoint, wait_for_zenoh, zenoh_keys
-from tests.waiting import wait_until
+from tests.support.commands import run_command
+from tests.support.configurations import write_config
+from tests.support.gateway_process import program, simulator
+from tests.support.networks import free_endpoint, wait_for_zenoh, zenoh_keys
+from tests.support.waiting import wait_until
 
 SCENE: Final = ("--rate", "100", "--analog-rate", "100", "--markers", "12", "--analog", "8", "--tools", "2")
 COMPONENTS: Final = {"3d", "6d", "analog", "force", "event"}

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.configurations import write_config
-from tests.gateway_process import PROGRAM
-from tests.needs import need_programs
-from tests.networks import free_port, lan_interface
-from tests.waiting import wait_until
+from tests.support.configurations import write_config
+from tests.support.gateway_process import PROGRAM
+from tests.support.needs import need_programs
+from tests.support.networks import free_port, lan_interface
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import pyxdf
 
-from tests.command_process import run_command
-from tests.configurations import write_config
-from tests.gateway_process import program, simulator
 from tests.integration.test_host_clock import WallClock
-from tests.lsl_receiver import LslReceiver, lsl_config
-from tests.waiting import wait_until
-from tests.xdf import RecordedStream, write_xdf
+from tests.support.commands import run_command
+from tests.support.configurations import write_config
+from tests.support.gateway_process import program, simulator
+from tests.support.lsl_receiver import LslReceiver, lsl_config
+from tests.support.waiting import wait_until
+from tests.support.xdf import RecordedStream, write_xdf
 
 pytestmark = pytest.mark.netns
 

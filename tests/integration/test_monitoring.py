@@ -31,12 +31,12 @@ from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from tests.configurations import local_source, make_settings
-from tests.documents import ROOT
-from tests.needs import need_programs
-from tests.networks import free_port, zenoh_keys
-from tests.running_gateway import monitored_gateway
-from tests.waiting import wait_until_async
+from tests.support.configurations import local_source, make_settings
+from tests.support.documents import ROOT
+from tests.support.gateways import monitored_gateway
+from tests.support.needs import need_programs
+from tests.support.networks import free_port, zenoh_keys
+from tests.support.waiting import wait_until_async
 
 RULES: Final = ROOT / "config/prometheus/rtc3d-gateway.yaml"
 OPERATIONS = (ROOT / "docs/operations.md").read_text()

@@ -20,8 +20,8 @@ from gateway.service.gateway import Gateway
 from gateway.simulator.faults.connection_faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.networks import free_port, lcm_url, open_zenoh
-from tests.queried_gateway import (
+from tests.support.networks import free_port, lcm_url, open_zenoh
+from tests.support.queried_gateway import (
     ParameterServer,
     parameters_xml,
     query,
@@ -29,8 +29,8 @@ from tests.queried_gateway import (
     wait_until_cached,
     zenoh_peer,
 )
-from tests.servers import ScriptedServer
-from tests.waiting import wait_until_async
+from tests.support.servers import ScriptedServer
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 KEY = "mocap/lab/parameters"

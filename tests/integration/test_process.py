@@ -20,11 +20,10 @@ from typing import Any, Final
 
 import pytest
 
-from tests.configurations import write_config
-from tests.gateway_process import PROGRAM, program
-from tests.name_server import dead_name_server
-from tests.networks import free_endpoint, free_port, zenoh_keys
-from tests.waiting import wait_until
+from tests.support.configurations import write_config
+from tests.support.gateway_process import PROGRAM, program
+from tests.support.networks import dead_name_server, free_endpoint, free_port, zenoh_keys
+from tests.support.waiting import wait_until
 
 STOP_S: Final = 9
 """Much more than the gateway needs."""

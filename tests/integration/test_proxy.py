@@ -7,7 +7,7 @@ import pytest
 
 from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
-from tests.proxy import FuzzingProxy
+from tests.support.proxy import FuzzingProxy
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import COMMAND, command, packet
 

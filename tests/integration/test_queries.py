@@ -20,8 +20,9 @@ from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.service.gateway import Gateway
-from tests.networks import free_endpoint, lcm_url
-from tests.queried_gateway import (
+from tests.support.networks import free_endpoint, lcm_url
+from tests.support.parameters import BY_SECTION, in_root, spec_xml
+from tests.support.queried_gateway import (
     ParameterServer,
     ServerOfSections,
     gateway_with_server,
@@ -31,9 +32,8 @@ from tests.queried_gateway import (
     wait_until_cached,
     zenoh_peer,
 )
-from tests.servers import ScriptedServer, c3d_file, packet
-from tests.spec_parameters import BY_SECTION, in_root, spec_xml
-from tests.waiting import wait_until_async
+from tests.support.servers import ScriptedServer, c3d_file, packet
+from tests.support.waiting import wait_until_async
 
 # Parameters ----------------------------------------------------------------------------------
 

@@ -24,10 +24,10 @@ from gateway.service.gateway import Gateway
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import local_settings, local_source
-from tests.networks import free_endpoint, lcm_url, zenoh_keys
-from tests.running_gateway import running_gateway
-from tests.waiting import wait_until_async
+from tests.support.configurations import local_settings, local_source
+from tests.support.gateways import running_gateway
+from tests.support.networks import free_endpoint, lcm_url, zenoh_keys
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

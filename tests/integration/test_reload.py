@@ -23,12 +23,12 @@ from gateway.service.daemon import Daemon
 from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import local_settings, local_source
-from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
-from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
-from tests.running_gateway import running_gateway
-from tests.servers import ScriptedServer
-from tests.waiting import wait_until_async
+from tests.support.configurations import local_settings, local_source
+from tests.support.gateways import running_gateway
+from tests.support.networks import free_endpoint, free_port, lcm_url, zenoh_keys
+from tests.support.queried_gateway import ParameterServer, query, query_all, zenoh_peer
+from tests.support.servers import ScriptedServer
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

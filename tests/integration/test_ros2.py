@@ -17,10 +17,10 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.configurations import local_settings, local_source
-from tests.networks import open_zenoh
-from tests.running_gateway import running_gateway
-from tests.waiting import wait_until_async
+from tests.support.configurations import local_settings, local_source
+from tests.support.gateways import running_gateway
+from tests.support.networks import open_zenoh
+from tests.support.waiting import wait_until_async
 
 TYPES: Final = {
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -69,7 +69,7 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
     port = router.rpartition(":")[2]
     async with simulated() as server, gateway_of(settings_of(router, {"hall-2": server})):
         listener = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.ros2_listener", port, "0", *arguments), stdout=PIPE
+            *(sys.executable, "-m", "tests.support.ros2_listener", port, "0", *arguments), stdout=PIPE
         )
         output, _ = await listener.communicate()
     heard = json.loads(output.splitlines()[-1])

@@ -18,9 +18,9 @@ from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.networks import zenoh_keys
-from tests.serving_gateway import ServingGateway, serving_gateway
-from tests.waiting import wait_until_async
+from tests.support.gateways import ServingGateway, serving_gateway
+from tests.support.networks import zenoh_keys
+from tests.support.waiting import wait_until_async
 
 _NUMBER_AND_TIME_BYTES = 12
 

@@ -7,8 +7,8 @@ import pytest
 
 from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import connected, consecutive, until
-from tests.networks import free_port
-from tests.serving_gateway import playing, serving_gateway
+from tests.support.gateways import playing, serving_gateway
+from tests.support.networks import free_port
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     COMMAND,

@@ -26,7 +26,7 @@ from tests.integration.raw_client import (
     numbers,
     until,
 )
-from tests.serving_gateway import serving_gateway
+from tests.support.gateways import serving_gateway
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,

@@ -19,9 +19,9 @@ from gateway.messages.decode import decode
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
-from tests.networks import lcm_url
-from tests.waiting import wait_until, wait_until_async
+from tests.support.gateway_process import GatewayProcess, gaps, gateway_process, simulator
+from tests.support.networks import lcm_url
+from tests.support.waiting import wait_until, wait_until_async
 
 ROUNDS: Final = 3
 

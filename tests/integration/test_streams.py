@@ -17,7 +17,7 @@ from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.memory_gateway import MemoryGateway, run_gateway
+from tests.support.gateways import MemoryGateway, run_gateway
 
 ONE_CONNECTION = "analog and force arrive at 200 Hz instead of 2000 Hz: "
 EVERYTHING = "3d 6d analog force event"

@@ -15,12 +15,12 @@ import pytest
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.service.gateway import Gateway
-from tests.configurations import local_settings, local_source
-from tests.needs import need
-from tests.networks import free_port
-from tests.running_gateway import running_gateway
-from tests.tool_server import ToolServer
-from tests.waiting import wait_until_async
+from tests.support.configurations import local_settings, local_source
+from tests.support.gateways import running_gateway
+from tests.support.needs import need
+from tests.support.networks import free_port
+from tests.support.servers import ToolServer
+from tests.support.waiting import wait_until_async
 
 Poses = dict[str, list[float]]
 
@@ -67,7 +67,7 @@ class LibVrpn:
 async def libvrpn(address: str) -> AsyncIterator[LibVrpn]:
     need(HAS_PROTOCOLS, "libvrpn reads /etc/protocols: install Debian's netbase")
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.vrpn_oracle", address), stdout=PIPE, limit=1 << 20
+        *(sys.executable, "-m", "tests.support.vrpn_oracle", address), stdout=PIPE, limit=1 << 20
     )
     assert process.stdout is not None
     client = LibVrpn()

@@ -9,8 +9,8 @@ import zenoh
 import zenoh.ext
 
 from gateway.config.document import variable_name
-from tests.networks import free_port
-from tests.secure_zenoh import (
+from tests.support.networks import free_port
+from tests.support.secure_zenoh import (
     GUIDE,
     Change,
     SecureRouter,
@@ -20,7 +20,7 @@ from tests.secure_zenoh import (
     run_gateway_with_simulator,
     shipped_file,
 )
-from tests.waiting import wait_until
+from tests.support.waiting import wait_until
 
 FAKE: Final = b"fake"
 PASSWORD: Final = variable_name(("zenoh", "config", "transport", "auth", "usrpwd", "password"))

@@ -14,8 +14,8 @@ from typing import Final
 import lcm
 import pytest
 
-from tests.example_programs import EXAMPLES, PROGRAMS, ExampleProgram
-from tests.takes import markers
+from tests.support.example_programs import EXAMPLES, PROGRAMS, ExampleProgram
+from tests.support.takes import markers
 
 pytestmark = pytest.mark.netns
 

@@ -9,8 +9,8 @@ import pytest
 
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
 from gateway.messages.encode import COUNT_OFFSET
-from tests.example_programs import COMPONENT_TYPES, EXAMPLES, PROGRAMS, ExampleProgram, printed_errors
-from tests.message_vectors import VECTORS, difference, random_message, to_vector_values
+from tests.support.example_programs import COMPONENT_TYPES, EXAMPLES, PROGRAMS, ExampleProgram, printed_errors
+from tests.support.message_vectors import VECTORS, difference, random_message, to_vector_values
 
 each_program = pytest.mark.parametrize("program", PROGRAMS, ids=str)
 

@@ -16,7 +16,7 @@ import rtc3d
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
-from tests.example_programs import (
+from tests.support.example_programs import (
     COUNT,
     EXAMPLES,
     LCM_URL,
@@ -26,8 +26,8 @@ from tests.example_programs import (
     run_gateway,
     run_program,
 )
-from tests.joined_components import MARKERS, SCENARIOS, Pair, Scenario
-from tests.networks import free_port, open_zenoh
+from tests.support.joined_components import MARKERS, SCENARIOS, Pair, Scenario
+from tests.support.networks import free_port, open_zenoh
 
 pytestmark = pytest.mark.netns
 

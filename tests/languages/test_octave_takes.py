@@ -10,9 +10,9 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.takes import open_take
-from tests.example_programs import EXAMPLES, PROGRAMS, printed_errors
-from tests.message_vectors import VECTORS
-from tests.takes import description, frame, log_bytes, markers, parameters, write_take
+from tests.support.example_programs import EXAMPLES, PROGRAMS, printed_errors
+from tests.support.message_vectors import VECTORS
+from tests.support.takes import description, frame, log_bytes, markers, parameters, write_take
 
 [OCTAVE] = [program for program in PROGRAMS if program.name.startswith("Octave")]
 SAMPLE: Final = EXAMPLES / "walk.lcmlog"

@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 
-from tests.fresh_clones import COMPILED_MODULES, ROOT
+from tests.support.fresh_clones import COMPILED_MODULES, ROOT
 
 _EXPECT_COMPILED: Final = os.environ.get("RTC3D_COMPILED") == "1"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fresh_clones import ROOT
+from tests.support.fresh_clones import ROOT
 
 
 @pytest.fixture

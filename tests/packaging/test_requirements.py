@@ -10,7 +10,7 @@ from typing import Final
 import pytest
 from packaging.requirements import Requirement
 
-from tests.fresh_clones import ROOT
+from tests.support.fresh_clones import ROOT
 
 PROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: Final = PROJECT["optional-dependencies"]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from gateway import __version__
-from tests.fresh_clones import (
+from tests.support.fresh_clones import (
     COMPILED_MODULES,
     QUICK_CC,
     ROOT,

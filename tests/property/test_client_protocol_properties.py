@@ -25,9 +25,9 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.frames import Frame, split_frame
-from tests.servers import ok, packet
-from tests.strategies import damaged, pieces_of
-from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME
+from tests.support.servers import ok, packet
+from tests.support.strategies import damaged, pieces_of
+from tests.support.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME
 
 FRAME = packet(3, FULL_FRAME["big"])
 COMMANDS: list[Command] = [

@@ -4,7 +4,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gateway.stream.clock import Sample, ServerClock, envelope_slope
-from tests.clock_simulation import EPOCH_UTIME, observe, percentile_95_us, simulate
+from tests.support.clock_simulation import EPOCH_UTIME, observe, percentile_95_us, simulate
 
 EXTREMES_US = (0, -1, 1, -(2**63), 2**63 - 1, 2**32 - 1, 2**32, -(2**32))
 timestamps_us = st.integers(-(2**63), 2**63 - 1) | st.sampled_from(EXTREMES_US)

@@ -21,7 +21,7 @@ from gateway.rtc3d.commands import (
 )
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from tests.strategies import damaged
+from tests.support.strategies import damaged
 
 digits = st.text(string.digits, min_size=1, max_size=4)
 component_lists = st.lists(st.sampled_from(ComponentType), unique=True).map(tuple)

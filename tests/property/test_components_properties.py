@@ -17,8 +17,8 @@ from gateway.rtc3d.components import (
     encode_component,
 )
 from gateway.rtc3d.frames import Frame, FrameReader, detect_byte_order, encode_frame, split_frame
-from tests.strategies import damaged
-from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
+from tests.support.strategies import damaged
+from tests.support.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
 # The bytes of each field of one item (§7.3 to §7.7, field note 6).
 FIELD_BYTES = {

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from gateway.config.document import VARIABLE_PREFIX, Location, variable_name
 from gateway.config.settings import Settings
 from gateway.errors import ConfigError
-from tests.configurations import load
 from tests.property.test_config_properties import PIECES, SETTINGS
+from tests.support.configurations import load
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from gateway.outputs.lcm.settings import LCM_SCHEMES, LcmSettings
 from gateway.outputs.zenoh.settings import KeyPrefix, ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from tests.configurations import load, make_settings
-from tests.strategies import damaged
+from tests.support.configurations import load, make_settings
+from tests.support.strategies import damaged
 
 ROOT = Path(__file__).parents[2]
 # Without the comments, so that damage hits keys and values.

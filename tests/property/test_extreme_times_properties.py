@@ -23,7 +23,7 @@ from gateway.stream.ingest import Ingest
 from gateway.stream.rate_check import RateWatch
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from tests.memory_output import MemoryOutput
+from tests.support.memory_output import MemoryOutput
 
 EDGES = [edge + near for edge in (-(2**63), -(2**32), 0, 2**31, 2**32, 2**53, 2**62) for near in (-1, 0, 1)]
 timestamps_us = st.sampled_from([edge for edge in [*EDGES, 2**63 - 1] if edge >= -(2**63)]) | st.integers(

@@ -21,8 +21,8 @@ from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.stream.status import StreamStatus
-from tests.strategies import damaged
-from tests.vectors import FULL_FRAME, ByteOrder
+from tests.support.strategies import damaged
+from tests.support.vectors import FULL_FRAME, ByteOrder
 
 ORDERS: tuple[ByteOrder, ...] = ("big", "little")
 # Words of 4 bytes per item, by §7.3 to §7.7.

@@ -4,7 +4,7 @@ from hypothesis.strategies import SearchStrategy
 
 from gateway.errors import PacketError
 from gateway.rtc3d.packets import FilePiece, Packet, PacketReader, decode_text
-from tests.strategies import damaged, pieces_of
+from tests.support.strategies import damaged, pieces_of
 
 LIMIT = 64
 C3D_LIMIT = 96

@@ -29,11 +29,11 @@ from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.replay.play_list import Entry, SeekIndex, Selection, play_list
 from gateway.takes.replay.timeline import ReplayTimeline
-from tests.recording_output import events as recorded_events
-from tests.recording_output import still_lab
-from tests.strategies import damaged
-from tests.takes import START_UTIME, Message, description, markers, parameters, write_take
-from tests.vectors import COMPONENTS
+from tests.support.recording_output import events as recorded_events
+from tests.support.recording_output import still_lab
+from tests.support.strategies import damaged
+from tests.support.takes import START_UTIME, Message, description, markers, parameters, write_take
+from tests.support.vectors import COMPONENTS
 
 HEADER_BYTES = 28
 int64s = st.integers(-(2**63), 2**63 - 1) | st.sampled_from((0, -1, 2**63 - 1, -(2**63))) | st.integers(0, 50)

@@ -12,7 +12,7 @@ from gateway.outputs.vrpn.protocol import (
     encode_pose,
 )
 from gateway.outputs.vrpn.trackers import MAX_TRACKERS, TrackerNames, Trackers
-from tests.strategies import damaged, pieces_of
+from tests.support.strategies import damaged, pieces_of
 
 PING_TYPE = 7
 

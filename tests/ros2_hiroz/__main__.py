@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.integration.test_ros2 import TYPES, gateway_of, settings_of, simulated
-from tests.networks import free_endpoint, open_zenoh
+from tests.support.networks import free_endpoint, open_zenoh
 
 HERE: Final = Path(__file__).parent
 

@@ -9,8 +9,8 @@ from typing import Final
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser import NewPage, chromium, new_page
-from tests.documents import ROOT
+from tests.support.browser import NewPage, chromium, new_page
+from tests.support.documents import ROOT
 
 pytestmark = pytest.mark.chromium
 

@@ -25,8 +25,8 @@ from tests.hostile.port_attacks import ATTACKS as PORT_ATTACKS
 from tests.hostile.server_floods import FLOODS
 from tests.hostile.servers import SERVERS, streaming
 from tests.hostile.zenoh_peer import KINDS
-from tests.networks import open_zenoh
-from tests.servers import Client, Script, ScriptedServer, c3d_file, packet
+from tests.support.networks import open_zenoh
+from tests.support.servers import Client, Script, ScriptedServer, c3d_file, packet
 
 ASKS_AT_ONCE: Final = 2000
 NUM_STALLED: Final = 20

@@ -32,7 +32,6 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.faults.control import KINDS, Faults
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.gateway_process import simulator as simulator_process
 from tests.hostile.gateway_under_attack import (
     HEALTHY_SCENE,
     Report,
@@ -44,12 +43,12 @@ from tests.hostile.gateway_under_attack import (
     rss_kib,
     run_gateway,
 )
-from tests.lsl_receiver import lsl_config
-from tests.name_server import dead_name_server
-from tests.networks import free_endpoint, free_port
-from tests.networks import open_zenoh as open_session
 from tests.soak.attacks import ATTACKS, Target
-from tests.waiting import wait_until_async
+from tests.support.gateway_process import simulator as simulator_process
+from tests.support.lsl_receiver import lsl_config
+from tests.support.networks import dead_name_server, free_endpoint, free_port
+from tests.support.networks import open_zenoh as open_session
+from tests.support.waiting import wait_until_async
 
 RATE_HZ: Final = 200.0
 COMPONENTS: Final = tuple(COMPONENTS_BY_KEY)

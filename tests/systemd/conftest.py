@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator, Iterator
 import pytest
 import uvloop
 
-from tests.fresh_clones import ROOT, clone_into, files_in
-from tests.networks import free_endpoint
+from tests.support.fresh_clones import ROOT, clone_into, files_in
+from tests.support.networks import free_endpoint
 from tests.systemd.machine import CLONE, DROP_INS, Machine, Service, commands
 
 QUICKLY = "export CC=/run/repository/tests/quick-cc\n" if shutil.which("cc") else ""

@@ -13,8 +13,8 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
-from tests.fresh_clones import ROOT, SYSTEM_PYTHON, WHEELHOUSE, pip_environment
-from tests.networks import zenoh_keys
+from tests.support.fresh_clones import ROOT, SYSTEM_PYTHON, WHEELHOUSE, pip_environment
+from tests.support.networks import zenoh_keys
 
 UNIT: Final = "rtc3d-gateway.service"
 CONFIG: Final = "/etc/rtc3d-gateway/gateway.yaml"

@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from tests.fresh_clones import skip_if_plain
-from tests.networks import free_port, zenoh_keys
+from tests.support.fresh_clones import skip_if_plain
+from tests.support.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service, commands, exposure
 
 pytestmark = [

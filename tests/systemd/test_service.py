@@ -10,11 +10,11 @@ import pytest
 
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.fresh_clones import ROOT
-from tests.networks import free_endpoint, free_port, zenoh_keys
-from tests.servers import Client, ScriptedServer, ok, packet
+from tests.support.fresh_clones import ROOT
+from tests.support.networks import free_endpoint, free_port, zenoh_keys
+from tests.support.servers import Client, ScriptedServer, ok, packet
+from tests.support.waiting import wait_until_async
 from tests.systemd.machine import CONFIG, UNIT, Service
-from tests.waiting import wait_until_async
 
 pytestmark = [
     pytest.mark.systemd,

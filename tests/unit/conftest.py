@@ -6,9 +6,8 @@ from typing import Final
 
 import pytest
 
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock, VirtualTimeLoop
 from tests.unit.service.scripted_sources import Servers, SlowThreads, use_scripted_servers
-from tests.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {
     "test_daemon.py",

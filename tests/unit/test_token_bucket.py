@@ -1,7 +1,7 @@
 """Rates and bursts, on a clock that the test sets."""
 
 from gateway.token_bucket import TokenBucket
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
 
 
 def test_a_bucket_allows_the_amount_of_a_second_at_once_and_then_its_rate(clock: Clock) -> None:

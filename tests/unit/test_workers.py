@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gateway.workers import MAX_BYTES, MAX_CALLS, QueueRoom, WorkerThread, module_environment, result_of
-from tests.waiting import wait_until_async
+from tests.support.waiting import wait_until_async
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from gateway.client.series import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from tests.networks import free_endpoint, open_zenoh
-from tests.queried_gateway import parameters_xml
+from tests.support.networks import free_endpoint, open_zenoh
+from tests.support.queried_gateway import parameters_xml
 
 Position = tuple[float, float, float]
 

@@ -13,8 +13,8 @@ from gateway.display.view.panel import Panel
 from gateway.display.view.server import ViewServer, open_server
 from gateway.display.view.viewer import PERIOD_S
 from gateway.rtc3d.components import ComponentType
-from tests.browser import NewPage, chromium, new_page
-from tests.statuses import stream
+from tests.support.browser import NewPage, chromium, new_page
+from tests.support.statuses import stream
 from tests.unit.display.live_lab import Lab
 
 pytestmark = pytest.mark.chromium

@@ -9,9 +9,9 @@ import pytest
 from playwright.sync_api import Browser
 
 from gateway.takes.files.component_rows import Array
-from tests.browser import NewPage, chromium, new_page, pages
-from tests.gateway_process import gateway_process, simulator
-from tests.networks import free_port
+from tests.support.browser import NewPage, chromium, new_page, pages
+from tests.support.gateway_process import gateway_process, simulator
+from tests.support.networks import free_port
 from tests.view.picture import Picture, Position
 from tests.view.published_scene import MISSING, PublishedScene, published_scene
 from tests.view.view_process import ViewProcess, view_process

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from tests.gateway_process import program
+from tests.support.gateway_process import program
 
 _ADDRESS: Final = re.compile(r"http://[\w.:]+")
 

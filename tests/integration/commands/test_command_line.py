@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import pytest
 
 from gateway.cli.main import COMMANDS
-from tests.gateway_process import PROGRAM
+from tests.support.gateway_process import PROGRAM
 
 ROOT: Final = Path(__file__).parents[3]
 CONFIG: Final = str(ROOT / "config/gateway.yaml")

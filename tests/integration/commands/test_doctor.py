@@ -15,10 +15,19 @@ from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.findings import MARKERS_XML, TOOLS_XML, diagnose, lab, parameters, replying, run_doctor, streaming
-from tests.findings import tools_frame as tools
-from tests.networks import free_port
-from tests.servers import Client, Script, ScriptedServer, markers_frame, ok, packet
+from tests.support.findings import (
+    MARKERS_XML,
+    TOOLS_XML,
+    diagnose,
+    lab,
+    parameters,
+    replying,
+    run_doctor,
+    streaming,
+)
+from tests.support.findings import tools_frame as tools
+from tests.support.networks import free_port
+from tests.support.servers import Client, Script, ScriptedServer, markers_frame, ok, packet
 
 MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
 FORCE, EVENT = ComponentType.FORCE, ComponentType.EVENT

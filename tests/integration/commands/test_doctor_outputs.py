@@ -17,8 +17,8 @@ from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.command_process import Completed, run
-from tests.networks import free_port, zenoh_keys
+from tests.support.commands import Completed, run
+from tests.support.networks import free_port, zenoh_keys
 
 GROUP: Final = "udpm://239.255.76.67:7667"
 

@@ -15,14 +15,14 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway
 from gateway.stream.state import StreamState
-from tests import servers
-from tests.command_process import run
-from tests.configurations import make_settings
-from tests.findings import MARKERS_XML, Findings, lab, parameters, replying, run_doctor, streaming
-from tests.networks import free_port
-from tests.running_gateway import monitored_gateway
-from tests.servers import ScriptedServer, markers_frame, packet
-from tests.waiting import wait_until_async
+from tests.support import servers
+from tests.support.commands import run
+from tests.support.configurations import make_settings
+from tests.support.findings import MARKERS_XML, Findings, lab, parameters, replying, run_doctor, streaming
+from tests.support.gateways import monitored_gateway
+from tests.support.networks import free_port
+from tests.support.servers import ScriptedServer, markers_frame, packet
+from tests.support.waiting import wait_until_async
 
 GATEWAY = "running gateway"
 STREAM = "lab (3d 6d analog force event)"

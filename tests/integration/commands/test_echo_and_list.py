@@ -18,12 +18,12 @@ from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.command_process import run
 from tests.integration.commands.test_params_command import SIDES, Lab, lab_without_server
-from tests.networks import free_endpoint, lcm_url, open_zenoh
-from tests.pseudo_terminals import in_terminal
-from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
-from tests.waiting import wait_until_async
+from tests.support.commands import run
+from tests.support.networks import free_endpoint, lcm_url, open_zenoh
+from tests.support.pseudo_terminals import in_terminal
+from tests.support.queried_gateway import ParameterServer, run_gateway, wait_until_cached
+from tests.support.waiting import wait_until_async
 
 pytestmark = [pytest.mark.netns, pytest.mark.asyncio(loop_scope="module")]
 

@@ -17,13 +17,12 @@ from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from tests.command_in_process import run_in_process
-from tests.command_process import Completed, run
-from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
-from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
-from tests.servers import ScriptedServer
-from tests.spec_parameters import spec_xml
-from tests.waiting import wait_until_async
+from tests.support.commands import Completed, run, run_in_process
+from tests.support.networks import free_endpoint, free_port, lcm_url, open_zenoh
+from tests.support.parameters import spec_xml
+from tests.support.queried_gateway import ParameterServer, run_gateway, wait_until_cached
+from tests.support.servers import ScriptedServer
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

@@ -8,8 +8,8 @@ from typing import Final
 
 import pytest
 
-from tests.gateway_process import PROGRAM
-from tests.takes import description, markers, write_take
+from tests.support.gateway_process import PROGRAM
+from tests.support.takes import description, markers, write_take
 
 HIDDEN_CURSOR: Final = b"\x1b[?25l"
 """What a line of progress begins with."""

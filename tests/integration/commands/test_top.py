@@ -14,12 +14,12 @@ from typing import Any, Final, NamedTuple
 import pytest
 
 from gateway.display.top.pages import TWO_GATEWAYS
-from tests.command_process import Completed, run_command
-from tests.configurations import write_config
-from tests.gateway_process import program, simulator
-from tests.networks import free_endpoint, lcm_url, open_zenoh, zenoh_keys
-from tests.pseudo_terminals import PseudoTerminal, in_terminal
-from tests.waiting import wait_until
+from tests.support.commands import Completed, run_command
+from tests.support.configurations import write_config
+from tests.support.gateway_process import program, simulator
+from tests.support.networks import free_endpoint, lcm_url, open_zenoh, zenoh_keys
+from tests.support.pseudo_terminals import PseudoTerminal, in_terminal
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.command_process import run_command
-from tests.configurations import write_config
-from tests.networks import free_port
-from tests.secure_zenoh import SecureRouter, run_gateway_with_simulator
-from tests.waiting import wait_until
+from tests.support.commands import run_command
+from tests.support.configurations import write_config
+from tests.support.networks import free_port
+from tests.support.secure_zenoh import SecureRouter, run_gateway_with_simulator
+from tests.support.waiting import wait_until
 
 
 def test_connect_replaces_the_address_in_the_file(secured: SecureRouter, tmp_path: Path) -> None:

@@ -14,13 +14,12 @@ import yaml
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.simulator.synthetic import SyntheticScene
-from tests.command_in_process import run_in_process
-from tests.gateway_process import PROGRAM
-from tests.networks import free_endpoint, free_port, zenoh_keys
-from tests.recorded_scenes import record_scene
-from tests.takes import frame, parameters, write_take
+from tests.support.commands import run_in_process
+from tests.support.gateway_process import PROGRAM
+from tests.support.networks import free_endpoint, free_port, zenoh_keys
+from tests.support.takes import frame, parameters, record_scene, write_take
+from tests.support.waiting import wait_until
 from tests.unit.takes.export.exported import read_ezc3d
-from tests.waiting import wait_until
 
 SCENE = SyntheticScene(markers=20, tools=0, analog=8, plates=1, rate_hz=100, analog_rate_hz=1000)
 

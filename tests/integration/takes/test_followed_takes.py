@@ -13,10 +13,10 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.takes import Takes
 from gateway.service.gateway import Gateway
 from gateway.takes.files.reader import TakeReader
-from tests.networks import free_endpoint
-from tests.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
-from tests.servers import ScriptedServer, c3d_file, markers_frame, packet
-from tests.waiting import wait_until_async
+from tests.support.networks import free_endpoint
+from tests.support.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
+from tests.support.servers import ScriptedServer, c3d_file, markers_frame, packet
+from tests.support.waiting import wait_until_async
 
 
 def takes_in(folder: Path, setting: str) -> TakesSettings:

@@ -20,8 +20,8 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
-from tests.configurations import make_settings
-from tests.waiting import wait_until_async
+from tests.support.configurations import make_settings
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

@@ -27,9 +27,9 @@ from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.statistics import take_statistics
-from tests.gateway_process import PROGRAM, program, simulator
-from tests.networks import free_endpoint, lcm_url, open_zenoh, wait_for_zenoh, zenoh_keys
-from tests.waiting import wait_until
+from tests.support.gateway_process import PROGRAM, program, simulator
+from tests.support.networks import free_endpoint, lcm_url, open_zenoh, wait_for_zenoh, zenoh_keys
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 

@@ -24,12 +24,12 @@ from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.files.reader import TakeReader
-from tests.configurations import make_settings
-from tests.gateway_process import program, simulator
-from tests.networks import free_endpoint, zenoh_keys
-from tests.recording_output import settings_in
-from tests.running_gateway import running_gateway
-from tests.waiting import wait_until, wait_until_async
+from tests.support.configurations import make_settings
+from tests.support.gateway_process import program, simulator
+from tests.support.gateways import running_gateway
+from tests.support.networks import free_endpoint, zenoh_keys
+from tests.support.recording_output import settings_in
+from tests.support.waiting import wait_until, wait_until_async
 
 pytestmark = pytest.mark.netns
 

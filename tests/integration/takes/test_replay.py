@@ -21,12 +21,21 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.takes.files.event_log import encode_event
-from tests.command_in_process import run_in_process
-from tests.gateway_process import PROGRAM
 from tests.integration.commands.test_command_line import Ended, end_of, run
-from tests.networks import free_endpoint, lcm_url, open_zenoh
-from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
-from tests.waiting import wait_until_async
+from tests.support.commands import run_in_process
+from tests.support.gateway_process import PROGRAM
+from tests.support.networks import free_endpoint, lcm_url, open_zenoh
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    frame,
+    log_bytes,
+    markers,
+    parameters,
+    write_take,
+)
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

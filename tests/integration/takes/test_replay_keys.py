@@ -12,9 +12,9 @@ from typing import Final
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from tests.networks import lcm_url
-from tests.pseudo_terminals import PseudoTerminal, in_terminal
-from tests.takes import START_UTIME, description, frame, markers, parameters, write_take
+from tests.support.networks import lcm_url
+from tests.support.pseudo_terminals import PseudoTerminal, in_terminal
+from tests.support.takes import START_UTIME, description, frame, markers, parameters, write_take
 
 pytestmark = pytest.mark.netns
 

@@ -14,8 +14,8 @@ from gateway.messages.decode import decode
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.takes import open_take
 from gateway.takes.files.reader import TakeReader
-from tests.command_in_process import run_in_process
-from tests.documents import ROOT
+from tests.support.commands import run_in_process
+from tests.support.documents import ROOT
 from tests.unit.takes.export.exported import read_ezc3d
 
 TAKE: Final = ROOT / "examples/walk.lcmlog"

@@ -36,14 +36,13 @@ from gateway.simulator.take_scene import TakeScene
 from gateway.stream.state import StreamState
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
-from tests.command_in_process import run_in_process
-from tests.configurations import make_settings
 from tests.integration.raw_client import RawClient, connected
-from tests.memory_gateway import run_gateway
-from tests.running_gateway import running_gateway
-from tests.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+from tests.support.commands import run_in_process
+from tests.support.configurations import make_settings
+from tests.support.gateways import run_gateway, running_gateway
+from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+from tests.support.waiting import wait_until_async
 from tests.unit.rtc3d_server.wire import XML, WireComponent, command
-from tests.waiting import wait_until_async
 
 SECOND_US = 1_000_000
 LABELS = encode_parameters(

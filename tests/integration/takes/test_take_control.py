@@ -20,10 +20,10 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
-from tests.networks import free_endpoint, lcm_url
-from tests.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
-from tests.servers import ScriptedServer, markers_frame
-from tests.waiting import wait_until_async
+from tests.support.networks import free_endpoint, lcm_url
+from tests.support.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
+from tests.support.servers import ScriptedServer, markers_frame
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 

@@ -11,8 +11,8 @@ from gateway.c3d_files import receiving
 from gateway.c3d_files.receiving import FileReceiver, SourceFiles
 from gateway.c3d_files.spool import QueueMemory, Spool, StoredFile
 from gateway.rtc3d.packets import FilePiece
-from tests.servers import c3d_file
-from tests.waiting import wait_until_async
+from tests.support.servers import c3d_file
+from tests.support.waiting import wait_until_async
 
 FILE = c3d_file(b"the end", 2000)
 

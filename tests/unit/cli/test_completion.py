@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from gateway.cli import options
 from gateway.cli.main import COMPLETION_VARIABLE, app
 from gateway.cli.options import source_names
-from tests.gateway_process import PROGRAM
-from tests.takes import description, write_take
+from tests.support.gateway_process import PROGRAM
+from tests.support.takes import description, write_take
 
 
 @pytest.fixture(autouse=True)

@@ -20,8 +20,8 @@ from gateway.cli.echo_output import (
 )
 from gateway.cli.echo_sources import Silence, Units
 from gateway.outputs.kind import Receive, SubscriptionRequest
-from tests.settable_clock import Clock
-from tests.spec_parameters import in_root, spec_xml
+from tests.support.clocks import Clock
+from tests.support.parameters import in_root, spec_xml
 
 MARKERS_BYTES = len(spec_xml("3d"))
 

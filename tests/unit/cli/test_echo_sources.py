@@ -12,8 +12,8 @@ from gateway.client.found_sources import FoundSources
 from gateway.errors import OutputError, QueryError
 from gateway.messages.source_report import source_report
 from gateway.outputs.kind import SubscriptionRequest
-from tests import statuses
-from tests.waiting import wait_until
+from tests.support import statuses
+from tests.support.waiting import wait_until
 
 
 def found_of(*components: str) -> FoundSources:

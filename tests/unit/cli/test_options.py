@@ -18,8 +18,8 @@ from gateway.config.loading import Configuration
 from gateway.config.show import schema_text
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.command_in_process import run_in_process
-from tests.configurations import MODEL
+from tests.support.commands import run_in_process
+from tests.support.configurations import MODEL
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ from gateway.cli.params import OutputFormat, write_replies
 from gateway.client.transport import Reply
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS
-from tests.spec_parameters import ALL, in_root, spec_body, spec_xml
+from tests.support.parameters import ALL, in_root, spec_body, spec_xml
 
 EVERYTHING = in_root(*(spec_body(section).decode() for section in ("general", "3d", "6d", "analog")))
 

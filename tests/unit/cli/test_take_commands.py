@@ -13,7 +13,7 @@ from gateway.cli.main import app
 from gateway.cli.take_list import ListedTake, size_text, write_list
 from gateway.errors import TakeError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
-from tests.takes import description, markers, parameters, write_take
+from tests.support.takes import description, markers, parameters, write_take
 
 TAKE = {"name": "walk-1", "bytes": 3_456_789, "begin_utime": 1_700_000_000_000_000, "seconds": 83.25}
 

@@ -15,8 +15,8 @@ from gateway.messages.encode import PREFIX
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.parameters_message import encode_parameters
-from tests.networks import lcm_url
-from tests.waiting import wait_until
+from tests.support.networks import lcm_url
+from tests.support.waiting import wait_until
 
 CODES = ("disabled", "nothing-yet", "refused")
 

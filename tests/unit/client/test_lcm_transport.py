@@ -16,8 +16,8 @@ from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.recorder import FileWriter, TakeRecording, Target
-from tests.networks import lcm_url
-from tests.waiting import wait_until
+from tests.support.networks import lcm_url
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 

@@ -6,7 +6,7 @@ import pytest
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.configurations import load, make_settings, read, read_server
+from tests.support.configurations import load, make_settings, read, read_server
 
 FILE = """\
 sources:

@@ -15,7 +15,7 @@ from gateway.config.settings import StreamSettings
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.configurations import MODEL, load
+from tests.support.configurations import MODEL, load
 
 SHIPPED = Path(__file__).parents[3] / "config"
 

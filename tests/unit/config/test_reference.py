@@ -31,8 +31,8 @@ from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.configurations import MODEL
 from tests.property.test_config_properties import SETTINGS
+from tests.support.configurations import MODEL
 
 REFERENCE = (Path(__file__).parents[3] / "docs/reference/configuration.md").read_text(encoding="utf-8")
 

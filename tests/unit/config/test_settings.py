@@ -11,8 +11,7 @@ from gateway.messages import topics
 from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
-from tests.configurations import MODEL
-from tests.settings import mistakes, source
+from tests.support.configurations import MODEL, mistakes, source
 
 MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.FORCE
 TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from gateway.config.show import shown_configuration
-from tests.configurations import load, read
+from tests.support.configurations import load, read
 
 FILE = """\
 sources:

@@ -11,7 +11,7 @@ from gateway.outputs.lcm.settings import DEFAULT_LCM_URL, LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from tests.settings import mistakes, source
+from tests.support.configurations import mistakes, source
 
 MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
 HERTZ = "expected a number of frames per second above 0, up to 1000000"

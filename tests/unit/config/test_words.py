@@ -12,9 +12,9 @@ from gateway.config.words import find_secrets, mask_secrets
 from gateway.errors import ConfigError
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.output import ZenohOutput
-from tests.configurations import load, read
-from tests.networks import free_port
-from tests.waiting import wait_until
+from tests.support.configurations import load, read
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until
 
 SERVER = "sources: [{name: lab, host: 192.0.2.20}]\n"
 PASSWORD = variable_name(("zenoh", "config", "transport", "auth", "usrpwd", "password"))

@@ -10,7 +10,7 @@ from gateway.descriptions.source_frame import source_frame
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import Parameters, Parameters3D
-from tests.settings import mistakes
+from tests.support.configurations import mistakes
 
 
 def frame_of(unit: str | None = "mm", frame_id: str | None = None, **transform: Any) -> CoordinateFrame:

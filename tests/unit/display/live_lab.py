@@ -11,7 +11,7 @@ import rtc3d
 from gateway.display.live.live_data import LiveData, LiveSource
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
-from tests.takes import frame, parameters
+from tests.support.takes import frame, parameters
 
 NAN = float("nan")
 MISSING = (NAN, NAN, NAN, 999.0)

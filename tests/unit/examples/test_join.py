@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from tests.joined_components import SCENARIOS, Pair, Scenario
-from tests.takes import frame, markers
+from tests.support.joined_components import SCENARIOS, Pair, Scenario
+from tests.support.takes import frame, markers
 
 EXAMPLE = Path(__file__).parents[3] / "examples/join.py"
 _, MESSAGE = markers(2, 7)

@@ -11,7 +11,7 @@ from gateway.foxglove_schemas.messages import FoxgloveSource
 from gateway.foxglove_schemas.topics import FloatTopics, field_names
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from tests.spec_parameters import ALL
+from tests.support.parameters import ALL
 
 
 @pytest.mark.parametrize("bits", ["7f800000", "7f800001", "7f7fffff", "ffffffff"])

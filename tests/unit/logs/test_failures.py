@@ -15,7 +15,7 @@ from gateway.logs.failures import (
 )
 from gateway.logs.limits import HOLD_S, MAX_HOLD_S, MAX_REPEATS
 from gateway.logs.log_format import ContextFilter
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
 
 LOGGER = logging.getLogger("tests.failures")
 

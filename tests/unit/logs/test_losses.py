@@ -6,8 +6,8 @@ import pytest
 
 from gateway.logs.limits import HOLD_S, MAX_HOLD_S
 from gateway.logs.losses import Losses, last_minute_text
-from tests.losses import amounts
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.statuses import amounts
 
 LOGGER = logging.getLogger("tests.losses")
 

@@ -8,9 +8,9 @@ import pytest
 from gateway.errors import ProtocolError
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, json_bytes, json_text, to_json
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
-from tests.message_vectors import VECTORS
+from tests.support.message_vectors import VECTORS
+from tests.support.vectors import LONG_EVENTS, MARKERS
 from tests.unit.messages.samples import component_message, tool_pose_messages
-from tests.vectors import LONG_EVENTS, MARKERS
 
 MISSING = [None] * 3
 EVERY_MESSAGE = [vector.data for vector in VECTORS]

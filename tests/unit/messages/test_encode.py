@@ -21,9 +21,9 @@ from gateway.messages.encode import (
 from gateway.messages.texts import encode_within_limits
 from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, zenoh_key
 from gateway.rtc3d.components import ComponentType
-from tests.message_vectors import FOLDER, VECTORS, MessageVector, difference, to_vector_values
+from tests.support.message_vectors import FOLDER, VECTORS, MessageVector, difference, to_vector_values
+from tests.support.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, SHORT_EVENTS, TOOLS, ComponentVector
 from tests.unit.messages.samples import received
-from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, SHORT_EVENTS, TOOLS, ComponentVector
 
 STAMP = Stamp(1_700_000_000_000_001, 1_700_000_000_000_000, session=3, parameters_version=5)
 SEQUENCE = 41

@@ -12,6 +12,7 @@ from gateway.messages.texts import xml_bytes, xml_text
 from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from tests.support.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentVector
 from tests.unit.messages.samples import (
     command_messages,
     component_message,
@@ -19,7 +20,6 @@ from tests.unit.messages.samples import (
     tool_pose_messages,
     unknown_clock,
 )
-from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentVector
 
 LAB = "#17 lab at 192.0.2.20:3020: [3d 6d] "
 OUTPUTS = "; outputs: zenoh ok; lcm no multicast: ip route add"

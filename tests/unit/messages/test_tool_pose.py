@@ -13,7 +13,7 @@ from gateway.messages.coordinate_frame import CoordinateFrame, Quaternion
 from gateway.messages.encode import Stamp, metres_per_unit, tool_poses
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame
-from tests.vectors import ALL_ONES
+from tests.support.vectors import ALL_ONES
 
 HALF = math.sqrt(0.5)
 QUARTER_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)

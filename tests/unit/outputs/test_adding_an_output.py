@@ -32,8 +32,14 @@ from gateway.service.monitoring.metrics import metrics_page, metrics_registry
 from gateway.service.monitoring.process_limits import LoopDelay
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
-from tests.waiting import wait_until_async
+from tests.support.example_output import (
+    EXAMPLE,
+    UNREACHABLE,
+    ExampleOutput,
+    ExampleSettings,
+    ExampleSubscription,
+)
+from tests.support.waiting import wait_until_async
 
 OFF = {"zenoh": {"enabled": False}, "lcm": {"enabled": False}, "metrics": {"enabled": False}}
 

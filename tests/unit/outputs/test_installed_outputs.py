@@ -22,14 +22,14 @@ from gateway.outputs.registry import (
     build_outputs,
     settings_type,
 )
-from tests.example_output import ExampleOutput, ExampleSettings
+from tests.support.example_output import ExampleOutput, ExampleSettings
 
 Install = Callable[..., None]
 
 WORKING = """
 from dataclasses import replace
 from gateway.config.settings import OutputSettings
-from tests.example_output import EXAMPLE
+from tests.support.example_output import EXAMPLE
 KIND = EXAMPLE
 """
 

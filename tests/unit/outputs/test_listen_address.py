@@ -12,7 +12,7 @@ from gateway.outputs.listen_address import (
     is_loopback,
     listen_problem,
 )
-from tests.networks import free_port
+from tests.support.networks import free_port
 
 ALL_IPV4 = "0.0.0.0"  # noqa: S104 - not bound
 

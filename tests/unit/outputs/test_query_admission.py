@@ -7,7 +7,7 @@ import pytest
 from gateway.errors import QueryError
 from gateway.outputs import query_admission as admission_module
 from gateway.outputs.query_admission import MAX_KEYS, NO_REPLY, QueryAdmission, QueryLimits
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
 
 LIMITS = QueryLimits("zenoh", "max_queries_per_key_per_s", 100.0, 10.0, 1000.0, 40)
 

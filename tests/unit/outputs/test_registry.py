@@ -13,7 +13,7 @@ from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
-from tests.configurations import make_settings
+from tests.support.configurations import make_settings
 
 SOURCES = (SourceSettings(name="lab", host="127.0.0.1"),)
 

@@ -19,9 +19,15 @@ from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import key_patterns
-from tests.memory_output import MemoryOutput
-from tests.networks import add_multicast_route, free_endpoint, lcm_url, remove_multicast_route, zenoh_keys
-from tests.waiting import wait_until
+from tests.support.memory_output import MemoryOutput
+from tests.support.networks import (
+    add_multicast_route,
+    free_endpoint,
+    lcm_url,
+    remove_multicast_route,
+    zenoh_keys,
+)
+from tests.support.waiting import wait_until
 
 MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
 ELSEWHERE = Topic("hall", ("3d",), "rtc3d.markers_t")

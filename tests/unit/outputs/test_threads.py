@@ -21,9 +21,9 @@ from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.queries.service import SourceQueryService
-from tests.lcm_relay import LcmRelay
-from tests.networks import zenoh_keys
-from tests.waiting import wait_until_async
+from tests.support.lcm_relay import LcmRelay
+from tests.support.networks import zenoh_keys
+from tests.support.waiting import wait_until_async
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from gateway.messages.encode import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, WIRE_ORDER, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, FrameLayout, encode_frame, split_frame
-from tests.toy_output import ToyOutput
-from tests.vectors import FULL_FRAME
+from tests.support.toy_output import ToyOutput
+from tests.support.vectors import FULL_FRAME
 
 MARKERS, TOOLS, EVENT = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT
 ALL = frozenset(WIRE_ORDER)

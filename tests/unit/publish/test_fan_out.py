@@ -14,11 +14,12 @@ from gateway.publish.fan_out import FanOut, ItemCounts
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
-from tests.losses import amounts
-from tests.memory_output import MemoryOutput
-from tests.server_parameters import in_metres
-from tests.settable_clock import Clock
-from tests.toy_output import ToyOutput
+from tests.support.clocks import Clock
+from tests.support.memory_output import MemoryOutput
+from tests.support.parameters import in_metres
+from tests.support.statuses import amounts
+from tests.support.toy_output import ToyOutput
+from tests.support.vectors import EMPTY_FRAME
 from tests.unit.publish.rig import (
     ALL,
     EVENT,
@@ -32,7 +33,6 @@ from tests.unit.publish.rig import (
     publish_full,
     sequences,
 )
-from tests.vectors import EMPTY_FRAME
 
 PROBES = in_metres(
     Parameters(tools=Parameters6D(tools=(Tool(id="0", label="Probe"), Tool(id="1", label="H"))))

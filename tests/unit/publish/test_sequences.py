@@ -8,8 +8,8 @@ from gateway.messages.encode import encode_message
 from gateway.publish.fan_out import FanOut
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
-from tests.losses import amounts
-from tests.toy_output import ToyOutput
+from tests.support.statuses import amounts
+from tests.support.toy_output import ToyOutput
 from tests.unit.publish.rig import (
     ALL,
     EVENT,

@@ -8,10 +8,10 @@ from gateway.outputs.takes.output import TakesOutput
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
-from tests.memory_output import MemoryOutput
-from tests.recording_output import frames, settings_in
-from tests.vectors import FULL_FRAME
-from tests.waiting import wait_until_async
+from tests.support.memory_output import MemoryOutput
+from tests.support.recording_output import frames, settings_in
+from tests.support.vectors import FULL_FRAME
+from tests.support.waiting import wait_until_async
 
 STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
 ALL = frozenset(WIRE_ORDER)

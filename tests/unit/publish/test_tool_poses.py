@@ -10,9 +10,9 @@ from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.frames import Frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
-from tests.losses import amounts
-from tests.server_parameters import in_metres
-from tests.toy_output import ToyOutput
+from tests.support.parameters import in_metres
+from tests.support.statuses import amounts
+from tests.support.toy_output import ToyOutput
 from tests.unit.publish.rig import ALL, STAMP
 
 IN_VIEW = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.5)

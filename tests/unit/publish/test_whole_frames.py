@@ -4,8 +4,8 @@ from gateway.errors import OutputError
 from gateway.outputs.guard import GuardedOutput
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ComponentType
-from tests.losses import amounts
-from tests.toy_output import ToyOutput
+from tests.support.statuses import amounts
+from tests.support.toy_output import ToyOutput
 from tests.unit.publish.rig import (
     ALL,
     EVENT,

@@ -18,8 +18,8 @@ from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.stream.status import SessionNumbers, StreamStatus
-from tests.spec_parameters import in_root
-from tests.waiting import wait_until_async
+from tests.support.parameters import in_root
+from tests.support.waiting import wait_until_async
 
 
 def parameters_xml(unit: str, frames_sent: int = 1) -> bytes:

@@ -23,8 +23,8 @@ from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import General, Parameters, ParametersForce
+from tests.support.vectors import FULL_FRAME, MARKERS
 from tests.unit.messages.samples import component_message
-from tests.vectors import FULL_FRAME, MARKERS
 
 
 def encoded_message(component_type: ComponentType) -> bytes:

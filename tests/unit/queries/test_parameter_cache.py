@@ -12,7 +12,7 @@ from gateway.queries.server_answer import MAX_PARTS
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.replies import LONG_XML_BYTES, XmlThread
-from tests.spec_parameters import in_root
+from tests.support.parameters import in_root
 from tests.unit.queries.fake_source import CM, MM, FakeSource, parameters_xml
 
 SILENCE = ReplyTimeoutError("192.0.2.1:3020 did not answer SendParameters within 2 s")

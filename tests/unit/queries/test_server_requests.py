@@ -12,8 +12,8 @@ from gateway.errors import ClosedError, QueryError, ReplyTimeoutError, ServerErr
 from gateway.queries.server_requests import ServerRequests
 from gateway.rtc3d.commands import SendCurrentFrame, SendParameters
 from gateway.rtc3d.packets import Packet, PacketType
+from tests.support.clocks import run_in_virtual_time
 from tests.unit.queries.fake_source import CM, MM, FakeSource
-from tests.virtual_time import run_in_virtual_time
 
 
 async def test_equal_requests_share_a_reply_and_different_ones_wait_for_each_other() -> None:

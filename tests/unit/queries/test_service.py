@@ -21,10 +21,10 @@ from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.stream.state import StreamState
-from tests.servers import markers_frame
-from tests.toy_output import ToyOutput
+from tests.support.clocks import run_in_virtual_time
+from tests.support.servers import markers_frame
+from tests.support.toy_output import ToyOutput
 from tests.unit.queries.fake_source import CM, MM, FakeSource
-from tests.virtual_time import run_in_virtual_time
 
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))[8:]
 

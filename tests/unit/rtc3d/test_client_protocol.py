@@ -30,8 +30,8 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.rtc3d.packets import Packet
-from tests.servers import error, ok, packet
-from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING, ByteOrder
+from tests.support.servers import error, ok, packet
+from tests.support.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING, ByteOrder
 
 STREAM = StreamFrames(AllFrames(), (ComponentType.MARKERS,))
 FRAME = packet(3, FULL_FRAME["big"])

@@ -27,7 +27,7 @@ from gateway.rtc3d.frames import (
     encode_frame,
     split_frame,
 )
-from tests.vectors import (
+from tests.support.vectors import (
     ANALOG,
     COMPONENTS,
     EMPTY_FRAME,

@@ -17,7 +17,7 @@ from gateway.rtc3d.packets import (
     decode_text,
     encode_packet,
 )
-from tests.vectors import PACKETS
+from tests.support.vectors import PACKETS
 
 
 def header(size: int, packet_type: int) -> bytes:

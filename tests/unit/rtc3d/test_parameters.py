@@ -26,7 +26,7 @@ from gateway.rtc3d.parameters import (
     without_statistics,
 )
 from gateway.rtc3d.parameters_xml import parse_parameters
-from tests.spec_parameters import ALL, ANALOG, BY_SECTION, GENERAL, spec_xml
+from tests.support.parameters import ALL, ANALOG, BY_SECTION, GENERAL, spec_xml
 
 
 def test_sections_have_the_words_of_section_5_3_3_and_are_found_by_their_keys() -> None:

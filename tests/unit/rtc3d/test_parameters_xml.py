@@ -36,7 +36,7 @@ from gateway.rtc3d.parameters_xml import (
     named_sections,
     parse_parameters,
 )
-from tests.spec_parameters import ALL, BY_SECTION, MARKERS, in_root, markers_of, spec_body, spec_xml
+from tests.support.parameters import ALL, BY_SECTION, MARKERS, in_root, markers_of, spec_body, spec_xml
 
 
 def recovered_markers(xml: bytes) -> tuple[Parameters3D, tuple[str, ...]]:

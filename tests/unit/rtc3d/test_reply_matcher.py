@@ -17,8 +17,8 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.components import ComponentType
-from tests.servers import error, ok, packet
-from tests.vectors import FULL_FRAME
+from tests.support.servers import error, ok, packet
+from tests.support.vectors import FULL_FRAME
 
 VERSION: Final = Version()
 STREAM: Final = StreamFrames(AllFrames(), (ComponentType.MARKERS,))

@@ -11,8 +11,8 @@ import pytest
 from gateway.config.settings import SourceSettings
 from gateway.stream.supervisor import Supervisor
 from gateway.workers import WorkerThread
+from tests.support.clocks import read_clocks
 from tests.unit.stream.scripted_server import ScriptedServer
-from tests.virtual_time import read_clocks
 
 
 class Servers:

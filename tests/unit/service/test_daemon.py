@@ -20,9 +20,9 @@ from gateway.config.settings import MetricsSettings, Settings, SourceSettings
 from gateway.errors import ConfigError
 from gateway.service.daemon import Daemon, SystemdNotifier
 from gateway.service.gateway import Gateway
-from tests.memory_output import MemoryOutput
+from tests.support.clocks import settle, until
+from tests.support.memory_output import MemoryOutput
 from tests.unit.service.scripted_sources import Servers, SlowThreads
-from tests.virtual_time import settle, until
 
 
 @pytest.fixture

@@ -20,12 +20,18 @@ from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.service.gateway import Gateway
-from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
-from tests.memory_output import MemoryOutput
-from tests.servers import c3d_file, packet
+from tests.support.clocks import settle, until
+from tests.support.example_output import (
+    EXAMPLE,
+    UNREACHABLE,
+    ExampleOutput,
+    ExampleSettings,
+    ExampleSubscription,
+)
+from tests.support.memory_output import MemoryOutput
+from tests.support.servers import c3d_file, packet
 from tests.unit.service.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML, silent_to
-from tests.virtual_time import settle, until
 
 pytestmark = pytest.mark.usefixtures("servers", "threads")
 REFUSED = "refused"

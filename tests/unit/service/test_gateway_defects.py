@@ -19,6 +19,7 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.streams import AutomaticStreams
 from gateway.stream.supervisor import Supervisor
+from tests.support.clocks import settle
 from tests.unit.service.scripted_sources import Servers
 from tests.unit.service.test_gateway import (
     RecordingOutput,
@@ -29,7 +30,6 @@ from tests.unit.service.test_gateway import (
     streaming,
     subscribe,
 )
-from tests.virtual_time import settle
 
 pytestmark = pytest.mark.usefixtures("servers", "threads")
 

@@ -21,11 +21,11 @@ from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
 from gateway.service.source import Source, SourceHistory
 from gateway.workers import WorkerThread
-from tests.servers import c3d_file, packet
-from tests.toy_output import ToyOutput, ToyPublisher
+from tests.support.clocks import settle, until
+from tests.support.servers import c3d_file, packet
+from tests.support.toy_output import ToyOutput, ToyPublisher
 from tests.unit.service.scripted_sources import Servers
 from tests.unit.stream.scripted_server import ScriptedServer
-from tests.virtual_time import settle, until
 
 HOST = "192.0.2.20"
 STREAM = "lab (3d 6d analog force event)"

@@ -10,14 +10,14 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import ServerParameters
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
-from tests.servers import packet
-from tests.spec_parameters import in_root
-from tests.toy_output import ToyOutput
+from tests.support.clocks import settle
+from tests.support.parameters import in_root
+from tests.support.servers import packet
+from tests.support.toy_output import ToyOutput
 from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
 from tests.unit.queries.fake_source import parameters_xml
 from tests.unit.service.test_source import TWO_STREAMS, Lab, NewLab, new_lab, running
 from tests.unit.stream.scripted_server import XML, Answer, obliging, refusing, silent_to
-from tests.virtual_time import settle
 
 __all__ = ["new_lab"]  # a fixture
 

@@ -14,7 +14,7 @@ from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
 from gateway.simulator.take_frames import RecordedFrames, TakePass
 from gateway.simulator.take_moments import Moment, RecordedParameters
 from gateway.takes.files.reader import TakeReader
-from tests.takes import START_UTIME, Message, description, markers, parameters, write_take
+from tests.support.takes import START_UTIME, Message, description, markers, parameters, write_take
 from tests.unit.rtc3d_server.wire import WireComponent, components_in
 
 FIRST = b"<RT_Parameters><General><Name>first</Name></General></RT_Parameters>"

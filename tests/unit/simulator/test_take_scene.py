@@ -16,7 +16,16 @@ from gateway.rtc3d_server.scene import NOT_YET_US
 from gateway.simulator.take_frames import RecordedFrames
 from gateway.simulator.take_scene import TakeScene
 from gateway.takes.files.event_log import SYNC, encode_event
-from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    frame,
+    log_bytes,
+    markers,
+    parameters,
+    write_take,
+)
 from tests.unit.rtc3d_server.wire import components_in
 
 MARKERS = (ComponentType.MARKERS,)

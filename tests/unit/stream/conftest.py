@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.virtual_time import VirtualTimeLoop
+from tests.support.clocks import VirtualTimeLoop
 
 
 def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:

@@ -12,7 +12,7 @@ from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.replies import Connection as ClientConnection
 from gateway.stream.session import Session
-from tests.servers import markers_frame, ok, packet
+from tests.support.servers import markers_frame, ok, packet
 
 XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
 

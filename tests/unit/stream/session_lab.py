@@ -14,9 +14,9 @@ from gateway.stream.replies import Connection as ClientConnection
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_requests import StreamRequests, StreamTarget
-from tests.servers import packet
+from tests.support.clocks import EPOCH_UTIME, read_clocks
+from tests.support.servers import packet
 from tests.unit.stream.scripted_server import Answer, Connection, ScriptedServer, obliging, read_parameters
-from tests.virtual_time import EPOCH_UTIME, read_clocks
 
 NO_DATA = packet(4)
 

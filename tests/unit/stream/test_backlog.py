@@ -9,8 +9,8 @@ from gateway.rtc3d.frames import Frame, split_frame
 from gateway.stream.backlog import MAX_TOGETHER, Backlog
 from gateway.stream.clock import ServerClock
 from gateway.stream.process_clock import running_clock
-from tests.servers import markers_frame
-from tests.virtual_time import read_clocks, stop_process, until
+from tests.support.clocks import read_clocks, stop_process, until
+from tests.support.servers import markers_frame
 
 UTIME = 1_700_000_000_000_000
 MS = 0.001

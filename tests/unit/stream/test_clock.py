@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gateway.stream.clock import Sample, ServerClock, envelope_slope
-from tests.clock_simulation import (
+from tests.support.clock_simulation import (
     EPOCH_UTIME,
     Frames,
     Numbers,

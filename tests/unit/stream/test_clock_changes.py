@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gateway.stream.clock import ServerClock
-from tests.clock_simulation import (
+from tests.support.clock_simulation import (
     EPOCH_UTIME,
     Times,
     delayed,

@@ -9,7 +9,7 @@ from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, enc
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
-from tests.losses import amounts
+from tests.support.statuses import amounts
 
 BOOT_UTIME = 1_700_000_000_000_000
 PERIOD_US = 5_000

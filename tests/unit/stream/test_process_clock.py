@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from gateway.stream.process_clock import RunningTimeout, running_clock
-from tests.virtual_time import stop_process
+from tests.support.clocks import stop_process
 
 
 def now_s() -> float:

@@ -13,12 +13,12 @@ import pytest
 from gateway.errors import ClosedError, LinkError, PacketError, ReplyTimeoutError, ServerError, SilenceError
 from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
 from gateway.stream.state import StreamState
-from tests.losses import amounts
-from tests.servers import error, markers_frame, ok, packet
+from tests.support.clocks import settle
+from tests.support.servers import error, markers_frame, ok, packet
+from tests.support.statuses import amounts
+from tests.support.vectors import STOP_RECORDING
 from tests.unit.stream.scripted_server import obliging, refusing, refusing_without_name, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, now_s
-from tests.vectors import STOP_RECORDING
-from tests.virtual_time import settle
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import pytest
 
 from gateway.errors import DefectError, ReplyTimeoutError, SilenceError
 from gateway.rtc3d.commands import Version
-from tests.losses import amounts
-from tests.servers import markers_frame, packet
+from tests.support.clocks import settle, until
+from tests.support.servers import markers_frame, packet
+from tests.support.statuses import amounts
 from tests.unit.stream.scripted_server import silent_to
 from tests.unit.stream.session_lab import Lab, now_s
-from tests.virtual_time import settle, until
 
 REJECTED = packet(3, b"\0")
 

@@ -8,10 +8,10 @@ import pytest
 from gateway.errors import SilenceError
 from gateway.rtc3d.commands import StopStreaming, Version
 from gateway.stream.state import StreamState
-from tests.servers import ok, packet
+from tests.support.clocks import stop_process
+from tests.support.servers import ok, packet
 from tests.unit.stream.scripted_server import BROKEN_FRAME, obliging, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, now_s
-from tests.virtual_time import stop_process
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from gateway.rtc3d.client_protocol import ProtocolState
 from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, SourceWarnings, StreamStatus
 from gateway.stream.supervisor import FrameRate
-from tests.losses import amounts
+from tests.support.statuses import amounts
 
 SERVER = "192.0.2.20:3020"
 

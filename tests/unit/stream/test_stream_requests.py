@@ -9,10 +9,10 @@ import pytest
 from gateway.errors import LinkError, RequestError, SilenceError
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.state import StreamState
-from tests.servers import error, markers_frame, ok, packet
+from tests.support.clocks import settle, until
+from tests.support.servers import error, markers_frame, ok, packet
 from tests.unit.stream.scripted_server import BROKEN_FRAME, XML, Answer, obliging, refusing, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, now_s
-from tests.virtual_time import settle, until
 
 RATE_XML = "<RT_Parameters Ver='1.00'><The_3D><Frequency>200</Frequency></The_3D></RT_Parameters>"
 

@@ -12,9 +12,9 @@ from gateway.errors import DefectError, RequestError
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.state import StreamState
 from gateway.stream.stream_requests import DEMAND_POLL_S, MAX_RESUMES
+from tests.support.clocks import settle
 from tests.unit.stream.scripted_server import obliging, refusing, silent_to
 from tests.unit.stream.session_lab import Lab
-from tests.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
 HALF = "StreamFrames FrequencyDivisor:2"

@@ -9,12 +9,12 @@ import pytest
 
 from gateway.c3d_files.spool import Spool
 from gateway.stream.state import StreamState
-from tests.servers import error, ok, packet
-from tests.spec_parameters import in_root
+from tests.support.clocks import settle, until
+from tests.support.parameters import in_root
+from tests.support.servers import error, ok, packet
 from tests.unit.service.scripted_sources import Servers
 from tests.unit.service.test_source import Lab
 from tests.unit.stream.scripted_server import Connection
-from tests.virtual_time import settle, until
 
 pytestmark = pytest.mark.interpreted  # gateway.service.source gets another Supervisor
 

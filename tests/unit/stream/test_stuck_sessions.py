@@ -8,7 +8,8 @@ from itertools import product
 import pytest
 
 from gateway.stream.state import StreamState
-from tests.servers import error, markers_frame, ok
+from tests.support.clocks import until
+from tests.support.servers import error, markers_frame, ok
 from tests.unit.stream.scripted_server import (
     XML,
     Answer,
@@ -18,7 +19,6 @@ from tests.unit.stream.scripted_server import (
     silent_to,
 )
 from tests.unit.stream.test_supervisor import Lab, running
-from tests.virtual_time import until
 
 BARE = "StreamFrames"
 FIRST_FORM = "StreamFrames AllFrames"

@@ -21,10 +21,10 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor
 from gateway.stream.tcp import STEADY_S, Backoff
-from tests.servers import markers_frame, packet
+from tests.support.clocks import STEP_S, read_clocks, settle, until
+from tests.support.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
 from tests.unit.stream.session_lab import CollectedFiles
-from tests.virtual_time import STEP_S, read_clocks, settle, until
 
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 10.0
 

@@ -19,7 +19,7 @@ from gateway.errors import ConnectError
 from gateway.stream import tcp
 from gateway.stream.process_clock import RunningTimeout
 from gateway.stream.tcp import MAX_ADDRESSES, is_address, look_up, open_connection, set_socket_options
-from tests.networks import free_port
+from tests.support.networks import free_port
 from tests.unit.stream.conftest import Resolver
 
 

@@ -20,8 +20,8 @@ from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_det
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording, Target
-from tests.settable_clock import Clock
-from tests.waiting import wait_until
+from tests.support.clocks import Clock
+from tests.support.waiting import wait_until
 
 UTIME = 1_700_000_000_000_000
 MARKERS = MESSAGE_TYPES[ComponentType.MARKERS]

@@ -7,7 +7,7 @@ from gateway.display.live.component import LiveComponent
 from gateway.display.live.live_data import NUM_EVENTS, LiveData
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
-from tests.takes import frame
+from tests.support.takes import frame
 from tests.unit.display.live_lab import MISSING, Lab, wait
 
 MARKERS = ComponentType.MARKERS

@@ -18,7 +18,7 @@ from gateway.display.top.table import (
     text_cell,
     wrapped,
 )
-from tests.statuses import stream
+from tests.support.statuses import stream
 from tests.unit.display.live_lab import Lab
 
 COLUMNS = (Column("marker"), Column("%", is_number=True), Column("unit", rank=1))

@@ -12,7 +12,7 @@ from gateway.display.top.table import laid_out, sorted_by
 from gateway.messages.decode import json_text
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
-from tests.statuses import count, loss, output, stream
+from tests.support.statuses import count, loss, output, stream
 from tests.unit.display.live_lab import Lab
 
 

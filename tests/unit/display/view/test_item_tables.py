@@ -9,7 +9,7 @@ from gateway.display.live.live_data import LiveSource
 from gateway.display.view.plots import MAX_CHOICES, Channel, choices, component_of, first_choice, samples
 from gateway.display.view.texts import MAX_ROWS, events_html, items_html, worst_first
 from gateway.rtc3d.components import ComponentType
-from tests.takes import START_UTIME
+from tests.support.takes import START_UTIME
 from tests.unit.display.live_lab import NAN, Lab, text_of, wait
 
 LABELS = """<The_3D><Markers>3</Markers>

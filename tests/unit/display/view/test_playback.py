@@ -12,8 +12,8 @@ from gateway.display.live.live_data import LiveData
 from gateway.display.view.markers_and_tools import Labels
 from gateway.display.view.viewer import Playback, Viewer
 from gateway.errors import TakeError
-from tests.takes import description, markers, parameters, write_take
-from tests.waiting import wait_until
+from tests.support.takes import description, markers, parameters, write_take
+from tests.support.waiting import wait_until
 
 XML = b"<Parameters><The_3D><Markers>1</Markers></The_3D></Parameters>"
 USER = SimpleNamespace(client_id=1)

@@ -14,7 +14,7 @@ from gateway.display.view.scene import Scene
 from gateway.display.view.server import ViewServer
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
-from tests.takes import parameters
+from tests.support.takes import parameters
 from tests.unit.display.live_lab import MISSING, NAN, Lab
 
 MARKERS, TOOLS, FORCE = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.FORCE

@@ -21,7 +21,7 @@ from gateway.display.view.texts import clock_text
 from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
-from tests.statuses import loss, output, stream
+from tests.support.statuses import loss, output, stream
 from tests.unit.display.live_lab import Lab, text_of, wait
 
 HOSTILE = "<img src=x onerror=alert(1)>"

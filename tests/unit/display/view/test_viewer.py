@@ -13,9 +13,9 @@ from gateway.display.view.server import ViewServer, address_of, open_server
 from gateway.display.view.viewer import Viewer
 from gateway.errors import ViewError
 from gateway.rtc3d.components import ComponentType
+from tests.support.waiting import wait_until
 from tests.unit.display.live_lab import Lab
 from tests.unit.display.view.page_client import PageClient, page_client
-from tests.waiting import wait_until
 
 POINTS = "/sources/MOCAP_LAB/markers"
 

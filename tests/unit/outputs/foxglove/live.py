@@ -16,10 +16,10 @@ from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog, Plate, Point
-from tests.foxglove_viewer import Viewer, viewing
-from tests.losses import amounts
-from tests.networks import free_port
-from tests.waiting import wait_until_async
+from tests.support.foxglove_viewer import Viewer, viewing
+from tests.support.networks import free_port
+from tests.support.statuses import amounts
+from tests.support.waiting import wait_until_async
 
 _Result = TypeVar("_Result")
 

@@ -12,7 +12,7 @@ from gateway.outputs.findings import Finding, Result
 from gateway.outputs.foxglove import checks
 from gateway.outputs.foxglove.checks import check_foxglove
 from gateway.outputs.foxglove.settings import FOXGLOVE, FoxgloveSettings
-from tests.networks import free_port
+from tests.support.networks import free_port
 from tests.unit.outputs.foxglove.live import serving
 
 

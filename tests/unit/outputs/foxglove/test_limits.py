@@ -12,7 +12,7 @@ import pytest
 
 from gateway.outputs.foxglove.connections import LIMITS, MAX_FRAGMENTS, MAX_REQUEST_BYTES
 from gateway.rtc3d.components import ComponentType
-from tests.foxglove_viewer import (
+from tests.support.foxglove_viewer import (
     CONTINUATION,
     PING,
     TEXT,
@@ -22,8 +22,8 @@ from tests.foxglove_viewer import (
     upgrade_request,
     viewing,
 )
+from tests.support.waiting import wait_until_async
 from tests.unit.outputs.foxglove.live import LiveSource, frame_of, serving, watching
-from tests.waiting import wait_until_async
 
 LARGE = frame_of({ComponentType.MARKERS: [(1, 2, 3, 0)] * 5000})  # 100 kB for a viewer
 

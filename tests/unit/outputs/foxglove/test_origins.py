@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from tests.foxglove_viewer import HandshakeRefusedError, Viewer
+from tests.support.foxglove_viewer import HandshakeRefusedError, Viewer
 from tests.unit.outputs.foxglove.live import serving
 
 HOST = "127.0.0.1"

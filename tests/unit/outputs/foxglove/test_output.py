@@ -18,8 +18,9 @@ from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.rtc3d.components import MISSING, WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, ParametersForce, Tool
-from tests.foxglove_viewer import HandshakeRefusedError, Viewer, viewing
-from tests.networks import free_port
+from tests.support.foxglove_viewer import HandshakeRefusedError, Viewer, viewing
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until_async
 from tests.unit.outputs.foxglove.live import (
     ANALOG,
     EVENT,
@@ -36,7 +37,6 @@ from tests.unit.outputs.foxglove.live import (
     watching,
 )
 from tests.unit.takes.export.read_mcap import floats_of, points_of
-from tests.waiting import wait_until_async
 
 ALWAYS = {
     "/lab/markers": "foxglove.PointCloud",

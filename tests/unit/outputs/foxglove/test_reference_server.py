@@ -11,8 +11,8 @@ from gateway.foxglove_schemas.topics import FloatTopics, FoxgloveMessage
 from gateway.outputs.foxglove.server import FoxgloveServer, send
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from tests.foxglove_viewer import Received, Viewer
-from tests.networks import free_port
+from tests.support.foxglove_viewer import Received, Viewer
+from tests.support.networks import free_port
 from tests.unit.outputs.foxglove.live import UTIME, channels, frame_of
 
 

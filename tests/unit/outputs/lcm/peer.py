@@ -15,8 +15,8 @@ from gateway.messages.decode import JSON, decode, json_bytes
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.lcm.output import LcmOutput, LcmQueries
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.losses import amounts
-from tests.waiting import wait_until_async
+from tests.support.statuses import amounts
+from tests.support.waiting import wait_until_async
 
 XML = b"<RT_Parameters/>"
 JSON_ANSWER = Answer(json_bytes({"name": "walk-1"}), JSON)

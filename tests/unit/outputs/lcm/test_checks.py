@@ -8,7 +8,7 @@ from gateway.outputs.findings import Finding, MessageLoad, Result
 from gateway.outputs.lcm import checks
 from gateway.outputs.lcm.checks import charged_bytes, check_lcm
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.networks import add_multicast_route, lan_interface, lcm_url, remove_multicast_route
+from tests.support.networks import add_multicast_route, lan_interface, lcm_url, remove_multicast_route
 
 LOADS = (MessageLoad(rate_hz=100.0, largest_bytes=8000), MessageLoad(rate_hz=50.0, largest_bytes=1000))
 URL = "udpm://239.255.76.67:7667?ttl=0"

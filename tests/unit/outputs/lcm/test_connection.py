@@ -13,9 +13,9 @@ from gateway.errors import OutputError
 from gateway.outputs.lcm import connection
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.receiver import NO_CHANNEL, LcmDatagrams, split_datagram
-from tests.lcm_relay import LcmRelay
-from tests.networks import lcm_url
-from tests.waiting import wait_until
+from tests.support.lcm_relay import LcmRelay
+from tests.support.networks import lcm_url
+from tests.support.waiting import wait_until
 
 URL = lcm_url()
 GROUP = ("239.255.76.67", urlsplit(URL).port)

@@ -16,8 +16,8 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm import output as output_module
 from gateway.outputs.lcm.output import REPEAT_S, LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.losses import amounts
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.statuses import amounts
 from tests.unit.outputs.lcm.peer import XML, Lab, request
 
 

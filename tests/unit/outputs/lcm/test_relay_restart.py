@@ -11,9 +11,9 @@ from gateway.messages.decode import decode
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from tests.lcm_relay import LcmRelay
+from tests.support.lcm_relay import LcmRelay
+from tests.support.waiting import wait_until, wait_until_async
 from tests.unit.outputs.lcm.peer import XML, Service, request
-from tests.waiting import wait_until, wait_until_async
 
 REQUEST, REPLY = "MOCAP_LAB_PARAMETERS_REQUEST", "MOCAP_LAB_PARAMETERS_REPLY"
 

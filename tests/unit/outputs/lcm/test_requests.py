@@ -19,9 +19,9 @@ from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.token_bucket import TokenBucket
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.waiting import wait_until_async
 from tests.unit.outputs.lcm.peer import XML, Lab, command_request, request, with_settings
-from tests.waiting import wait_until_async
 
 
 async def test_a_reply_has_the_answer_of_the_service(lab: Lab) -> None:

@@ -20,8 +20,8 @@ from gateway.outputs.lcm.sender import (
     LcmThreadSender,
     new_sender,
 )
-from tests.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
 
 BAD_URL = "udpm://not-an-address:7667"
 

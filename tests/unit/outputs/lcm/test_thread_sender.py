@@ -9,7 +9,7 @@ import pytest
 from gateway.errors import OutputError
 from gateway.outputs.lcm import sender as sender_module
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, LcmThreadSender
-from tests.waiting import wait_until
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.interpreted
 

@@ -40,7 +40,7 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
-from tests.losses import amounts
+from tests.support.statuses import amounts
 
 ALL = frozenset(WIRE_ORDER)
 MARKERS, TOOLS, ANALOG, _, EVENT = WIRE_ORDER

@@ -36,7 +36,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
-from tests.lsl_receiver import lsl_config
+from tests.support.lsl_receiver import lsl_config
 
 UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Mx": "Nmm", "My": "Nmm", "Mz": "Nmm"}
 FORCE_CHANNELS = tuple(ForceChannel(str(at), name, unit) for at, (name, unit) in enumerate(UNITS.items()))

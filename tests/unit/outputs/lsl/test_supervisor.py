@@ -21,8 +21,8 @@ from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.process import Kind, Message, Report
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import LslProcesses
-from tests.lsl_receiver import lsl_config
-from tests.waiting import wait_until
+from tests.support.lsl_receiver import lsl_config
+from tests.support.waiting import wait_until
 
 TIMEOUT_S = 120.0
 CANNOT_OPEN = Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]')
@@ -31,7 +31,7 @@ _GATEWAY = """
 import signal, sys
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import LslProcesses
-from tests.waiting import wait_until
+from tests.support.waiting import wait_until
 
 processes = LslProcesses(LslSettings(enabled=True, config=sys.argv[1]))
 processes.restart(lambda: None)

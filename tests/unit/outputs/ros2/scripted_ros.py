@@ -16,8 +16,8 @@ from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosTopic
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
-from tests.losses import amounts
-from tests.ros_lab import ALL, stamp
+from tests.support.ros_lab import ALL, stamp
+from tests.support.statuses import amounts
 from tests.unit.outputs.ros2 import ros_messages as ros
 
 

@@ -9,9 +9,9 @@ from gateway.outputs.findings import Result
 from gateway.outputs.ros2.checks import CHECKS, check_ros2, leaves_host
 from gateway.outputs.ros2.messages import NO_HASH, POSE_STAMPED
 from gateway.outputs.ros2.settings import Ros2Settings
-from tests.networks import free_endpoint
-from tests.ros_lab import RosLab, ros_lab
-from tests.waiting import wait_until
+from tests.support.networks import free_endpoint
+from tests.support.ros_lab import RosLab, ros_lab
+from tests.support.waiting import wait_until
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from gateway.outputs.ros2 import diagnostics as diagnostics_module
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher, diagnostics_of
 from gateway.outputs.ros2.messages import DiagnosticStatus
 from gateway.rtc3d.parameters import Plate
-from tests import statuses
-from tests.ros_lab import UTIME, parameters
+from tests.support import statuses
+from tests.support.ros_lab import UTIME, parameters
 from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.unit.outputs.ros2.scripted_ros import cause_of
 from tests.unit.outputs.ros2.test_output import Output

@@ -15,9 +15,9 @@ from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import gid_of
 from gateway.rtc3d.components import ComponentType
-from tests.ros_lab import ALL, parameters, ros_lab, stamp, tools_frame
+from tests.support.ros_lab import ALL, parameters, ros_lab, stamp, tools_frame
+from tests.support.waiting import wait_until
 from tests.unit.outputs.ros2.scripted_ros import Node, Router, Sender
-from tests.waiting import wait_until
 
 
 class Output:

@@ -11,7 +11,7 @@ from gateway.outputs.ros2.messages import POINT_CLOUD
 from gateway.outputs.ros2.output import client_config
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.topic import RosNode, RosTopic, gid_of
-from tests.settings import mistakes
+from tests.support.configurations import mistakes
 
 ENDPOINT = "tcp/192.0.2.9:7447"
 

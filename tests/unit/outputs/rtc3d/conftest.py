@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 
 import pytest
 
+from tests.support.clocks import VirtualTimeLoop
 from tests.unit.outputs.rtc3d.scripted_server import Client, ScriptedServer
-from tests.virtual_time import VirtualTimeLoop
 
 
 def pytest_asyncio_loop_factories(

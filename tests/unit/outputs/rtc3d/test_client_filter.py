@@ -13,11 +13,11 @@ from gateway.rtc3d.commands import ControlRecording
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
-from tests.losses import amounts
+from tests.support.statuses import amounts
+from tests.support.vectors import START_RECORDING, STOP_RECORDING
 from tests.unit.outputs.rtc3d.scripted_server import Client, Line, ScriptedServer, settle, write_file
 from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, streaming
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, command, packet
-from tests.vectors import START_RECORDING, STOP_RECORDING
 
 C3D = 5
 VERSION = (COMMAND, b"OK-Version 1.0")

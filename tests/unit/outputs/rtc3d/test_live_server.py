@@ -12,7 +12,7 @@ from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import SECTIONS, General
 from gateway.rtc3d.parameters_xml import parse_parameters
-from tests.losses import amounts
+from tests.support.statuses import amounts
 from tests.unit.outputs.rtc3d.scripted_server import (
     Client,
     ScriptedServer,

@@ -12,10 +12,10 @@ from gateway.outputs.findings import Finding, Result
 from gateway.outputs.rtc3d.checks import check_rtc3d
 from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
 from gateway.simulator.simulator import Simulator
-from tests.networks import free_port
-from tests.settings import mistakes
+from tests.support.configurations import mistakes
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until_async
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.waiting import wait_until_async
 
 
 def test_by_default_it_is_off_and_listens_on_this_computer_only() -> None:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from gateway.outputs.findings import MessageLoad
 from gateway.outputs.takes.checks import check_takes
-from tests.recording_output import settings_in
+from tests.support.recording_output import settings_in
 from tests.unit.outputs.takes.test_segments import no_links
 
 LOADS = [MessageLoad(100.0, 10_000), MessageLoad(500.0, 2_000)]

@@ -11,7 +11,7 @@ from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, TakeCommand
 from gateway.outputs.takes.folder import StoredTake, TakePiece
 from gateway.outputs.takes.takes import SourceTakes
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
 
 ABOUT = TakeDetails("S01", note="left knee")
 WALK = StoredTake("walk-1", 4096, 1_700_000_000_000_000, 12.34567, True, 2, details=ABOUT)

@@ -26,9 +26,9 @@ from gateway.outputs.takes.take_file import SourceWriter
 from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.take_writer import RETRY_S
 from gateway.takes.files.writer_thread import LogFile
-from tests.losses import amounts
-from tests.recording_output import RecordingLab, frames, recording_lab
-from tests.waiting import wait_until_async
+from tests.support.recording_output import RecordingLab, frames, recording_lab
+from tests.support.statuses import amounts
+from tests.support.waiting import wait_until_async
 
 MIB = 1024 * 1024
 

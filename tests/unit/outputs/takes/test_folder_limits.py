@@ -12,8 +12,8 @@ from gateway.outputs.takes import folder_limits
 from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.folder_limits import FolderLimits, FolderWatch
-from tests.recording_output import NoThread, settings_in
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.recording_output import NoThread, settings_in
 from tests.unit.outputs.takes.test_folder import NOW_S, stored
 
 DAY_S = 86_400.0

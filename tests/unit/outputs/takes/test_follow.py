@@ -13,11 +13,11 @@ import rtc3d
 
 from gateway.outputs.takes.follow import END_S, LOST_S, event_ids
 from gateway.takes.files.reader import TakeReader
-from tests.recording_output import RecordingLab, still_lab
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.recording_output import RecordingLab, still_lab
+from tests.support.vectors import LONG_EVENTS
+from tests.support.waiting import wait_until_async
 from tests.unit.messages.samples import component_message
-from tests.vectors import LONG_EVENTS
-from tests.waiting import wait_until_async
 
 
 class Followed:

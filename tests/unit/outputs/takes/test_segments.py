@@ -19,8 +19,8 @@ from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.writer_thread import LogFile
-from tests.recording_output import frames, still_lab
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.recording_output import frames, still_lab
 
 CHANNEL = b"MOCAP_LAB_3D"
 

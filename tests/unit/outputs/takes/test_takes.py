@@ -22,9 +22,8 @@ from gateway.outputs.takes.takes import MAX_SAVES
 from gateway.takes import open_take
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from gateway.takes.files.statistics import take_statistics
-from tests.recording_output import events, frames, still_lab
-from tests.settable_clock import Clock
-from tests.virtual_time import run_in_virtual_time
+from tests.support.clocks import Clock, run_in_virtual_time
+from tests.support.recording_output import events, frames, still_lab
 
 
 async def refused(call: Coroutine[Any, Any, Any], text: str) -> str:

@@ -11,9 +11,9 @@ from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.output import TakesOutput
 from gateway.takes.files.reader import log_paths
-from tests.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
-from tests.settable_clock import Clock
-from tests.takes import markers, write_take
+from tests.support.clocks import Clock
+from tests.support.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
+from tests.support.takes import markers, write_take
 
 MIB = 1024 * 1024
 

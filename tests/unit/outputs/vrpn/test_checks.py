@@ -7,8 +7,8 @@ from gateway.outputs.findings import Result
 from gateway.outputs.vrpn.checks import check_vrpn
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
-from tests.networks import free_port
-from tests.waiting import wait_until
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until
 
 
 def check(settings: VrpnSettings) -> dict[str, tuple[Result, str, str]]:

@@ -22,8 +22,8 @@ from gateway.outputs.vrpn.trackers import Trackers
 from gateway.rtc3d.components import ITEM_DTYPES, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
-from tests.losses import amounts
-from tests.networks import free_port
+from tests.support.networks import free_port
+from tests.support.statuses import amounts
 
 TOOLS = frozenset({ComponentType.TOOLS})
 UTIME = 1_700_000_000_000_000

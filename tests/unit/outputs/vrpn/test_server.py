@@ -14,9 +14,9 @@ from gateway.outputs.vrpn.callbacks import MAX_CALLS, MAX_CALLS_PER_HOST, Callba
 from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import LIMITS, VrpnServer, bind
 from gateway.token_bucket import TokenBucket
-from tests.networks import free_port
-from tests.vrpn_client import COOKIE, Pose, VrpnClient, send_datagram
-from tests.waiting import wait_until_async
+from tests.support.networks import free_port
+from tests.support.vrpn_client import COOKIE, Pose, VrpnClient, send_datagram
+from tests.support.waiting import wait_until_async
 
 POSE = (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 ONE = encode_pose(0, 0, POSE)

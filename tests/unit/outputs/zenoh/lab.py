@@ -17,10 +17,10 @@ from gateway.outputs.contract import Answer, KeyPath
 from gateway.outputs.zenoh.declarations import SourceDeclarations
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.losses import amounts
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
-from tests.queried_gateway import Reply, query, query_all
-from tests.waiting import wait_until
+from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.support.queried_gateway import Reply, query, query_all
+from tests.support.statuses import amounts
+from tests.support.waiting import wait_until
 
 STATUS, C3D = ("status",), ("c3d",)
 

@@ -8,10 +8,10 @@ import zenoh
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.token_bucket import TokenBucket
-from tests.queried_gateway import to_reply
-from tests.settable_clock import Clock
+from tests.support.clocks import Clock
+from tests.support.queried_gateway import to_reply
+from tests.support.waiting import wait_until_async
 from tests.unit.outputs.zenoh.lab import QueriedLab, with_settings
-from tests.waiting import wait_until_async
 
 
 @pytest.fixture

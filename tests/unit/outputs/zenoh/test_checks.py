@@ -11,7 +11,7 @@ import zenoh
 from gateway.outputs.findings import Finding, Result
 from gateway.outputs.zenoh.checks import check_zenoh, leaves_host
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
+from tests.support.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 
 ROUTER_REMEDY = (
     "Start zenohd at that address, or correct connect/endpoints in zenoh.config. With TLS, check that all "

@@ -17,10 +17,10 @@ from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh import declarations as declarations_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.losses import amounts
-from tests.networks import open_zenoh, zenoh_keys
+from tests.support.networks import open_zenoh, zenoh_keys
+from tests.support.statuses import amounts
+from tests.support.waiting import wait_until_async
 from tests.unit.outputs.zenoh.lab import STATUS, QueriedLab
-from tests.waiting import wait_until_async
 
 XML = b"<RT_Parameters/>"
 

@@ -19,10 +19,10 @@ from gateway.outputs.zenoh.json_publishing import MAX_DESCRIPTION_CHARACTERS, Js
 from gateway.outputs.zenoh.publisher import ZenohPublisher
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
-from tests.spec_parameters import ALL as SPEC_PARAMETERS
-from tests.takes import START_UTIME, frame, markers
+from tests.support.parameters import ALL as SPEC_PARAMETERS
+from tests.support.takes import START_UTIME, frame, markers
+from tests.support.waiting import wait_until
 from tests.unit.outputs.zenoh.lab import Lab, with_settings
-from tests.waiting import wait_until
 
 JSON = "mocap/lab/*/json"
 

@@ -13,9 +13,9 @@ from gateway.outputs.contract import OutputHealth
 from gateway.outputs.zenoh.config import command_config, zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.networks import free_endpoint, zenoh_keys
+from tests.support.networks import free_endpoint, zenoh_keys
+from tests.support.waiting import wait_until
 from tests.unit.outputs.zenoh.lab import Lab
-from tests.waiting import wait_until
 
 MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
 

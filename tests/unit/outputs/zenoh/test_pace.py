@@ -16,8 +16,7 @@ from gateway.outputs.zenoh.declarations import SourceDeclarations
 from gateway.outputs.zenoh.json_publishing import JsonConverter
 from gateway.outputs.zenoh.publisher import BURST_BYTES, BURST_S, ZenohLink
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests.settable_clock import Clock
-from tests.virtual_time import run_in_virtual_time
+from tests.support.clocks import Clock, run_in_virtual_time
 
 PARAMETERS = ServerParameters(b"<RT_Parameters/>", 1, 4)
 

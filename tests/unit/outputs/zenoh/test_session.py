@@ -11,7 +11,7 @@ import zenoh
 from gateway.outputs.zenoh import session as session_module
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
-from tests.networks import zenoh_keys
+from tests.support.networks import zenoh_keys
 
 TEXTS = SessionTexts("zenoh", "not open yet", "cannot open", "correct it", "no router there", "it is open")
 

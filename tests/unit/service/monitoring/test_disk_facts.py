@@ -12,8 +12,8 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway
 from gateway.service.monitoring import disk_facts
 from gateway.service.monitoring.disk_facts import DiskFacts
-from tests.configurations import make_settings
-from tests.waiting import wait_until_async
+from tests.support.configurations import make_settings
+from tests.support.waiting import wait_until_async
 
 FOLDER = Path(__file__).parents[3] / "data/certificates"
 NEAR_S, FAR_S = 1925048779, 3005048779  # one before 2050 and one after, whose times have two forms

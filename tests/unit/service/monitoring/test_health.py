@@ -15,8 +15,8 @@ from gateway.service.monitoring.health import health_page, status_lines
 from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from tests.configurations import make_settings
-from tests.memory_output import MemoryOutput
+from tests.support.configurations import make_settings
+from tests.support.memory_output import MemoryOutput
 
 MARKERS, ANALOG, EVENT = ((ComponentType.MARKERS,), (ComponentType.ANALOG,), (ComponentType.EVENT,))
 STALL_TIMEOUT_S = 3.0

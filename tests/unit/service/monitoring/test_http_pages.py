@@ -11,8 +11,8 @@ import pytest_asyncio
 
 from gateway.service.monitoring import http_pages
 from gateway.service.monitoring.http_pages import LIMITS, MAX_REQUEST_BYTES, HttpPages, Page
-from tests.networks import free_port
-from tests.waiting import wait_until_async
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until_async
 
 
 class Site:

@@ -23,9 +23,9 @@ from gateway.service.monitoring.disk_facts import DiskFacts
 from gateway.service.monitoring.metrics import metrics_page, metrics_registry
 from gateway.service.monitoring.process_limits import LoopDelay
 from gateway.stream.state import StreamState
-from tests.configurations import make_settings
-from tests.example_output import ExampleOutput, ExampleSettings
-from tests.toy_output import ToyOutput
+from tests.support.configurations import make_settings
+from tests.support.example_output import ExampleOutput, ExampleSettings
+from tests.support.toy_output import ToyOutput
 
 STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS, ComponentType.TOOLS)),

@@ -11,7 +11,7 @@ import pytest
 
 from gateway.service.monitoring.process_limits import LoopDelay, ProcessLimits
 from gateway.workers import WorkerThread
-from tests.waiting import wait_until_async
+from tests.support.waiting import wait_until_async
 
 
 def test_the_largest_delay_expires_after_one_to_two_minutes() -> None:

@@ -6,8 +6,8 @@ from collections.abc import AsyncIterator, Callable, Mapping
 
 import pytest
 
+from tests.support.clocks import VirtualTimeLoop
 from tests.unit.simulator.faults.faulty_client import FaultyClient
-from tests.virtual_time import VirtualTimeLoop
 
 
 def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:

@@ -15,8 +15,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob, export_take
-from tests.recorded_scenes import scene_messages
-from tests.takes import Message, parameters, write_take
+from tests.support.takes import Message, parameters, scene_messages, write_take
 
 Values = npt.NDArray[Any]
 

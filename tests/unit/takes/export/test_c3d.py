@@ -28,8 +28,16 @@ from gateway.rtc3d.parameters import (
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob, export_take
-from tests.recorded_scenes import record_scene, scene_messages
-from tests.takes import START_UTIME, Message, description, details, frame, parameters
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    details,
+    frame,
+    parameters,
+    record_scene,
+    scene_messages,
+)
 from tests.unit.takes.export.exported import (
     NAN,
     SCENE,

@@ -12,8 +12,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob
-from tests.recorded_scenes import scene_messages
-from tests.takes import Message, description, frame, parameters
+from tests.support.takes import Message, description, frame, parameters, scene_messages
 from tests.unit.takes.export.exported import (
     SCENE,
     C3d,

@@ -21,7 +21,7 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.files import reader
-from tests.takes import START_UTIME, frame, markers, parameters
+from tests.support.takes import START_UTIME, frame, markers, parameters
 from tests.unit.takes.export.exported import NAN, export_messages, labelled, scene
 
 SCENE = SyntheticScene(markers=3, tools=2, analog=2, plates=1, rate_hz=100, analog_rate_hz=1000)

@@ -9,8 +9,7 @@ import pytest
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
-from tests.recorded_scenes import scene_messages
-from tests.takes import START_UTIME, Message, description, frame, markers, parameters
+from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, scene_messages
 from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled
 from tests.unit.takes.export.test_trc import read_trc
 

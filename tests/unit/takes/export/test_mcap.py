@@ -36,8 +36,16 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.mcap import McapFile
-from tests.recorded_scenes import scene_messages
-from tests.takes import START_UTIME, Message, description, details, frame, markers, parameters
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    details,
+    frame,
+    markers,
+    parameters,
+    scene_messages,
+)
 from tests.unit.takes.export.exported import export_messages
 from tests.unit.takes.export.read_mcap import (
     McapContent,

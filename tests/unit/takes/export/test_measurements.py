@@ -9,7 +9,7 @@ from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.takes import open_take
 from gateway.takes.export.measurements import Grid, place
 from gateway.takes.files.series import Series
-from tests.takes import START_UTIME, markers, parameters, write_take
+from tests.support.takes import START_UTIME, markers, parameters, write_take
 
 
 def series(tmp_path: Path, rows: list[tuple[int, int]], announced_hz: float | None = 100.0) -> Series:

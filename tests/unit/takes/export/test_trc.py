@@ -12,8 +12,7 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
-from tests.recorded_scenes import scene_messages
-from tests.takes import frame, parameters
+from tests.support.takes import frame, parameters, scene_messages
 from tests.unit.takes.export.exported import NAN, export_messages, labelled
 
 MARKERS = tuple(Marker(str(number), f"m{number}") for number in range(4))

@@ -16,7 +16,7 @@ from gateway.takes import open_take
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.files.take import Take
-from tests.takes import description, log_bytes, markers, parameters, write_take
+from tests.support.takes import description, log_bytes, markers, parameters, write_take
 
 READERS: list[Callable[[Path], Any]] = [
     open_take,

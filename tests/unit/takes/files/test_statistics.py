@@ -13,7 +13,16 @@ from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parame
 from gateway.takes.files import reader
 from gateway.takes.files.component_statistics import MAX_LISTED_STEPS, ClockSteps, ComponentStatistics
 from gateway.takes.files.statistics import SourceStatistics, take_statistics
-from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    frame,
+    log_bytes,
+    markers,
+    parameters,
+    write_take,
+)
 
 NAN = math.nan
 

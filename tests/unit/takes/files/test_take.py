@@ -29,7 +29,7 @@ from gateway.takes import open_take
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import TakeSource
-from tests.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
 
 NAN = math.nan
 PARAMETERS = Parameters(

@@ -14,7 +14,7 @@ from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.take_writer import begin_log
 from gateway.takes.files.writer_thread import LogFile
 from gateway.takes.recorder import FileWriter
-from tests.waiting import wait_until
+from tests.support.waiting import wait_until
 
 CHANNEL = b"MOCAP_LAB_3D"
 

@@ -18,9 +18,18 @@ from gateway.takes.replay.play_list import Selection
 from gateway.takes.replay.player import Player
 from gateway.takes.replay.publication import MAX_TOPICS, Publication, Refusal
 from gateway.takes.replay.replay import playing
-from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
-from tests.toy_output import ToyOutput
-from tests.waiting import wait_until_async
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    frame,
+    log_bytes,
+    markers,
+    parameters,
+    write_take,
+)
+from tests.support.toy_output import ToyOutput
+from tests.support.waiting import wait_until_async
 
 XML = b"<Parameters><The_3D><Markers>2</Markers></The_3D></Parameters>"
 

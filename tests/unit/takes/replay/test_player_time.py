@@ -12,7 +12,7 @@ from gateway.takes.files.reader import TakeReader
 from gateway.takes.replay.play_list import Selection
 from gateway.takes.replay.player import STALL_S, Player, PlayerClock
 from gateway.takes.replay.timeline import Jump
-from tests.takes import START_UTIME, description, markers, parameters, write_take
+from tests.support.takes import START_UTIME, description, markers, parameters, write_take
 
 XML = b"<Parameters><The_3D><Markers>1</Markers></The_3D></Parameters>"
 TICK_S = 0.01

@@ -9,7 +9,7 @@ from gateway.takes.files.reader import FIRST_PLACE, TakeReader
 from gateway.takes.replay.play_list import STEP_US, SeekIndex, SeekPoint, Selection, play_list
 from gateway.takes.replay.player import Lateness, Pace
 from gateway.takes.replay.timeline import Jump, ReplayTimeline, TimelineState, time_text
-from tests.takes import markers, parameters, write_take
+from tests.support.takes import markers, parameters, write_take
 
 START = 1_700_000_000_000_000
 HOUR = 3_600_000_000

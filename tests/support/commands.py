@@ -1,11 +1,14 @@
-"""Commands of ``rtc3d-gateway`` in processes of their own that need no start of Python.
+"""The command line of ``rtc3d-gateway``: in processes of their own, and in this process.
 
-They are forked from a process that has imported every command, which saves half a second of CPU each. Like
-programs they have their own signals, streams and exit status. Tests of the start itself, of terminals and
-of encodings start ``PROGRAM`` of tests/gateway_process.py instead.
+``run`` and ``run_command`` need no start of Python: the processes are forked from one that has imported every
+command, which saves half a second of CPU each. Like programs they have their own signals, streams and exit
+status. ``run_in_process`` is for commands that end before they open or start anything. Tests of the start
+itself, of terminals and of encodings start ``PROGRAM`` of tests/support/gateway_process.py instead.
 """
 
 import asyncio
+import contextlib
+import io
 import multiprocessing
 import os
 import pkgutil
@@ -16,8 +19,10 @@ from collections.abc import Mapping
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Final, NamedTuple
+from unittest.mock import patch
 
 import gateway.cli
+from gateway.cli import main
 
 _TIMEOUT_S: Final = 120.0
 _LOCK: Final = threading.Lock()
@@ -27,7 +32,7 @@ _FORKS: Final = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
     [
         *(f"gateway.cli.{module.name}" for module in pkgutil.iter_modules(gateway.cli.__path__)),
-        *("gateway.doctor.all_checks", "gateway.display.top.app", "zenoh", "tests.command_process"),
+        *("gateway.doctor.all_checks", "gateway.display.top.app", "zenoh", "tests.support.commands"),
     ]
 )
 
@@ -72,3 +77,21 @@ def _run(arguments: list[str], folder: str, environ: dict[str, str]) -> None:
     from gateway.__main__ import main  # noqa: PLC0415 - it must not handle signals of this process
 
     main()
+
+
+class Ended(NamedTuple):
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run_in_process(*arguments: str | Path) -> Ended:
+    """Run ``rtc3d-gateway`` with these arguments; it prints errors as the program does."""
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with (
+        patch.object(sys, "argv", ["rtc3d-gateway", *map(str, arguments)]),
+        contextlib.redirect_stdout(stdout),
+        contextlib.redirect_stderr(stderr),
+    ):
+        status = main._run()
+    return Ended(status, stdout.getvalue(), stderr.getvalue())

@@ -13,7 +13,7 @@ from typing import Final
 
 import pytest
 
-from tests.documents import ROOT, Block, blocks
+from tests.support.documents import ROOT, Block, blocks
 
 LONG_RUNNING: Final = (
     "rtc3d-gateway simulate",

@@ -1,6 +1,6 @@
 """Receives a gateway's topics with zenoh-ros2-sdk, an independent implementation of rmw_zenoh.
 
-    python -m tests.ros2_listener PORT DOMAIN_ID TOPIC:TYPE...
+    python -m tests.support.ros2_listener PORT DOMAIN_ID TOPIC:TYPE...
 
 It prints one line of JSON: the next message of each topic, what the attachments say, and the graph. The
 package keeps one session in each process, and does not close it: so it has a process of its own.

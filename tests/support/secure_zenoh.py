@@ -10,12 +10,12 @@ from typing import Final, NamedTuple
 import yaml
 import zenoh
 
-from tests.configurations import write_config
-from tests.gateway_process import program, simulator
-from tests.networks import free_port
-from tests.waiting import wait_until
+from tests.support.configurations import write_config
+from tests.support.gateway_process import program, simulator
+from tests.support.networks import free_port
+from tests.support.waiting import wait_until
 
-ROOT: Final = Path(__file__).parents[1]
+ROOT: Final = Path(__file__).parents[2]
 CONFIG: Final = ROOT / "config"
 FOLDER: Final = "/etc/rtc3d-gateway/tls"
 GUIDE: Final = (ROOT / "docs/how-to/secure.md").read_text(encoding="utf-8")

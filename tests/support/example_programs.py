@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Final
 
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
-from tests.configurations import write_config
-from tests.gateway_process import program, simulator
-from tests.needs import need
-from tests.networks import free_endpoint, zenoh_keys
-from tests.waiting import wait_until
+from tests.support.configurations import write_config
+from tests.support.gateway_process import program, simulator
+from tests.support.needs import need
+from tests.support.networks import free_endpoint, zenoh_keys
+from tests.support.waiting import wait_until
 
-ROOT: Final = Path(__file__).parents[1]
+ROOT: Final = Path(__file__).parents[2]
 EXAMPLES: Final = ROOT / "examples"
 COUNT: Final = 20
 LCM_URL: Final = "udpm://239.255.76.67:7712?ttl=0"

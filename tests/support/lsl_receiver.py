@@ -1,6 +1,6 @@
 """A receiver of LSL streams in a process of its own, with pylsl's inlet: what an EEG lab has.
 
-    python -m tests.lsl_receiver NAME...      prints lines of JSON until it is killed
+    python -m tests.support.lsl_receiver NAME...      prints lines of JSON until it is killed
 
 One line for each stream that opens: name, xml, and the offset of its clock. Then one for each chunk: name,
 times in s on LSL's clock, and values, which are lists of numbers or of one text.
@@ -17,7 +17,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any, Final
 
-_PAGE: Final = Path(__file__).parent.parent / "docs/how-to/lsl.md"
+_PAGE: Final = Path(__file__).parents[2] / "docs/how-to/lsl.md"
 
 _POLL_S: Final = 0.01
 
@@ -38,7 +38,7 @@ class LslReceiver:
         self.offset_s: dict[str, float] = {}
         self.samples: defaultdict[str, list[tuple[float, list[Any]]]] = defaultdict(list)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.lsl_receiver", *names],
+            [sys.executable, "-m", "tests.support.lsl_receiver", *names],
             env={**os.environ, "LSLAPICFG": str(config)},
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # liblsl's log

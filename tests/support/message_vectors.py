@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import rtc3d
 
-FOLDER: Final = Path(__file__).parents[1] / "lcm_types/vectors"
+FOLDER: Final = Path(__file__).parents[2] / "lcm_types/vectors"
 _NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _INTEGERS: Final = {"int8_t", "int16_t", "int32_t", "int64_t"}
 

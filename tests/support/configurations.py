@@ -1,13 +1,16 @@
-"""Whole configurations for tests, with a section for every output of the registry."""
+"""Whole configurations for tests, with a section for every output, and the mistakes that a section finds."""
 
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import pytest
 import yaml
+from pydantic import ValidationError
 
 from gateway.config import loading
+from gateway.config.section import Section
 from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.outputs.registry import settings_type
 
@@ -56,3 +59,14 @@ def read_server(host: str, port: int, environ: Mapping[str, str] = os.environ) -
 def load(path: Path | None, environ: Mapping[str, str] = os.environ) -> Any:
     """Return the settings from a file and the environment."""
     return read(path, environ).settings
+
+
+def mistakes(model: type[Section], value: object) -> list[tuple[str, str]]:
+    """Return the location and the text of each mistake that ``model`` finds in ``value``."""
+    with pytest.raises(ValidationError) as caught:
+        model.model_validate(value)
+    return [(".".join(map(str, item["loc"])), item["msg"]) for item in caught.value.errors()]
+
+
+def source(**keys: object) -> dict[str, object]:
+    return {"name": "lab", "host": "192.0.2.20", **keys}

@@ -1,8 +1,11 @@
-"""Parts of status messages that tests invent."""
+"""Parts of status messages that tests invent, and losses as they compare them."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import rtc3d
+
+from gateway.logs.losses import Loss
 
 
 def stream(components: str = "3d 6d", state: str = "streaming", **fields: Any) -> rtc3d.stream_status_t:
@@ -38,3 +41,8 @@ def loss(cause: str, messages: int, frames: int) -> rtc3d.loss_t:
     message = rtc3d.loss_t()
     message.cause, message.messages, message.frames = cause, messages, frames
     return message
+
+
+def amounts(losses: Iterable[Loss]) -> dict[str, tuple[int, int]]:
+    """Return (messages, frames) by cause."""
+    return {loss.cause: (loss.messages, loss.frames) for loss in losses}

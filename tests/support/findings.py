@@ -13,9 +13,9 @@ from gateway.doctor.all_checks import run_checks
 from gateway.outputs.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from tests import servers
-from tests.configurations import make_settings
-from tests.servers import Client, ScriptedServer, ok, packet
+from tests.support import servers
+from tests.support.configurations import make_settings
+from tests.support.servers import Client, ScriptedServer, ok, packet
 
 SECONDS = 0.3
 

@@ -7,9 +7,9 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
-from tests.needs import need
+from tests.support.needs import need
 
-ROOT: Final = Path(__file__).parents[1]
+ROOT: Final = Path(__file__).parents[2]
 WHEELHOUSE: Final = ROOT / "build/wheelhouse"
 """All packages that installing downloads; ``make wheelhouse`` fills it."""
 

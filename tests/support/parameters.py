@@ -1,7 +1,13 @@
-"""The specification's examples in §6: the XML, word for word, and the parameters as a human reads them."""
+"""Parameters of servers: as outputs get them, and the specification's examples in §6.
+
+These are the XML, word for word, and the parameters as a human reads them.
+"""
 
 from pathlib import Path
 
+from gateway.config.settings import SourceSettings
+from gateway.descriptions.source_frame import source_frame
+from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -22,7 +28,7 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d.parameters_xml import parse_parameters
 
-SPEC_XML = Path(__file__).parent / "data" / "spec_xml"
+SPEC_XML = Path(__file__).parents[1] / "data" / "spec_xml"
 
 GENERAL = General(
     name="",
@@ -111,3 +117,9 @@ def markers_of(xml: bytes) -> Parameters3D:
     assert recovered == ()
     assert parameters.markers is not None
     return parameters.markers
+
+
+def in_metres(parameters: Parameters, source: str = "lab") -> ServerParameters:
+    """Return parameters of a source without a transform: poses are in metres, in the server's axes."""
+    frame = source_frame(SourceSettings(name=source, host="192.0.2.20"), parameters)
+    return ServerParameters(b"", 1, 1, parsed=parameters, frame=frame)

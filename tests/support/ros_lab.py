@@ -31,8 +31,8 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
-from tests.networks import free_endpoint, open_zenoh
-from tests.waiting import wait_until
+from tests.support.networks import free_endpoint, open_zenoh
+from tests.support.waiting import wait_until
 
 ALL = frozenset(WIRE_ORDER)
 UTIME = 1_700_000_000_000_001

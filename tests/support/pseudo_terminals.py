@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
-from tests.gateway_process import PROGRAM
+from tests.support.gateway_process import PROGRAM
 
 _TIMEOUT_S: Final = 120.0
 _LINE: Final = re.compile(rb"\x1b\[(\d+);1H\x1b\[K((?:(?!\x1b\[\d+;1H|\x1b\[\?).)*)", re.DOTALL)

@@ -16,9 +16,9 @@ from typing import Any, Final, NamedTuple
 import zenoh
 
 from gateway.messages.decode import decode
-from tests.configurations import write_config
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
-from tests.waiting import wait_until
+from tests.support.configurations import write_config
+from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.support.waiting import wait_until
 
 PROGRAM: Final = (sys.executable, "-m", "gateway")
 

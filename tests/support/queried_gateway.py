@@ -17,12 +17,12 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.service.gateway import Gateway
-from tests.configurations import local_settings, local_source
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
-from tests.running_gateway import running_gateway
-from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
-from tests.spec_parameters import in_root, spec_xml
-from tests.waiting import wait_until_async
+from tests.support.configurations import local_settings, local_source
+from tests.support.gateways import running_gateway
+from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.support.parameters import in_root, spec_xml
+from tests.support.servers import Client, ScriptedServer, error, markers_frame, ok, packet
+from tests.support.waiting import wait_until_async
 
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))
 

@@ -1,7 +1,8 @@
-"""Takes for tests: messages as a gateway publishes them, and event logs of them."""
+"""Takes for tests: messages as a gateway publishes them, event logs of them, and those of whole scenes."""
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,12 @@ import rtc3d
 
 from gateway.messages.encode import Stamp, encode_message
 from gateway.messages.topics import lcm_channel
-from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType, encode_component
+from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, Component, ComponentType, encode_component
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.rtc3d_server.measurement import exact_rate
+from gateway.simulator.c3d_scene import C3dScene
+from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import encode_event
 
@@ -98,3 +102,51 @@ def write_take(path: Path, messages: Iterable[Message]) -> Path:
     """Write an event log; return its path."""
     path.write_bytes(log_bytes(messages))
     return path
+
+
+SERVER_START_US = 5_000_000
+"""The server's time of the first sample."""
+
+
+def scene_messages(
+    scene: C3dScene | SyntheticScene,
+    num_frames: int,
+    *,
+    source: str = "lab",
+    session: int = 1,
+    start_us: int = 0,
+    sequence: int = 0,
+    keep: Callable[[ComponentType, int], bool] = lambda _component, _sample: True,
+) -> Iterator[Message]:
+    """Yield the messages of so many frames of a scene, with its time stamps, in the order of time.
+
+    ``keep`` says which samples of a component arrive. The times of capture have a jitter of up to 0.4 ms.
+    """
+    jitter = np.random.default_rng(7)
+    slowest = exact_rate(scene.measurement_rate_hz)
+    due: list[tuple[Fraction, ComponentType, int]] = []
+    items = {}
+    for component in WIRE_ORDER:
+        if component in scene.rates_hz:
+            rate = exact_rate(scene.rates_hz[component])
+            count = int(num_frames * rate / slowest)
+            items[component] = scene.items(component, np.arange(count))
+            due += [(number / rate, component, number) for number in range(count)]
+    for time_s, component, number in sorted(due, key=lambda entry: entry[0]):
+        if keep(component, number):
+            time_us = start_us + int(time_s * 1_000_000)
+            yield frame(
+                component,
+                items[component][number].tolist(),
+                sequence + number,
+                utime=START_UTIME + time_us + 3000 + int(jitter.integers(400)),
+                session=session,
+                timestamp_us=SERVER_START_US + time_us,
+                frame_number=number + 1,
+                source=source,
+            )
+
+
+def record_scene(path: Path, scene: C3dScene | SyntheticScene, num_frames: int) -> Path:
+    """Write a take of a scene; return its path."""
+    return write_take(path, [description(), parameters(scene.parameters), *scene_messages(scene, num_frames)])

@@ -1,18 +1,20 @@
-"""Ports, Zenoh sessions, LCM URLs and routes for tests, all on the loopback interface."""
+"""Ports, Zenoh sessions, LCM URLs and routes for tests, all on the loopback interface; a dead name server."""
 
 import contextlib
 import itertools
 import json
 import socket
 import subprocess
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final
 
 import zenoh
 
-from tests.needs import need_programs
+from tests.support.needs import need_programs
 
 _LCM_PORTS: Final = itertools.count(7720)
 _PORTS: Final = itertools.cycle(range(10_000, 32_000))
@@ -145,3 +147,30 @@ def slow_interface(kbit_per_s: int) -> Iterator[str]:
         yield f"udpm://{group}:7667?ttl=1"
     finally:
         subprocess.run(["ip", "link", "del", "slow"], check=True)
+
+
+_ADDRESS: Final = ("127.0.0.53", 53)
+_TIMEOUT_S: Final = 30
+"""How long a program waits for an answer: longer than a busy computer delays what does not wait for it."""
+
+_USE_FILE: Final = 'mount --bind "$1" /etc/resolv.conf && shift && exec "$@"'
+
+
+@contextlib.contextmanager
+def dead_name_server(
+    folder: Path,
+    options: str = f"timeout:{_TIMEOUT_S}",
+    serve: Callable[[socket.socket], None] | None = None,
+) -> Iterator[tuple[str, ...]]:
+    """Run the server; yield what to put before a command whose names it should resolve.
+
+    The command gets a file /etc/resolv.conf of its own, in a mount namespace. ``serve`` may answer after all,
+    in a thread.
+    """
+    file = folder / "resolv.conf"
+    file.write_text(f"nameserver {_ADDRESS[0]}\noptions {options}\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(_ADDRESS)
+        if serve is not None:
+            threading.Thread(target=serve, args=(server,), daemon=True).start()
+        yield ("unshare", "--mount", "sh", "-c", _USE_FILE, "with-resolv-conf", str(file))

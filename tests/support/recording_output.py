@@ -21,8 +21,8 @@ from gateway.takes.files.event_log import Event
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES, WriterThread
 from gateway.workers import WorkerThread, make_call
-from tests.settable_clock import Clock
-from tests.waiting import wait_until_async
+from tests.support.clocks import Clock
+from tests.support.waiting import wait_until_async
 
 _Result = TypeVar("_Result")
 
