@@ -85,6 +85,8 @@ class QueueRoom:
 class WorkerThread:
     """Makes calls one after the other in its own thread, which exists only while there are calls.
 
+    Unless it ``ends_when_idle``, the thread that the first call starts exists until the end.
+
     Two queues: calls that must be made (``submit``, ``run``) go first, and their callers bound them. Calls
     that may be given up (``offer``) are refused while too many wait, or too many bytes.
 
@@ -92,8 +94,16 @@ class WorkerThread:
     does not respond, or a peer that does not read, would delay the end of the gateway.
     """
 
-    def __init__(self, name: str, max_calls: int = MAX_CALLS, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(
+        self,
+        name: str,
+        max_calls: int = MAX_CALLS,
+        max_bytes: int = MAX_BYTES,
+        *,
+        ends_when_idle: bool = True,
+    ) -> None:
         self._name = name
+        self._ends_when_idle = ends_when_idle
         self._changed = threading.Condition()  # of everything below
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._offered: deque[tuple[int, Callable[[], None]]] = deque()
@@ -194,7 +204,8 @@ class WorkerThread:
     def _next(self) -> Callable[[], None] | None:
         """Wait for the next call; None if there is none, so that the thread ends."""
         with self._changed:
-            self._changed.wait_for(lambda: self._calls or self._offered or self._is_closed, _IDLE_S)
+            idle_s = _IDLE_S if self._ends_when_idle else None
+            self._changed.wait_for(lambda: self._calls or self._offered or self._is_closed, idle_s)
             if self._calls:
                 return functools.partial(make_call, *self._calls.popleft())
             if self._offered:

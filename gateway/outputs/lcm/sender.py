@@ -127,7 +127,7 @@ class LcmThreadSender:
         self._is_open = False
         self._full = f"{url} does not take messages fast enough; check the peer of lcm.url"
         self._is_full = False  # the queue, when the last message came
-        self._lcm: lcm.LCM
+        self._lcm: lcm.LCM | None = None
         self._worker = WorkerThread("lcm-send", MAX_QUEUED_MESSAGES, MAX_QUEUED_BYTES)
         self._opened: Future[None] | None = None
         self._lock = threading.Lock()  # of the next two, and of what ``close`` sets last
@@ -187,6 +187,7 @@ class LcmThreadSender:
         self._worker.finish(_JOIN_S)
         with self._lock:
             self._problem = CLOSED
+            self._lcm = None  # there is no close(); LCM writes the end of a file when nothing refers to it
             return +self._waiting
 
     # In the thread.
@@ -212,9 +213,10 @@ class LcmThreadSender:
 
     def _publish(self, channel: str, message: bytes, source: str) -> None:
         """Publish a message, with retries; give up when that fails after ``close`` was called."""
-        while not self._has_given_up:
+        connection = self._lcm
+        while connection is not None and not self._has_given_up:
             try:
-                self._lcm.publish(channel, message)
+                connection.publish(channel, message)
             except OSError as error:
                 problem = send_problem(self._url, error)
                 self._set_problem(problem)

@@ -53,7 +53,8 @@ class LslOutput(FrameOutput):
             )
         self.settings: LslSettings = settings
         self._processes = LslProcesses(settings, self._wanted_changed)
-        self._thread = WorkerThread("lsl-send")
+        # The kernel kills the process for LSL when the thread that started it ends (PR_SET_PDEATHSIG).
+        self._thread = WorkerThread("lsl-send", ends_when_idle=False)
         self._numbers = itertools.count(1)
         self._computer = socket.gethostname()
         self._publishers: dict[str, LslFramePublisher] = {}  # by source

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import lcm
@@ -22,6 +23,7 @@ from gateway.outputs.lcm.sender import (
 )
 from tests.support.clocks import Clock
 from tests.support.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
+from tests.support.waiting import wait_until
 
 BAD_URL = "udpm://not-an-address:7667"
 
@@ -123,6 +125,18 @@ def test_a_sender_that_has_opened_is_not_opened_again(shared: lcm.LCM, clock: Cl
 )
 def test_only_the_schemes_that_block_send_from_a_thread(url: str, sender_class: type) -> None:
     assert type(new_sender(url, None, lambda: None)) is sender_class
+
+
+def test_a_file_is_complete_when_its_sender_is_closed(tmp_path: Path) -> None:
+    """LCM has no ``close``: it keeps the end of a file in memory as long as something refers to it."""
+    file, messages = tmp_path / "log.lcmlog", [bytes([number]) for number in range(10)]
+    sender = new_sender(f"file://{file}?mode=w", None, lambda: None)
+    sender.open()
+    wait_until(lambda: not sender.problem)
+    for message in messages:
+        sender.send("CHANNEL", message)
+    assert not sender.close()
+    assert [event.data for event in lcm.EventLog(str(file))] == messages
 
 
 # Failures ------------------------------------------------------------------------------------

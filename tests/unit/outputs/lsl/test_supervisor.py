@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,6 +83,18 @@ def test_a_process_loads_liblsl_and_ends_with_its_supervisor(processes: LslProce
     assert not processes.is_due
     assert processes.problem == "LSL is closed; start the gateway again"
     assert not processes.send(Message(Kind.CLOSE, 1))
+
+
+def test_the_process_lives_on_while_nothing_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel kills it when the thread that started it ends, as other idle threads do."""
+    monkeypatch.setattr("gateway.workers._IDLE_S", 0.0)
+    output = LslOutput(LslSettings(enabled=True, config=str(lsl_config(tmp_path))))
+    output.start()
+    try:
+        wait_until(lambda: output.version)
+        assert "lsl-send" in {thread.name for thread in threading.enumerate()}
+    finally:
+        output.close()
 
 
 def test_a_process_that_ended_is_replaced_and_gets_the_streams_again(
