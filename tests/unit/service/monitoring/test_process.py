@@ -2,14 +2,16 @@
 
 import asyncio
 import errno
+import resource
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
-from gateway.service.monitoring.process_limits import LoopDelay, ProcessLimits
+from gateway.service.monitoring.process_limits import LoopDelay, ProcessLimits, return_free_memory
 from gateway.workers import WorkerThread
 from tests.support.waiting import wait_until_async
 
@@ -40,6 +42,21 @@ async def test_closing_stops_the_measurement() -> None:
     delay.close()
     assert delay._timer is not None
     assert delay._timer.cancelled()
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def test_memory_between_blocks_in_use_is_returned() -> None:
+    """Without this, glibc keeps it until also the blocks around it are free."""
+    blocks = [bytearray(10_000) for _ in range(8_000)]
+    kept = blocks[::50]
+    del blocks
+    before = resident_bytes()
+    return_free_memory()
+    assert before - resident_bytes() > 40_000_000
+    assert len(kept) == 160
 
 
 @contextmanager
