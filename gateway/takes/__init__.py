@@ -13,6 +13,9 @@ In ``files``:
   messages at once.
 - Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
   with what interrupts it.
+
+``recorder`` records what gateways publish as one of their subscribers; in the gateway itself, the output
+``takes`` does. ``replay`` publishes a take again, and ``export`` converts it for other programs.
 """
 
 from typing import TYPE_CHECKING, Any
