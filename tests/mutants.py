@@ -32,6 +32,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "publish": ("unit/publish/test_* property/*_pacing_*",),
     "queries": ("unit/queries/test_* unit/service/test_source*",),
     "messages": ("unit/messages/test_*",),
+    "gateway": ("unit/test_*",),  # the modules that are in no package
     "takes/files": ("unit/takes/files/test_* property/*takes* property/*_components_*",),
 } | {
     f"outputs/{name}": (f"unit/outputs/{name}/test_* unit/outputs/test_*", f"contract/test_* -k {name}")

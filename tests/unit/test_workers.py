@@ -112,6 +112,9 @@ def test_a_queue_has_room_for_some_calls_and_bytes() -> None:
     room.free(0)
     assert not room.take(MAX_BYTES + 1)
     assert room.take(MAX_BYTES)
+    assert not room.take(1)
+    room.free(MAX_BYTES)
+    assert room.take(1)
 
 
 def test_after_close_only_the_last_call_is_begun(blocked: tuple[WorkerThread, threading.Event]) -> None:
