@@ -2,18 +2,65 @@
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 import asyncio
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, Self
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, ClassVar, Final, NamedTuple, Protocol, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from gateway.config.section import Section, expects, validation_error
 from gateway.rtc3d.packets import Packet, PacketType
+from gateway.simulator.synthetic import SceneSettings
 
-if TYPE_CHECKING:
-    from gateway.simulator.faults.control import Faults
-    from gateway.simulator.faults.pipeline import FaultPipeline
+
+class FaultyConnection(Protocol):
+    """What a momentary fault may do to a connection."""
+
+    @property
+    def number(self) -> int:
+        """The connection's number since the server's start, from 1."""
+        ...
+
+    def send_unchanged(self, data: bytes) -> None:
+        """Send bytes that no fault changes, after all bytes that are waiting."""
+        ...
+
+    def disconnect(self, last_data: bytes, *, reset: bool) -> None:
+        """Write ``last_data`` before all bytes that are waiting, and end the connection with FIN or RST."""
+        ...
+
+
+class FaultyServer(Protocol):
+    """What a fault may do to the server."""
+
+    @property
+    def connections(self) -> Sequence[FaultyConnection]:
+        """The clients' connections."""
+        ...
+
+    def stop_measurement(self) -> None:
+        """Stop the measurement, if one is running."""
+        ...
+
+    def start_measurement(self) -> None:
+        """Start a measurement, unless another fault prevents it."""
+        ...
+
+    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
+        """Serve the scenario's scene with changes; return a function that restores the previous scene."""
+        ...
+
+    def rename_items(self, prefix: str) -> Callable[[], None]:
+        """Put ``prefix`` before the names of markers and tools; return a function that restores the scene."""
+        ...
+
+    def crash(self) -> None:
+        """End as if the process died."""
+        ...
+
+    def restart(self) -> None:
+        """Listen again after a crash, unless another fault prevents it."""
+        ...
 
 
 MAX_SECONDS: Final = 86400
@@ -93,10 +140,9 @@ class ActiveFault:
     A fault with ``every_s`` begins repeatedly, others once.
     """
 
-    def __init__(self, fault: "Fault", faults: "Faults", rng: np.random.Generator) -> None:
+    def __init__(self, fault: "Fault", server: FaultyServer, rng: np.random.Generator) -> None:
         self.fault = fault
-        self.faults = faults
-        """All faults of the server, with what they may do to it."""
+        self.server = server
         # Two generators, so that the timing does not depend on how many packets the fault changed.
         self.rng, self._timing_rng = rng.spawn(2)
         self.ended = asyncio.Event()
@@ -199,11 +245,11 @@ class MomentaryFault(ConnectionFault):
 
     def begin(self, active: ActiveFault) -> None:
         """Act on every affected connection."""
-        for connection in active.faults.connections:
+        for connection in active.server.connections:
             if self.applies_to(connection.number):
                 self.act_on(connection, active)
 
-    def act_on(self, connection: "FaultPipeline", active: ActiveFault) -> None:
+    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
         """Act on one connection."""
         raise NotImplementedError
 

@@ -12,6 +12,7 @@ from gateway.rtc3d.packets import PACKET_HEADER, PacketType
 from gateway.simulator.faults.base import (
     ActiveFault,
     Fault,
+    FaultyConnection,
     LastingConnectionFault,
     LastingFault,
     Milliseconds,
@@ -19,7 +20,6 @@ from gateway.simulator.faults.base import (
     PendingWrite,
     Seconds,
 )
-from gateway.simulator.faults.pipeline import FaultPipeline
 from gateway.simulator.synthetic import Label, SceneSettings
 
 Pieces = Annotated[int, Field(strict=True, ge=2, le=1000), expects("a whole number from 2 to 1000")]
@@ -155,7 +155,7 @@ class Garbage(MomentaryFault):
     num_bytes: NumBytes = 64
     """The number of bytes."""
 
-    def act_on(self, connection: FaultPipeline, active: ActiveFault) -> None:
+    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
         """See MomentaryFault."""
         connection.send_unchanged(active.rng.bytes(self.num_bytes))
 
@@ -168,7 +168,7 @@ class Oversize(MomentaryFault):
     size_bytes: TooLarge = 0xFFFFFFFF
     """The value of the size field."""
 
-    def act_on(self, connection: FaultPipeline, active: ActiveFault) -> None:
+    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
         """See MomentaryFault."""
         connection.send_unchanged(PACKET_HEADER.pack(self.size_bytes, PacketType.DATA))
 
@@ -181,7 +181,7 @@ class Undersize(MomentaryFault):
     size_bytes: TooSmall = 0
     """The value of the size field."""
 
-    def act_on(self, connection: FaultPipeline, active: ActiveFault) -> None:
+    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
         """See MomentaryFault."""
         connection.send_unchanged(PACKET_HEADER.pack(self.size_bytes, PacketType.DATA))
 
@@ -194,7 +194,7 @@ class Cut(MomentaryFault):
     reset: Switch = False
     """End connections with RST instead of FIN, as a server's computer does after a restart."""
 
-    def act_on(self, connection: FaultPipeline, active: ActiveFault) -> None:
+    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
         """See MomentaryFault."""
         connection.disconnect(_PART_OF_A_PACKET, reset=self.reset)
 
@@ -209,8 +209,8 @@ class NoMeasurement(LastingFault):
 
     def begin(self, active: ActiveFault) -> Callable[[], None]:
         """See Fault."""
-        active.faults.stop_measurement()
-        return active.faults.start_measurement
+        active.server.stop_measurement()
+        return active.server.start_measurement
 
 
 class ChangeScene(LastingFault):
@@ -223,7 +223,7 @@ class ChangeScene(LastingFault):
 
     def begin(self, active: ActiveFault) -> Callable[[], None]:
         """See Fault."""
-        return active.faults.change_scene(self.scene)
+        return active.server.change_scene(self.scene)
 
 
 class Rename(LastingFault):
@@ -236,7 +236,7 @@ class Rename(LastingFault):
 
     def begin(self, active: ActiveFault) -> Callable[[], None]:
         """See Fault."""
-        return active.faults.rename_items(self.prefix)
+        return active.server.rename_items(self.prefix)
 
 
 class Restart(Fault):
@@ -257,10 +257,10 @@ class Restart(Fault):
 
     def begin(self, active: ActiveFault) -> Callable[[], None]:
         """See Fault."""
-        active.faults.crash()
+        active.server.crash()
         if self.scene.model_fields_set:
-            active.faults.change_scene(self.scene)
-        return active.faults.restart
+            active.server.change_scene(self.scene)
+        return active.server.restart
 
 
 SERVER_FAULTS: Final[tuple[type[Fault], ...]] = (NoMeasurement, ChangeScene, Rename, Restart)

@@ -233,31 +233,31 @@ class Faults:
             if isinstance(active.fault, LastingConnectionFault) and active.fault.applies_to(number)
         ]
 
-    # For faults -----------------------------------------------------------------------------
+    # For faults (FaultyServer) --------------------------------------------------------------
 
     def stop_measurement(self) -> None:
-        """Stop the measurement, if one is running."""
+        """See FaultyServer."""
         self._server.stop_measurement()
 
     def start_measurement(self) -> None:
-        """Start a measurement, unless another fault prevents it."""
+        """See FaultyServer."""
         if self._server.is_listening and not self._is_active(NoMeasurement):
             self._server.start_measurement()
 
     def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
-        """Serve the scenario's scene with changes; return a function that restores the previous scene."""
+        """See FaultyServer."""
         return self._serve(self.scene.with_changes(changes).build())
 
     def rename_items(self, prefix: str) -> Callable[[], None]:
-        """Put ``prefix`` before the names of markers and tools; return a function that restores the scene."""
+        """See FaultyServer."""
         return self._serve(RenamedScene(self._server.scene, prefix))
 
     def crash(self) -> None:
-        """End as if the process died."""
+        """See FaultyServer."""
         self._server.crash()
 
     def restart(self) -> None:
-        """Listen again after a crash, unless another fault prevents it."""
+        """See FaultyServer."""
         if self._restarting is None or self._restarting.done():
             self._restarting = asyncio.get_running_loop().create_task(self._restart())
 

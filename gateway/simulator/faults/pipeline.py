@@ -8,25 +8,75 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Final
 
-from gateway.rtc3d.packets import Packet, PacketType
+from gateway.rtc3d.packets import Packet
 from gateway.rtc3d_server.client_session import error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.server import call_after_us
-from gateway.simulator.faults.base import (
-    ActiveFault,
-    LastingConnectionFault,
-    PendingWrite,
-    Reply,
-    packet_type_of,
-)
+from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault, PendingWrite, Reply
+from gateway.simulator.faults.reply_faults import HeldReplies
 
 MAX_WAITING_BYTES: Final = 4 * 1024 * 1024
 """How many bytes may wait to be sent on one connection; beyond this, packets are dropped."""
 
 _log = logging.getLogger(__name__)
+
+
+class WriteQueue:
+    """Writes to a connection in order, each write when it is due."""
+
+    def __init__(self, connection: FilteredConnection) -> None:
+        self._connection = connection
+        self._waiting: deque[PendingWrite] = deque()
+        self._timer: asyncio.TimerHandle | None = None
+        self._was_full = False
+        self.waiting_bytes = 0
+        """The total size of the waiting writes."""
+
+    def put(self, writes: list[PendingWrite]) -> None:
+        """Write what is due and keep the rest. If that exceeds MAX_WAITING_BYTES, drop ``writes``."""
+        size = sum(len(write.data) for write in writes)
+        if self._waiting and self.waiting_bytes + size > MAX_WAITING_BYTES:
+            if not self._was_full:
+                _log.warning(
+                    "%s: faults delay more than %d MiB; dropping packets",
+                    self._connection.name,
+                    MAX_WAITING_BYTES >> 20,
+                )
+            self._was_full = True
+            return
+        self._waiting.extend(writes)
+        self.waiting_bytes += size
+        self._write_due(time.monotonic())
+
+    def flush(self) -> None:
+        """Write everything at once."""
+        self._write_due(math.inf)
+
+    def clear(self) -> None:
+        """Discard everything."""
+        self._cancel_timer()
+        self._waiting.clear()
+        self.waiting_bytes = 0
+
+    def _write_due(self, now_s: float) -> None:
+        while self._waiting and self._waiting[0].due_s <= now_s:
+            data = self._waiting.popleft().data
+            while self._waiting and self._waiting[0].joins_previous and self._waiting[0].due_s <= now_s:
+                data += self._waiting.popleft().data
+            self.waiting_bytes -= len(data)
+            self._connection.write(data)
+        self._cancel_timer()
+        if self._waiting:
+            self._timer = call_after_us(
+                1_000_000 * (self._waiting[0].due_s - now_s), lambda: self._write_due(time.monotonic())
+            )
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
 
 ActiveConnectionFaults = list[tuple[ActiveFault, LastingConnectionFault]]
@@ -135,11 +185,11 @@ class FaultPipeline(ConnectionFilter):
     # For faults -----------------------------------------------------------------------------
 
     def send_unchanged(self, data: bytes) -> None:
-        """Send bytes that no fault changes, after all bytes that are waiting."""
+        """See FaultyConnection."""
         self._writes.put([PendingWrite(time.monotonic(), data)])
 
     def disconnect(self, last_data: bytes, *, reset: bool) -> None:
-        """Write ``last_data`` before all bytes that are waiting, and end the connection with FIN or RST."""
+        """See FaultyConnection."""
         self.connection.write(last_data)
         if reset:
             tcp = self.connection.transport.get_extra_info("socket")
@@ -166,117 +216,3 @@ class FaultPipeline(ConnectionFilter):
         )
         if self._unread and self._read_timer is None and not is_reading_stopped:
             self.handle_unread()
-
-
-class WriteQueue:
-    """Writes to a connection in order, each write when it is due."""
-
-    def __init__(self, connection: FilteredConnection) -> None:
-        self._connection = connection
-        self._waiting: deque[PendingWrite] = deque()
-        self._timer: asyncio.TimerHandle | None = None
-        self._was_full = False
-        self.waiting_bytes = 0
-        """The total size of the waiting writes."""
-
-    def put(self, writes: list[PendingWrite]) -> None:
-        """Write what is due and keep the rest. If that exceeds MAX_WAITING_BYTES, drop ``writes``."""
-        size = sum(len(write.data) for write in writes)
-        if self._waiting and self.waiting_bytes + size > MAX_WAITING_BYTES:
-            if not self._was_full:
-                _log.warning(
-                    "%s: faults delay more than %d MiB; dropping packets",
-                    self._connection.name,
-                    MAX_WAITING_BYTES >> 20,
-                )
-            self._was_full = True
-            return
-        self._waiting.extend(writes)
-        self.waiting_bytes += size
-        self._write_due(time.monotonic())
-
-    def flush(self) -> None:
-        """Write everything at once."""
-        self._write_due(math.inf)
-
-    def clear(self) -> None:
-        """Discard everything."""
-        self._cancel_timer()
-        self._waiting.clear()
-        self.waiting_bytes = 0
-
-    def _write_due(self, now_s: float) -> None:
-        while self._waiting and self._waiting[0].due_s <= now_s:
-            data = self._waiting.popleft().data
-            while self._waiting and self._waiting[0].joins_previous and self._waiting[0].due_s <= now_s:
-                data += self._waiting.popleft().data
-            self.waiting_bytes -= len(data)
-            self._connection.write(data)
-        self._cancel_timer()
-        if self._waiting:
-            self._timer = call_after_us(
-                1_000_000 * (self._waiting[0].due_s - now_s), lambda: self._write_due(time.monotonic())
-            )
-
-    def _cancel_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-
-@dataclass(slots=True, eq=False)
-class _HeldReply:
-    packet: bytes
-    num_frames: int  # data frames to send before it; 0 if it waits for its timer
-    timer: asyncio.TimerHandle | None = None
-
-
-class HeldReplies:
-    """Holds replies until their delay is over or enough frames have been sent, then sends them."""
-
-    def __init__(self, send: Callable[[bytes], None]) -> None:
-        self._send = send
-        self._held: list[_HeldReply] = []
-
-    @property
-    def waiting_bytes(self) -> int:
-        """The size of all replies that are held."""
-        return sum(len(held.packet) for held in self._held)
-
-    def hold(self, reply: Reply) -> None:
-        """Hold a reply for its ``delay_s`` or its ``after_frames``."""
-        held = _HeldReply(reply.packet, reply.after_frames)
-        if not reply.after_frames:
-            held.timer = asyncio.get_running_loop().call_later(reply.delay_s, self._release, held)
-        self._held.append(held)
-
-    def packet_sent(self, packet: bytes) -> None:
-        """Send the replies that waited for this packet, if it is a data frame or No Data."""
-        packet_type = packet_type_of(packet)
-        if not self._held or packet_type not in {PacketType.DATA, PacketType.NO_DATA}:
-            return
-        for held in [held for held in self._held if held.num_frames]:
-            if held.num_frames > 1 and packet_type == PacketType.DATA:
-                held.num_frames -= 1
-            else:
-                self._release(held)
-
-    def flush(self) -> None:
-        """Send all replies at once, in the order of their commands."""
-        for held in list(self._held):
-            self._release(held)
-
-    def clear(self) -> None:
-        """Discard all replies."""
-        for held in self._held:
-            if held.timer is not None:
-                held.timer.cancel()
-        self._held.clear()
-
-    def _release(self, held: _HeldReply) -> None:
-        if held not in self._held:
-            return  # sending another reply has already released it
-        self._held.remove(held)
-        if held.timer is not None:
-            held.timer.cancel()
-        self._send(held.packet)

@@ -32,8 +32,7 @@ from gateway.simulator.faults.frame_faults import (
     WrongByteOrder,
     WrongCounts,
 )
-from gateway.simulator.faults.pipeline import HeldReplies
-from gateway.simulator.faults.reply_faults import MinimalServer, RefusedCommands
+from gateway.simulator.faults.reply_faults import HeldReplies, MinimalServer, RefusedCommands
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SceneSettings
 from tests.unit.rtc3d_server.counting_scene import CountingScene
