@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from gateway.logs.limits import HOLD_S, Hold
+from gateway.logs.failures import HOLD_S, Hold
 
 _MINUTE_S: Final = 60
 
@@ -94,13 +94,7 @@ class Losses:
         self._newest_s = 0.0
 
     def lost(
-        self,
-        cause: str,
-        text: str,
-        *,
-        messages: int = 1,
-        frames: int = 1,
-        level: int = logging.WARNING,
+        self, cause: str, text: str, *, messages: int = 1, frames: int = 1, level: int = logging.WARNING
     ) -> None:
         """Count lost ``messages`` that belong to ``frames``. ``text`` says what happened and what to do."""
         now_s = self._monotonic()
@@ -184,12 +178,9 @@ def last_minute_text(losses: Iterable[Loss]) -> str:
 
     For example "lost in the last minute: 872 messages of 436 frames (skipped while behind)".
     """
-    counts = [
-        (loss.cause, loss.messages_last_minute, loss.frames_last_minute)
-        for loss in losses
-        if loss.messages_last_minute
-    ]
-    return f"lost in the last minute: {counts_text(counts)}" if counts else ""
+    counts = [(loss.cause, loss.messages_last_minute, loss.frames_last_minute) for loss in losses]
+    text = counts_text(count for count in counts if count[1])
+    return f"lost in the last minute: {text}" if text else ""
 
 
 def counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
@@ -197,9 +188,8 @@ def counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
 
     For example "1 message (closed), 872 messages of 436 frames (skipped while behind)".
     """
-    return ", ".join(f"{_amount(messages, frames)} ({cause})" for cause, messages, frames in counts)
-
-
-def _amount(messages: int, frames: int) -> str:
-    text = f"{messages} message{'' if messages == 1 else 's'}"
-    return f"{text} of {frames} frame{'' if frames == 1 else 's'}" if frames else text
+    texts = []
+    for cause, messages, frames in counts:
+        of_frames = f" of {frames} frame{'' if frames == 1 else 's'}" if frames else ""
+        texts.append(f"{messages} message{'' if messages == 1 else 's'}{of_frames} ({cause})")
+    return ", ".join(texts)
