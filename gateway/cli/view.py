@@ -19,7 +19,7 @@ from gateway.outputs.listen_address import is_loopback
 if TYPE_CHECKING:
     from gateway.client.client import GatewayAddress
     from gateway.client.transport import GatewaySubscriber
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
     from gateway.display.view.server import ViewServer
     from gateway.display.view.viewer import Viewer
 
@@ -77,7 +77,7 @@ def _live_data(
     """Subscribe, and provide a viewer of what arrives."""
     from gateway.client.client import GatewayClient
     from gateway.client.transport import close_in_time
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
     from gateway.display.view.viewer import RunningTakes, Viewer
 
     live = LiveData()
@@ -102,7 +102,7 @@ def _take(
     path: Path, sources: Sequence[str], server: "ViewServer"
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Open a take, and provide a viewer that plays it."""
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
     from gateway.display.view.viewer import Playback, Viewer
 
     live = LiveData()

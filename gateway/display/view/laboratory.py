@@ -14,7 +14,7 @@ from gateway.descriptions.force_plates import (
     placed_plates,
     units_of,
 )
-from gateway.display.live.component import LiveComponent
+from gateway.display.live import LiveComponent
 from gateway.display.view.markers_and_tools import GREY, MAX_M, Labels
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import viser
 
-from gateway.display.live.component import LiveComponent
+from gateway.display.live import LiveComponent
 from gateway.logs.safe_text import safe_text
 from gateway.messages.encode import metres_per_unit
 from gateway.takes.files.component_rows import Array

@@ -9,8 +9,7 @@ import numpy as np
 import viser
 
 from gateway.descriptions.force_plates import METRES_PER_NEWTON
-from gateway.display.live.component import Percentiles
-from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.live import LiveData, LiveSource, Percentiles
 from gateway.display.view.laboratory import UP_AXES, UpAxis
 from gateway.display.view.markers_and_tools import SourceColor
 from gateway.display.view.plots import Plots

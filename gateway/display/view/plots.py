@@ -9,8 +9,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from gateway.display.live.component import LiveComponent
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveComponent, LiveSource
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.takes.files.component_rows import Array

@@ -9,8 +9,7 @@ from urllib.parse import quote
 import numpy as np
 import viser
 
-from gateway.display.live.component import LiveComponent
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveComponent, LiveSource
 from gateway.display.view.laboratory import (
     Plates,
     Sphere,

@@ -3,8 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-from gateway.display.live.component import LiveComponent, Percentiles
-from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.live import LiveComponent, LiveData, LiveSource, Percentiles
 from gateway.display.view.texts import (
     NONE,
     age_text,

@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.display.live.component import LiveComponent, Percentiles, visible_percent
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveComponent, LiveSource, Percentiles, visible_percent
 from gateway.logs.safe_text import safe_text
 from gateway.takes.files.component_rows import Array
 

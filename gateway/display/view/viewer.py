@@ -9,7 +9,7 @@ from typing import Any, Final
 import viser
 
 from gateway.client.transport import GatewaySubscriber
-from gateway.display.live.live_data import LiveData
+from gateway.display.live import LiveData
 from gateway.display.view.panel import Panel
 from gateway.display.view.scene import Scene
 from gateway.display.view.server import ViewServer

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveSource
 from gateway.display.view.plots import MAX_CHOICES, Channel, choices, component_of, first_choice, samples
 from gateway.display.view.texts import MAX_ROWS, events_html, items_html, worst_first
 from gateway.rtc3d.components import ComponentType

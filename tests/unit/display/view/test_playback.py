@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import viser
 
-from gateway.display.live.live_data import LiveData
+from gateway.display.live import LiveData
 from gateway.display.view.markers_and_tools import Labels
 from gateway.display.view.viewer import Playback, Viewer
 from gateway.errors import TakeError

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import rtc3d
 
-from gateway.display.live.component import LiveComponent, Percentiles
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveComponent, LiveSource, Percentiles
 from gateway.display.view.panel import MAX_SOURCES, banner_html
 from gateway.display.view.source_text import (
     data_state,

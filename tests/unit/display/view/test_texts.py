@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gateway.display.live.component import Percentiles
+from gateway.display.live import Percentiles
 from gateway.display.view.laboratory import UpAxis, on_floor, sphere_around, up_axis_of
 from gateway.display.view.markers_and_tools import MAX_M, positions_in_metres
 from gateway.display.view.texts import (
