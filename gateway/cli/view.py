@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from gateway.client.client import GatewayAddress
     from gateway.client.transport import GatewaySubscriber
     from gateway.display.live import LiveData
-    from gateway.display.view.server import ViewServer
-    from gateway.display.view.viewer import Viewer
+    from gateway.display.view.viewer import Viewer, ViewServer
 
 VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
@@ -117,7 +116,7 @@ def _take(
 def _open_server(host: str, port: int) -> "ViewServer":
     """Return the server of the page. Raises ViewError."""
     try:
-        from gateway.display.view.server import open_server
+        from gateway.display.view.viewer import open_server
     except ImportError as error:
         if not (error.name or "").startswith("viser"):
             raise
@@ -132,7 +131,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
 
 def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     """Print where the page is, and open it. A computer without a browser is no error."""
-    from gateway.display.view.server import address_of
+    from gateway.display.view.viewer import address_of
 
     address = address_of(host, port)
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)

@@ -10,8 +10,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from gateway.display.view.panel import Panel
-from gateway.display.view.server import ViewServer, open_server
-from gateway.display.view.viewer import PERIOD_S
+from gateway.display.view.viewer import PERIOD_S, ViewServer, open_server
 from gateway.rtc3d.components import ComponentType
 from tests.support.browser import NewPage, chromium, new_page
 from tests.support.statuses import stream

@@ -107,14 +107,15 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
     announced_hz = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
+    to_gateway_p50_ms, to_gateway_p99_ms = component.latency.to_gateway or (None, None)
+    to_here_p50_ms, to_here_p99_ms = component.latency.to_here or (None, None)
     can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
     return ComponentFacts(
         kind.key,
         0.0 if component.is_stopped else component.rate_hz,
         announced_hz if announced_hz is not None and math.isfinite(announced_hz) else None,
         *_message_counts([] if series is None else [series]),
-        *(component.latency.to_gateway or (None, None)),
-        *(component.latency.to_here or (None, None)),
+        *(to_gateway_p50_ms, to_gateway_p99_ms, to_here_p50_ms, to_here_p99_ms),
         num_items=len(component.newest_items) if has_come else None,
         num_visible=int(component.is_visible.sum()) if can_be_seen else None,
         age_s=component.age_s,

@@ -72,8 +72,8 @@ def _component_row(component: facts.ComponentFacts) -> Row:
     elif not component.num_messages:
         note, style = "none so far", Style.FAINT
     rate_hz, announced_hz = component.rate_hz, component.announced_rate_hz
-    is_known = rate_hz is not None and announced_hz is not None and component.num_messages > 0
-    is_slow = is_known and rate_hz < SLOW_SHARE * announced_hz
+    has_rates = rate_hz is not None and announced_hz is not None and component.num_messages > 0
+    is_slow = has_rates and (rate_hz or 0.0) < SLOW_SHARE * (announced_hz or 0.0)
     is_missing = component.num_visible is not None and component.num_visible < (component.num_items or 0)
     lost_style = Style.BAD if component.num_lost else Style.PLAIN
     return (

@@ -45,6 +45,10 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
     ]
     routes = list(_routes(gateway))
     losses = [f"{route.name}: {text}" for route in routes if (text := last_minute_text(route.losses))]
+    causes = []
+    for route in routes:
+        names = {"source": route.source, "stream": route.stream, "output": route.output}
+        causes += [names | loss._asdict() | {"age_s": round(loss.age_s, 1)} for loss in route.losses]
     body = {
         "status": "unhealthy" if problems else "degraded" if losses else "healthy",
         "healthy": not problems,
@@ -52,12 +56,11 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
         "process": list(process_problems),
         "streams": streams,
         "outputs": outputs,
-        "losses": [loss for route in routes for loss in _losses_json(route)],
+        "losses": causes,
     }
     status = HTTPStatus.SERVICE_UNAVAILABLE if problems else HTTPStatus.OK
-    return Page(
-        status, "application/json", safe_json(json.dumps(body, ensure_ascii=False, indent=2)).encode() + b"\n"
-    )
+    text = safe_json(json.dumps(body, ensure_ascii=False, indent=2))
+    return Page(status, "application/json", f"{text}\n".encode())
 
 
 def _streams(source: Source) -> Iterator[dict[str, Any]]:
@@ -97,11 +100,6 @@ def _routes(gateway: Gateway) -> Iterator[_Route]:
             yield _Route(source.name, None, output.name, output_status.losses)
 
 
-def _losses_json(route: _Route) -> list[dict[str, Any]]:
-    names = {"source": route.source, "stream": route.stream, "output": route.output}
-    return [names | loss._asdict() | {"age_s": round(loss.age_s, 1)} for loss in route.losses]
-
-
 def _stream_problem(
     source: Source, settings: StreamSettings, stream: StreamReport, age_s: float | None
 ) -> str:
@@ -109,25 +107,19 @@ def _stream_problem(
     max_age_s = source.settings.stall_timeout_s
     if age_s is not None and age_s < max_age_s:
         return ""
+    match StreamState(stream.state):
+        case StreamState.NO_MEASUREMENT:
+            return ""
+        case StreamState.IDLE | StreamState.STREAMING if settings.has_only_events:
+            return ""
+        case StreamState.IDLE if settings.on_demand:
+            if not source.fan_out.has_subscribers(settings.components):
+                return ""
     silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
-    if _needs_no_frames(source, settings, StreamState(stream.state)):
-        return ""
     if stream.state == StreamState.IDLE.value:
         return f"{silence}: {source.settings.host} is connected but sends nothing; is a measurement running?"
     reason = stream.last_error or f"connecting to {source.settings.host}:{source.settings.port}"
     return f"{silence}: {reason}"
-
-
-def _needs_no_frames(source: Source, stream: StreamSettings, state: StreamState) -> bool:
-    match state:
-        case StreamState.NO_MEASUREMENT:
-            return True
-        case StreamState.IDLE | StreamState.STREAMING if stream.has_only_events:
-            return True
-        case StreamState.IDLE:
-            return stream.on_demand and not source.fan_out.has_subscribers(stream.components)
-        case _:
-            return False
 
 
 def status_lines(gateway: Gateway) -> list[str]:
@@ -136,17 +128,15 @@ def status_lines(gateway: Gateway) -> list[str]:
     The line of a source is such as "lab: streaming 200.0 Hz". If the texts of its streams differ, the
     components of each stream precede its text.
     """
-    lines = [f"{source.name}: {_streams_line(source)}" for source in gateway.sources]
+    lines = []
+    for source in gateway.sources:
+        texts = []
+        for stream, status in zip(source.report.streams, source.statuses, strict=False):
+            lost = last_minute_text(status.losses.report())
+            texts.append((stream.components, f"{stream.text}, {lost}" if lost else stream.text))
+        lines.append(f"{source.name}: {streams_text(texts)}")
     lines += [f"{each['output']}: {each['problem']}" for each in _outputs(gateway) if each["problem"]]
     for route in _routes(gateway):
         if route.output and (text := last_minute_text(route.losses)):
             lines.append(f"{route.name}: {text}")
     return lines
-
-
-def _streams_line(source: Source) -> str:
-    texts = []
-    for stream, status in zip(source.report.streams, source.statuses, strict=False):
-        lost = last_minute_text(status.losses.report())
-        texts.append((stream.components, f"{stream.text}, {lost}" if lost else stream.text))
-    return streams_text(texts)

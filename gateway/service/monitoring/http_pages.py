@@ -9,6 +9,7 @@ import contextlib
 import functools
 import logging
 import math
+import os
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,6 @@ from gateway.errors import NO_FILES
 from gateway.logs.failures import DefectLog
 from gateway.outputs.listen_address import foreign_request
 from gateway.server_limits import Clients, ServerLimits
-from gateway.service.monitoring.process_limits import ReservedFiles
 
 logger = logging.getLogger(__name__)
 
@@ -44,12 +44,44 @@ _MAX_DISCARDED_BYTES: Final = 65536
 """How much to read after the request, such as the body of a POST; more is reset."""
 
 
+_TEXT: Final = "text/plain; charset=utf-8"
+
+
 class Page(NamedTuple):
     """An HTTP response."""
 
     status: HTTPStatus
     content_type: str
     body: bytes
+
+
+class ReservedFiles:
+    """File descriptors that are kept for when none is left.
+
+    ``use`` frees one, and whatever opens a file next gets it. ``refill`` takes back what is free again.
+    """
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._reserved: list[int] = []
+
+    def use(self) -> bool:
+        """Free one; return False if none is left."""
+        if not self._reserved:
+            return False
+        os.close(self._reserved.pop())
+        return True
+
+    def refill(self) -> None:
+        """Reserve as many as are missing, if the system allows it."""
+        with contextlib.suppress(OSError):
+            while len(self._reserved) < self._number:
+                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
+
+    def close(self) -> None:
+        """Free all."""
+        while self.use():
+            pass
 
 
 class HttpPages:
@@ -73,7 +105,10 @@ class HttpPages:
         """Listen on IP addresses; raises OSError if one of them or the port cannot be bound."""
         try:
             for address in addresses:
-                self._listening.append(_listen(address, port))
+                family = socket.AF_INET6 if ":" in address else socket.AF_INET
+                server = socket.create_server((address, port), family=family, backlog=_BACKLOG)
+                server.setblocking(False)
+                self._listening.append(server)
         except OSError:
             await self.close()
             raise
@@ -100,10 +135,19 @@ class HttpPages:
             asyncio.get_running_loop().add_reader(listening, self._accept, listening)
 
     def _accept(self, listening: socket.socket) -> None:
-        """Accept a connection; if that is not possible, disconnect the oldest one and wait for a moment."""
+        """Accept a connection, with a reserved file descriptor if no other is left.
+
+        If that is not possible, disconnect the oldest one and wait for a moment.
+        """
         loop = asyncio.get_running_loop()
+        self._reserve.refill()
         try:
-            connection = self._accepted(listening)
+            try:
+                connection, _ = listening.accept()
+            except OSError as error:
+                if error.errno not in NO_FILES or not self._reserve.use():
+                    raise
+                connection, _ = listening.accept()
         except OSError as error:
             if error.errno in NO_FILES:
                 self._connections.disconnect_oldest()
@@ -113,16 +157,6 @@ class HttpPages:
         task = loop.create_task(self._serve(connection))
         self._connections.open(task)
         task.add_done_callback(functools.partial(self._end, connection))
-
-    def _accepted(self, listening: socket.socket) -> socket.socket:
-        """Return the next connection, with a reserved file descriptor if no other is left. Raises OSError."""
-        self._reserve.refill()
-        try:
-            return listening.accept()[0]
-        except OSError as error:
-            if error.errno not in NO_FILES or not self._reserve.use():
-                raise
-        return listening.accept()[0]
 
     def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
         connection.close()
@@ -156,31 +190,41 @@ class HttpPages:
                 transport.abort()
 
     def _response(self, head: bytes) -> bytes:
-        method = head.partition(b" ")[0]
-        page = self._respond(head)
-        return _head(page) + (b"" if method == b"HEAD" else page.body)
+        """Return the response to the request with this head."""
+        page = self._page_for(head)
+        fields = (
+            f"HTTP/1.1 {page.status} {page.status.phrase}\r\n"
+            f"Content-Type: {page.content_type}\r\n"
+            f"Content-Length: {len(page.body)}\r\n"
+            "Allow: GET, HEAD\r\n"
+            "Cache-Control: no-store\r\n"
+            "Connection: close\r\n\r\n"
+        )
+        return fields.encode() + (b"" if head.startswith(b"HEAD ") else page.body)
 
-    def _respond(self, head: bytes) -> Page:
-        request = head.split(b"\r\n", 1)[0].decode("latin-1").split(" ")
+    def _page_for(self, head: bytes) -> Page:
+        first, *lines = head.split(b"\r\n")
+        request = first.decode("latin-1").split(" ")
         if len(request) != 3 or not request[2].startswith("HTTP/1."):
             return _error_page(HTTPStatus.BAD_REQUEST)
-        refusal = foreign_request(self._host, _header(head, b"host"), _header(head, b"origin"))
+        fields: dict[bytes, list[str]] = {}
+        for line in lines:
+            name, _, value = line.partition(b":")
+            fields.setdefault(name.strip().lower(), []).append(value.strip().decode("latin-1"))
+        refusal = foreign_request(self._host, fields.get(b"host", []), fields.get(b"origin", []))
         if refusal:
-            self._log_refusal(refusal)
+            if not self._has_refused:
+                self._has_refused = True
+                logger.warning("metrics: a request was refused: %s", refusal)
             return _error_page(HTTPStatus.FORBIDDEN, refusal)
         method, target, _ = request
         path = target.partition("?")[0]
         if path not in self._pages:
             paths = "".join(f"{path}\n" for path in self._pages)
-            return Page(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", f"Pages:\n{paths}".encode())
+            return Page(HTTPStatus.NOT_FOUND, _TEXT, f"Pages:\n{paths}".encode())
         if method not in {"GET", "HEAD"}:
             return _error_page(HTTPStatus.METHOD_NOT_ALLOWED)
         return self._page(path)
-
-    def _log_refusal(self, refusal: str) -> None:
-        if not self._has_refused:
-            self._has_refused = True
-            logger.warning("metrics: a request was refused: %s", refusal)
 
     def _page(self, path: str) -> Page:
         """Return the page, built at most MAX_PAGE_AGE_S ago."""
@@ -197,30 +241,5 @@ class HttpPages:
         return page
 
 
-def _listen(address: str, port: int) -> socket.socket:
-    """Return a socket that listens on an IP address. Raises OSError."""
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    listening = socket.create_server((address, port), family=family, backlog=_BACKLOG)
-    listening.setblocking(False)
-    return listening
-
-
-def _header(head: bytes, name: bytes) -> list[str]:
-    """Return the values of a header, whose name is in lower case."""
-    fields = (line.partition(b":") for line in head.split(b"\r\n")[1:])
-    return [value.strip().decode("latin-1") for key, _, value in fields if key.strip().lower() == name]
-
-
 def _error_page(status: HTTPStatus, reason: str = "only GET and HEAD are served") -> Page:
-    return Page(status, "text/plain; charset=utf-8", f"{status.phrase}; {reason}\n".encode())
-
-
-def _head(page: Page) -> bytes:
-    return (
-        f"HTTP/1.1 {page.status} {page.status.phrase}\r\n"
-        f"Content-Type: {page.content_type}\r\n"
-        f"Content-Length: {len(page.body)}\r\n"
-        "Allow: GET, HEAD\r\n"
-        "Cache-Control: no-store\r\n"
-        "Connection: close\r\n\r\n"
-    ).encode()
+    return Page(status, _TEXT, f"{status.phrase}; {reason}\n".encode())

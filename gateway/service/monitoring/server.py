@@ -8,11 +8,10 @@ from typing import Final
 from gateway.config.settings import MetricsSettings
 from gateway.errors import system_reason
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.disk_facts import DiskFacts
 from gateway.service.monitoring.health import health_page
 from gateway.service.monitoring.http_pages import HttpPages
 from gateway.service.monitoring.metrics import metrics_page, metrics_registry
-from gateway.service.monitoring.process_limits import LoopDelay, ProcessLimits
+from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay, ProcessLimits
 from gateway.stream.tcp import is_address, look_up
 
 _LOOK_UP_TIMEOUT_S: Final = 5.0

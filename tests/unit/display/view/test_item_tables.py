@@ -1,13 +1,13 @@
 """Markers and tools by visibility, the newest events, and the channels that can be plotted."""
 
+import re
 import time
 
-import numpy as np
 import pytest
 
 from gateway.display.live import LiveSource
-from gateway.display.view.plots import MAX_CHOICES, Channel, choices, component_of, first_choice, samples
-from gateway.display.view.texts import MAX_ROWS, events_html, items_html, worst_first
+from gateway.display.view.plots import MAX_CHOICES, Channel, choices, first_choice, samples
+from gateway.display.view.texts import MAX_ROWS, events_html, items_html
 from gateway.rtc3d.components import ComponentType
 from tests.support.takes import START_UTIME
 from tests.unit.display.live_lab import NAN, Lab, text_of, wait
@@ -19,8 +19,11 @@ LABELS = """<The_3D><Markers>3</Markers>
 </The_3D>"""
 
 
-def test_the_least_visible_come_first() -> None:
-    assert worst_first(np.array([1, 0.5, 1, 0, 0.5])) == [3, 1, 4, 0, 2]
+def test_the_least_visible_come_first_and_equal_ones_in_their_order(lab: Lab) -> None:
+    lab.send_markers(True, True, True, False, True)
+    lab.send_markers(True, False, True, False, False)
+    names = re.findall(r"marker \d", text_of(items_html(lab.source)))
+    assert names == ["marker 4", "marker 2", "marker 5", "marker 1", "marker 3"]
 
 
 def test_markers_by_visibility_and_tools_with_their_error(lab: Lab) -> None:
@@ -88,9 +91,8 @@ ANALOG = """<Analog><Channels>2</Channels><Channel><Label>EMG</Label><Unit>V</Un
 
 
 def values(source: LiveSource, channel: Channel) -> list[tuple[list[int], list[float]]]:
-    component = component_of(channel, {"lab": source})
-    assert component is not None
-    return [(utimes.tolist(), found.tolist()) for utimes, found in samples(channel, component)]
+    found = samples(channel, source.components[channel.key])
+    return [(utimes.tolist(), values.tolist()) for utimes, values in found]
 
 
 def test_channels_have_names_and_units(lab: Lab) -> None:
@@ -126,4 +128,3 @@ def test_samples_of_a_force_plate_and_while_the_number_of_channels_changes(lab: 
     assert values(source, Channel("lab", "force", 1, "mx")) == [([START_UTIME], [10])]
     channel = Channel("lab", "analog", 1, "")
     assert values(source, channel) == [([START_UTIME + 1], [1]), ([START_UTIME + 2], [2])]
-    assert component_of(channel, {}) is None

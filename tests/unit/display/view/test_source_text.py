@@ -9,14 +9,14 @@ import rtc3d
 
 from gateway.display.live import LiveComponent, LiveSource, Percentiles
 from gateway.display.view.panel import MAX_SOURCES, banner_html
-from gateway.display.view.source_text import (
+from gateway.display.view.texts import (
+    clock_text,
     data_state,
     gateway_states,
     ignored_html,
     source_html,
     states_html,
 )
-from gateway.display.view.texts import clock_text
 from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gateway.display.live import Percentiles
-from gateway.display.view.laboratory import UpAxis, on_floor, sphere_around, up_axis_of
-from gateway.display.view.markers_and_tools import MAX_M, positions_in_metres
+from gateway.display.view.scene import sphere_around, up_axis_of
+from gateway.display.view.scene_items import MAX_M, UpAxis, on_floor, positions_in_metres
 from gateway.display.view.texts import (
     NONE,
     age_text,

@@ -10,8 +10,8 @@ from gateway.config.settings import SourceSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring import disk_facts
-from gateway.service.monitoring.disk_facts import DiskFacts
+from gateway.service.monitoring import process_limits
+from gateway.service.monitoring.process_limits import DiskFacts
 from tests.support.configurations import make_settings
 from tests.support.waiting import wait_until_async
 
@@ -55,11 +55,11 @@ async def test_the_end_of_each_certificate_of_zenoh_is_read(tmp_path: Path) -> N
 def test_a_damaged_certificate_raises_only_the_documented_error(name: str) -> None:
     """What is in a file must not end the thread, or the page of the metrics."""
     der = ssl.PEM_cert_to_DER_cert((FOLDER / f"{name}.crt").read_text())
-    assert disk_facts._end_s(der) in {NEAR_S, FAR_S}
+    assert process_limits._end_s(der) in {NEAR_S, FAR_S}
     for position in range(len(der)):
         for damaged in (der[:position], der[:position] + b"\xff" + der[position + 1 :]):
             try:
-                disk_facts._end_s(damaged)
+                process_limits._end_s(damaged)
             except ValueError:
                 continue
 
