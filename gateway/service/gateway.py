@@ -3,13 +3,13 @@
 import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.logs.failures import defect_text, log_fields
 from gateway.messages.host_time import host_clock
-from gateway.outputs.contract import Answer, Command, Output, ServerFile, ServerParameters
+from gateway.outputs.contract import Answer, Command, Output
 from gateway.outputs.guard import GuardedOutput
 from gateway.outputs.registry import build_outputs
 from gateway.publish.routes import OPENING_S
@@ -20,7 +20,6 @@ from gateway.stream.tcp import Backoff
 from gateway.workers import WorkerThread
 
 _STATUS_PERIOD_S: Final = 1.0
-_SENDING_TIMEOUT_S: Final = 0.5
 _OPENING_POLL_S: Final = 0.02
 
 logger = logging.getLogger(__name__)
@@ -82,7 +81,11 @@ class Gateway:
             output.start()
         self._spool.reader.submit(self._spool.delete_abandoned)
         try:
-            await self._wait_for_outputs(stop)
+            deadline_s = asyncio.get_running_loop().time() + OPENING_S
+            while not stop.is_set() and not all(output.health().connected for output in self._outputs):
+                if asyncio.get_running_loop().time() >= deadline_s:
+                    break
+                await asyncio.sleep(_OPENING_POLL_S)
             async with self._tasks:
                 for name in self._sources:
                     self._start_source(name)
@@ -97,13 +100,6 @@ class Gateway:
             await _close_all(self._outputs)
             for source in self._sources.values():
                 source.fan_out.end_losses()
-
-    async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
-        deadline_s = asyncio.get_running_loop().time() + OPENING_S
-        while asyncio.get_running_loop().time() < deadline_s and not stop.is_set():
-            if all(output.health().connected for output in self._outputs):
-                return
-            await asyncio.sleep(_OPENING_POLL_S)
 
     def _start_source(self, name: str) -> None:
         self._source_tasks[name] = self._tasks.create_task(self._run_source(name), name=f"source {name}")
@@ -193,16 +189,13 @@ class Gateway:
         await _close_all(removed)  # first, because a new output may use the same address
         for output in new:
             output.start()
-            self._publish_known_parameters(output)
+            for name, source in self._sources.items():
+                parameters = source.known_parameters
+                if parameters.version:
+                    output.publish_parameters(name, parameters)
+                else:
+                    source.fan_out.begin(parameters)
         return _changes("output", [output.name for output in removed], [output.name for output in new])
-
-    def _publish_known_parameters(self, output: GuardedOutput) -> None:
-        for name, source in self._sources.items():
-            parameters = source.known_parameters
-            if parameters.version:
-                output.publish_parameters(name, parameters)
-            else:
-                source.fan_out.begin(parameters)
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}
@@ -250,32 +243,7 @@ class Gateway:
             history = self._histories[settings.name] = SourceHistory(settings, self._outputs)
         elif settings.name not in self._sources:
             history.fan_out.set_outputs(self._outputs)
-        self._sources[settings.name] = Source(
-            settings,
-            history,
-            self._spool,
-            self._publish_parameters,
-            self._announce_file,
-            self._follow_recording,
-        )
-
-    async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish on every output; wait until they have sent it, but at most _SENDING_TIMEOUT_S."""
-        sent = [output.publish_parameters(source, parameters) for output in self._outputs]
-        pending = [future for future in sent if future is not None]
-        if pending:
-            await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
-
-    def _announce_file(self, source: str, file: ServerFile) -> None:
-        for output in self._outputs:
-            output.announce_file(source, file)
-
-    async def _follow_recording(self, source: str, start: bool, name: str) -> dict[str, Any]:
-        """Let the outputs follow a recording; return what they add to the reply to the peer."""
-        reply: dict[str, Any] = {}
-        for output in self._outputs:
-            reply |= await output.follow_recording(source, start=start, name=name)
-        return reply
+        self._sources[settings.name] = Source(settings, history, self._spool)
 
 
 async def _run_to_defect(source: Source) -> BaseException:
@@ -295,16 +263,16 @@ async def _run_to_defect(source: Source) -> BaseException:
 
 
 async def _close_all(outputs: Sequence[GuardedOutput]) -> None:
-    closing = (asyncio.create_task(_close(output), name=f"output {output.name}") for output in outputs)
-    await asyncio.gather(*closing)
+    async def close(output: GuardedOutput) -> None:
+        await output.stop_queries()
+        try:
+            await WorkerThread(f"close {output.name}").run(output.close)
+        except RuntimeError:  # there is no room for another thread
+            output.close()
 
-
-async def _close(output: GuardedOutput) -> None:
-    await output.stop_queries()
-    try:
-        await WorkerThread(f"close {output.name}").run(output.close)
-    except RuntimeError:  # there is no room for another thread
-        output.close()
+    await asyncio.gather(
+        *(asyncio.create_task(close(output), name=f"output {output.name}") for output in outputs)
+    )
 
 
 def _changes(what: str, removed: Collection[str], new: Collection[str]) -> list[str]:
