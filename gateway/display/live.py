@@ -26,30 +26,6 @@ from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array, decode
 
 logger = logging.getLogger(__name__)
 
-_RATE_WINDOW_S: Final = 2.0
-
-
-class MessageRate:
-    """Messages per second, over two seconds."""
-
-    def __init__(self) -> None:
-        self._counts: deque[tuple[float, int]] = deque()  # time and number of messages so far
-
-    def add(self, num_new: int, now_s: float) -> None:
-        """Take the number of messages since the last call."""
-        self._counts.append((now_s, num_new + (self._counts[-1][1] if self._counts else 0)))
-        while len(self._counts) > 2 and now_s - self._counts[1][0] >= _RATE_WINDOW_S:
-            self._counts.popleft()
-
-    @property
-    def rate_hz(self) -> float:
-        """Messages per second; 0 before there are two counts."""
-        if len(self._counts) < 2:
-            return 0.0
-        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
-        return (last - first) / max(last_s - first_s, 1e-3)
-
-
 WINDOW_S: Final = 10.0
 _STEP_S: Final = 0.5
 
@@ -98,6 +74,8 @@ class Visibility:
 
 
 _NUM_SAMPLES: Final = 2000
+_NUM_SHOWN: Final = 300
+"""10 s at 30 pictures per second."""
 
 
 class Percentiles(NamedTuple):
@@ -123,6 +101,9 @@ class Latency:
         self._samples = np.zeros((_NUM_SAMPLES, 2))  # ms from capture to the gateway, and from there to here
         self._num_added = 0
 
+        self.shown_ms: deque[float] = deque(maxlen=_NUM_SHOWN)
+        """From the arrival at this program to the browsers, of what they have shown."""
+
     def add(self, capture_utime: Array, utime: Array, arrived_utime: Array) -> None:
         """Take the times of messages, each with the shape (messages,), in µs since the Unix epoch."""
         times = np.stack([capture_utime, utime, arrived_utime]).astype(np.float64)[:, -_NUM_SAMPLES:]
@@ -146,6 +127,8 @@ MAX_WAITING: Final = 20_000
 
 _MAX_WAITING_BYTES: Final = 32 * 1024 * 1024
 
+_RATE_WINDOW_S: Final = 2.0
+
 _STOPPED_S: Final = 0.5
 """Data that do not come for this long, and for STOPPED_FRAMES frames, have stopped."""
 _STOPPED_FRAMES: Final = 4
@@ -168,8 +151,6 @@ class LiveComponent:
         """The newest message before its items, with the fields of HEAD; None before the first."""
         self.newest_items: Array = np.empty(0, NATIVE_ITEM_DTYPES[component])
         """The items of the newest message, shape (items,), in native byte order."""
-        self.newest_arrived_utime: int | None = None
-        """When the newest message arrived, before it waited for ``update``: µs since the Unix epoch."""
         self.num_skipped = 0
         """How many messages were not decoded, because too many waited."""
         self.num_malformed = 0
@@ -178,11 +159,12 @@ class LiveComponent:
         self.description: Description = describe(component, None, 0)
         """The labels, units and announced rate of the newest items."""
         self._visibility = Visibility()
-        self._rate = MessageRate()
+        self._counts: deque[tuple[float, int]] = deque()  # time and number of messages so far
         self._rate_before_stop_hz = 0.0
         self._paused_s = 0.0  # how long it was held so far
         self._updated_s = self._now_s
         self._arrived_s: float | None = None
+        self._arrived_utime = 0  # of the newest message, before it waited for ``update``
         self._waiting: deque[tuple[bytes, int]] = deque()  # messages, and when they arrived
         self._waiting_bytes = 0
         self._described: tuple[Parameters | None, int] = (None, 0)
@@ -218,11 +200,14 @@ class LiveComponent:
         now_s = self._updated_s = self._now_s
         self.batch = rows = decode_rows(self.type, [message for message, _ in arrived])
         self.num_malformed += rows.malformed
-        self._rate.add(len(arrived), now_s)
+        num_before = self._counts[-1][1] if self._counts else 0
+        self._counts.append((now_s, num_before + len(arrived)))
+        while len(self._counts) > 2 and now_s - self._counts[1][0] >= _RATE_WINDOW_S:
+            self._counts.popleft()
         if len(rows.heads):
             self._arrived_s = now_s
-            self.newest_arrived_utime = arrived[-1][1]
-            self._rate_before_stop_hz = self._rate.rate_hz
+            self._arrived_utime = arrived[-1][1]
+            self._rate_before_stop_hz = self.rate_hz
             head = self.newest_head = rows.heads[-1]
             self.newest_items = rows.items[int(head["num_items"])][-1]
             if not rows.malformed:
@@ -236,10 +221,18 @@ class LiveComponent:
             self._described = (parameters, num_items)
             self.description = describe(self.type, parameters, num_items)
 
+    def note_shown(self) -> None:
+        """Take note that the newest messages are sent to the browsers now."""
+        if len(self.batch.heads):
+            self.latency.shown_ms.append((now_utime() - self._arrived_utime) / 1000)
+
     @property
     def rate_hz(self) -> float:
-        """How many messages come per second, over two seconds."""
-        return self._rate.rate_hz
+        """How many messages come per second, over two seconds; 0 before the second call of ``update``."""
+        if len(self._counts) < 2:
+            return 0.0
+        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
+        return (last - first) / max(last_s - first_s, 1e-3)
 
     @property
     def announced_rate_hz(self) -> float | None:

@@ -1,7 +1,6 @@
 """The panel beside the picture: state, rates, latency, losses, visibility, events and plots."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -9,7 +8,7 @@ from typing import Final
 import viser
 
 from gateway.descriptions.force_plates import METRES_PER_NEWTON
-from gateway.display.live import LiveData, LiveSource, Percentiles
+from gateway.display.live import LiveData, LiveSource
 from gateway.display.view.plots import Plots
 from gateway.display.view.scene_items import UP_AXES, Rgb, UpAxis
 from gateway.display.view.texts import (
@@ -23,7 +22,6 @@ from gateway.display.view.texts import (
     items_html,
     source_html,
 )
-from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import Level, State
 
 _SCRIPT: Final = """
@@ -195,32 +193,6 @@ class Switches:
             return self._server.gui.add_checkbox(name, initial_value=True)
 
 
-_NUM_LATENCIES: Final = 300
-"""10 s at 30 pictures per second."""
-
-
-class ShownLatency:
-    """The time from the arrival of what is shown to its sending, by source and component."""
-
-    def __init__(self) -> None:
-        self._samples_ms: dict[tuple[str, str], deque[float]] = {}
-
-    def add(self, sources: Sequence[LiveSource]) -> None:
-        """Take the newest messages, which are sent to the browsers now."""
-        now = now_utime()
-        for source in sources:
-            for key, component in [*source.components.items()]:
-                arrived_utime = component.newest_arrived_utime
-                if len(component.batch.heads) and arrived_utime is not None:
-                    samples_ms = self._samples_ms.setdefault((source.name, key), deque(maxlen=_NUM_LATENCIES))
-                    samples_ms.append((now - arrived_utime) / 1000)
-
-    def percentiles(self, source: str) -> dict[str, Percentiles | None]:
-        """Return the percentiles of the newest samples, by component."""
-        samples_ms = [*self._samples_ms.items()]
-        return {key: Percentiles.of(each) for (name, key), each in samples_ms if name == source}
-
-
 @dataclass
 class _Turn:
     """What is shown at an interval, next at ``due_s``."""
@@ -259,7 +231,6 @@ class Panel:
         self._live = live
         self._is_take = is_take
         self._is_paused = False
-        self._shown_latency = ShownLatency()
         self._stopped: tuple[bool, ...] = ()
         server.gui.main_panel.set_width(_WIDTH_PX)
         server.gui.add_html(STYLE, order=-2)
@@ -302,7 +273,9 @@ class Panel:
         ``is_paused`` says that a take stands still on purpose.
         """
         self._is_paused = is_paused
-        self._shown_latency.add(sources)
+        for source in sources:
+            for component in [*source.components.values()]:
+                component.note_shown()
         self._plots.take(sources)
         if not self._server.get_clients():
             return
@@ -323,11 +296,8 @@ class Panel:
         _show(self._banner, [banner])
 
     def _show_sources(self, sources: Sequence[LiveSource]) -> None:
-        state = {"is_take": self._is_take, "is_paused": self._is_paused}
-        texts = [
-            source_html(source, self._shown_latency.percentiles(source.name), **state)
-            for source in sources[:MAX_SOURCES]
-        ]
+        shown = sources[:MAX_SOURCES]
+        texts = [source_html(each, is_take=self._is_take, is_paused=self._is_paused) for each in shown]
         _show(self._sources, [*texts, ignored_html(self._live)])
 
 

@@ -146,13 +146,10 @@ _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
 """A median latency between computers outside of these says that their clocks differ."""
 
 
-def source_html(
-    source: LiveSource, shown: Mapping[str, Percentiles | None], *, is_take: bool, is_paused: bool = False
-) -> str:
+def source_html(source: LiveSource, *, is_take: bool, is_paused: bool = False) -> str:
     """Return everything about a source but its markers, tools and events.
 
-    ``shown`` is the latency from the arrival here to the browsers, by component. A take has no gateway now,
-    so its latency to here is left out, and if it ``is_paused``, it has no rate.
+    A take has no gateway now, so its latency to here is left out, and if it ``is_paused``, it has no rate.
     """
     parts = [f"<h3>{html_text(source.name)}</h3>"]
     if not (is_take and (source.is_silent or is_paused)):
@@ -168,7 +165,8 @@ def source_html(
             num_items = count_text(len(component.newest_items))
             rate = _rate(component, is_take=is_take, is_paused=is_paused)
         rates.append((key, num_items, rate, count_text(source.series_by_key[key].num_messages)))
-        stages = (component.latency.to_gateway, component.latency.to_here, shown.get(key))
+        latency = component.latency
+        stages = (latency.to_gateway, latency.to_here, Percentiles.of([*latency.shown_ms]))
         latencies.append((key, *map(percentiles_text, stages[:1] if is_take else stages)))
     if components:
         headings = ("ms, p50 / p99", "captured → gateway", "→ here", "→ browser")
