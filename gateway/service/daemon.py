@@ -16,14 +16,13 @@ from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.health import status_lines
 from gateway.service.monitoring.process_limits import (
     ProcessLimits,
     limit_arenas,
     raise_file_limit,
     return_free_memory,
 )
-from gateway.service.monitoring.server import MonitoringServer
+from gateway.service.monitoring.server import MonitoringServer, status_lines
 from gateway.service.process_end import Signals, named_tasks
 from gateway.workers import WorkerThread
 

@@ -1,7 +1,7 @@
 """Scrolling plots of selected analog and force channels."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -45,12 +45,6 @@ def choices(sources: Sequence[LiveSource]) -> dict[str, Channel]:
                 return found
             found[text] = channel
     return found
-
-
-def first_choice(offered: Mapping[str, Channel]) -> str | None:
-    """Return what most people look at first: the vertical force on a plate, otherwise the first channel."""
-    forces = [text for text, channel in offered.items() if channel.field == "fz"]
-    return next(iter([*forces, *offered]), None)
 
 
 def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
@@ -266,7 +260,8 @@ class Plots:
     def offer(self, sources: Sequence[LiveSource]) -> None:
         """Offer the channels that there are now. The first time that they are known, plot a useful one."""
         former, self._choices = self._choices, choices(sources)
-        first = first_choice(self._choices)
+        forces = [text for text, channel in self._choices.items() if channel.field == "fz"]
+        first = next(iter([*forces, *self._choices]), None)  # what most people look at first
         # Once the channels of the same sources and components came twice, no more come a moment later.
         if first and not self._has_begun and self._add.value == _CHOOSE and [*former] == [*self._choices]:
             self._plot(first)

@@ -100,11 +100,6 @@ def event_time_text(utime: int) -> str:
     return text if text == NONE else f"{text}.{utime % 1_000_000 // 1000:03d}"
 
 
-def value_text(value: float) -> str:
-    """Return a value of a measurement with three significant digits."""
-    return f"{value:.3g}" if math.isfinite(value) else NONE
-
-
 def data_state(source: LiveSource) -> State:
     """Return whether data come now: "live", "no analog for 0.7 s", "no data for 12 s"."""
     age_s = source.age_s
@@ -136,12 +131,6 @@ def gateway_states(source: LiveSource) -> list[State]:
     return [State(stream.level, f"{stream.components}: {stream.text}") for stream in streams]
 
 
-def states_html(states: Iterable[State]) -> str:
-    """Return states as lines in their colours."""
-    texts = ((state.level.value, html_text(state.text, _MAX_CHARACTERS)) for state in states)
-    return "".join(f"<p class={level}>{text}</p>" for level, text in texts)  # levels are classes of the style
-
-
 _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
 """A median latency between computers outside of these says that their clocks differ."""
 
@@ -153,7 +142,10 @@ def source_html(source: LiveSource, *, is_take: bool, is_paused: bool = False) -
     """
     parts = [f"<h3>{html_text(source.name)}</h3>"]
     if not (is_take and (source.is_silent or is_paused)):
-        parts.append(states_html(gateway_states(source)))
+        states = (
+            (each.level.value, html_text(each.text, _MAX_CHARACTERS)) for each in gateway_states(source)
+        )
+        parts += [f"<p class={level}>{text}</p>" for level, text in states]  # levels are classes of the style
     parts += [f"<p class=dim>{line}</p>" for line in _origin(source)]
     # Threads that receive add components, and after each the series of its messages.
     keys = [each.key for each in WIRE_ORDER if each.key in source.series_by_key]
@@ -364,7 +356,8 @@ def _visibility_html(component: LiveComponent, noun: str) -> str:
         error = ""
         if noun == "tool":
             value = float(component.newest_items["error"][index])
-            error = f"{value_text(value)} {html_text(units[index])}" if is_visible[index] else NONE
+            number = f"{value:.3g}" if math.isfinite(value) else NONE
+            error = f"{number} {html_text(units[index])}" if is_visible[index] else NONE
         share = float(shares[index])
         level = "good" if share == 1 else "waiting" if share >= 0.9 else "bad"
         bar = f"<span class=bar><i class={level} style=width:{100 * share:.0f}%></i></span>"

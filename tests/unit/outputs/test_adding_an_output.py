@@ -26,9 +26,9 @@ from gateway.outputs.findings import Result
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.health import health_page
 from gateway.service.monitoring.metrics import metrics_page, metrics_registry
 from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay
+from gateway.service.monitoring.server import health_page
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.example_output import (

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from gateway.display.live import LiveSource
-from gateway.display.view.plots import MAX_CHOICES, Channel, choices, first_choice, samples
+from gateway.display.view.plots import MAX_CHOICES, Channel, choices, samples
 from gateway.display.view.texts import MAX_ROWS, events_html, items_html
 from gateway.rtc3d.components import ComponentType
 from tests.support.takes import START_UTIME
@@ -32,12 +32,12 @@ def test_markers_by_visibility_and_tools_with_their_error(lab: Lab) -> None:
     lab.send_parameters(LABELS)
     for number in range(4):
         lab.send_markers(True, number == 0, number > 0)
-    lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 1, 2, 3, 0.1234), (NAN,) * 8])
+    lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 1, 2, 3, 0.1234), (NAN,) * 8, (1, 0, 0, 0, 1, 2, 3, NAN)])
     text = text_of(items_html(lab.source))
     assert "|A name in|red|is missing in the newest frame." in text
     assert "|3 markers|visible, last 10 s|" in text
     assert "|RASI|25.0 %|&lt;img src=x onerror=alert(1)&gt;|75.0 %|LASI|100 %|" in text
-    assert "|tool 2|0 %|–|tool 1|100 %|0.123 mm|" in text
+    assert "|tool 2|0 %|–|tool 1|100 %|0.123 mm|tool 3|100 %|– mm|" in text
 
 
 def test_rows_are_bounded(lab: Lab) -> None:
@@ -103,14 +103,6 @@ def test_channels_have_names_and_units(lab: Lab) -> None:
     assert [*found][:3] == ["lab analog 1: EMG (V)", "lab analog 2: Sync (mV)", "lab force 1: plate 1 Fx"]
     assert [*found.values()][2] == Channel("lab", "force", 0, "fx")
     assert len(found) == 2 + 6
-
-
-def test_the_first_choice_is_a_vertical_force_otherwise_the_first_channel(lab: Lab) -> None:
-    assert first_choice({}) is None
-    lab.send(ComponentType.ANALOG, [1.0, 2.0])
-    assert first_choice(choices([lab.source])) == "lab analog 1: channel 1 (mV)"
-    lab.send(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])
-    assert first_choice(choices([lab.source])) == "lab force 1: plate 1 Fz"
 
 
 def test_choices_are_bounded(lab: Lab) -> None:

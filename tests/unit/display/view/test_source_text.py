@@ -15,7 +15,6 @@ from gateway.display.view.texts import (
     gateway_states,
     ignored_html,
     source_html,
-    states_html,
 )
 from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import Level, State
@@ -217,10 +216,6 @@ def test_a_gateway_that_is_not_heard_is_not_said_to_stream(
     wait(monkeypatch, 5)
     text = "gateway not heard for 5.0 s" if has_status else "no gateway heard"
     assert gateway_states(source) == [State(Level.BAD, text)]
-
-
-def test_states_are_escaped() -> None:
-    assert states_html([State(Level.BAD, "<b>")]) == "<p class=bad>&lt;b&gt;</p>"
 
 
 NOW_S = 1_700_000_000.5

@@ -19,7 +19,6 @@ from gateway.display.view.texts import (
     percentiles_text,
     rate_text,
     share_text,
-    value_text,
 )
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 
@@ -41,7 +40,6 @@ def test_numbers() -> None:
     shares = (0, 1, 0.9999, 0.00001, 0.5)  # only all frames are 100 %
     assert [share_text(each) for each in shares] == ["0 %", "100 %", "99.9 %", "0.1 %", "50.0 %"]
     assert [counted(each, "marker") for each in (1, 12345)] == ["1 marker", "12,345 markers"]
-    assert [value_text(each) for each in (0.20849, math.nan)] == ["0.208", NONE]
 
 
 def test_times() -> None:
