@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -196,15 +197,9 @@ class _Scope:
     def __init__(self, monotonic: Callable[[], float]) -> None:
         self.bucket = TokenBucket(LINES_PER_MINUTE / 60, BURST_LINES, monotonic)
         self.own = TokenBucket(OWN_LINES_PER_MINUTE / 60, OWN_BURST_LINES, monotonic)
-        self.suppressed: dict[str, int] = {}  # by level
+        self.suppressed: Counter[str] = Counter()  # by level
         self.newest = ""
         self.since_s = 0.0  # of the first suppressed message
-
-    def suppress(self, record: logging.LogRecord, now_s: float) -> None:
-        if not self.suppressed:
-            self.since_s = now_s
-        self.suppressed[record.levelname] = self.suppressed.get(record.levelname, 0) + 1
-        self.newest = record.getMessage()[:200]
 
 
 class LogLimit(logging.Filter):
@@ -232,7 +227,10 @@ class LogLimit(logging.Filter):
             scope = self._scopes.setdefault(name, _Scope(self._monotonic))
             # A message passes if one line is left, and may use up more.
             if scope.bucket.left < 1 or max(scope.own.left, self._total.left) < 1:
-                scope.suppress(record, now_s)
+                if not scope.suppressed:
+                    scope.since_s = now_s
+                scope.suppressed[record.levelname] += 1
+                scope.newest = record.getMessage()[:200]
                 return False
             scope.bucket.take(lines, least=-math.inf)
             scope.own.take(lines, least=0.0)
@@ -249,13 +247,13 @@ class LogLimit(logging.Filter):
                 if scope.suppressed and (at_once or now_s - scope.since_s >= _REPORT_S)
             ]
             for name, _, _ in due:
-                self._scopes[name].suppressed = {}
+                self._scopes[name].suppressed = Counter()
         for name, suppressed, newest in due:
             logger.warning(
                 "%s: %d further messages suppressed in the last minute (%s); the status has the counts; "
                 "the newest: %s",
                 name or "gateway",
-                sum(suppressed.values()),
+                suppressed.total(),
                 ", ".join(f"{count} {level}" for level, count in suppressed.items()),
                 newest,
             )

@@ -35,7 +35,8 @@ class Gateway:
     def __init__(self, settings: Settings, outputs: Sequence[Output] | None = None) -> None:
         self.settings = settings
         self._given_outputs = None if outputs is None else [GuardedOutput(output) for output in outputs]
-        self._outputs = self._build_outputs(settings)
+        self.outputs = self._build_outputs(settings)
+        """The outputs. None of them raises anything."""
         self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
         self._histories: dict[str, SourceHistory] = {}  # also of removed sources: a reload may add them again
@@ -44,7 +45,7 @@ class Gateway:
         self._reload_lock = asyncio.Lock()
         self.opened = asyncio.Event()
         """Set once the outputs are open, but at most 2 s after the start: one may be unavailable for long."""
-        for output in self._outputs:
+        for output in self.outputs:
             self._serve_queries(output)
         for source in settings.sources:
             self._add_source(source)
@@ -54,35 +55,30 @@ class Gateway:
         """The sources."""
         return list(self._sources.values())
 
-    @property
-    def outputs(self) -> Sequence[GuardedOutput]:
-        """The outputs. None of them raises anything."""
-        return self._outputs
-
     def _serve_queries(self, output: GuardedOutput) -> None:
-        output.serve_queries(SourceQueryService(self._queries, self._commands, output.name))
+        def queries() -> Mapping[str, SourceQueries]:
+            return {name: source.queries for name, source in self._sources.items()}
 
-    def _queries(self) -> Mapping[str, SourceQueries]:
-        return {name: source.queries for name, source in self._sources.items()}
+        output.serve_queries(SourceQueryService(queries, self._commands, output.name))
 
     def _commands(self) -> Mapping[str, Command]:
-        of_outputs = {name: command for output in self._outputs for name, command in output.commands.items()}
+        of_outputs = {name: command for output in self.outputs for name, command in output.commands.items()}
         return {FRAME_KEY: self._answer_frame, **of_outputs}
 
     async def _answer_frame(self, source: str, options: Mapping[str, str]) -> Answer:
-        names = {output.name: output.topic_names(source) for output in self._outputs}
+        names = {output.name: output.topic_names(source) for output in self.outputs}
         return frame_answer(self._sources[source].queries.frame, names, options)
 
     # Running.
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then send Bye to every server and close the outputs."""
-        for output in self._outputs:
+        for output in self.outputs:
             output.start()
         self._spool.reader.submit(self._spool.delete_abandoned)
         try:
             deadline_s = asyncio.get_running_loop().time() + OPENING_S
-            while not stop.is_set() and not all(output.health().connected for output in self._outputs):
+            while not stop.is_set() and not all(output.health().connected for output in self.outputs):
                 if asyncio.get_running_loop().time() >= deadline_s:
                     break
                 await asyncio.sleep(_OPENING_POLL_S)
@@ -97,7 +93,7 @@ class Gateway:
                 for task in (periodic, *self._source_tasks.values()):
                     task.cancel()
         finally:
-            await _close_all(self._outputs)
+            await _close_all(self.outputs)
             for source in self._sources.values():
                 source.fan_out.end_losses()
 
@@ -134,7 +130,7 @@ class Gateway:
         while True:
             await asyncio.sleep(_STATUS_PERIOD_S)
             host_clock.read()  # detects a step of the wall clock even if no frame arrives
-            for output in self._outputs:
+            for output in self.outputs:
                 output.maintain()
             for source in self._sources.values():
                 try:
@@ -158,7 +154,7 @@ class Gateway:
         async with self._reload_lock:
             built = self._build_outputs(settings)
             outputs = [
-                next((running for running in self._outputs if running.is_configured_like(output)), output)
+                next((running for running in self.outputs if running.is_configured_like(output)), output)
                 for output in built
             ]
             kept = [pair for pair in zip(outputs, built, strict=True) if pair[0] is not pair[1]]
@@ -179,9 +175,9 @@ class Gateway:
         return [GuardedOutput(output) for output in build_outputs(settings)]
 
     async def _change_outputs(self, outputs: list[GuardedOutput]) -> list[str]:
-        removed = [output for output in self._outputs if output not in outputs]
-        new = [output for output in outputs if output not in self._outputs]
-        self._outputs = outputs
+        removed = [output for output in self.outputs if output not in outputs]
+        new = [output for output in outputs if output not in self.outputs]
+        self.outputs = outputs
         for output in new:
             self._serve_queries(output)
         for source in self._sources.values():
@@ -240,9 +236,9 @@ class Gateway:
         """Build a source, anew if there is or was one of this name."""
         history = self._histories.get(settings.name)
         if history is None:
-            history = self._histories[settings.name] = SourceHistory(settings, self._outputs)
+            history = self._histories[settings.name] = SourceHistory(settings, self.outputs)
         elif settings.name not in self._sources:
-            history.fan_out.set_outputs(self._outputs)
+            history.fan_out.set_outputs(self.outputs)
         self._sources[settings.name] = Source(settings, history, self._spool)
 
 

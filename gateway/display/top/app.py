@@ -188,7 +188,6 @@ class App:
         self._keyboard = keyboard
         self._notices = notices
         self._display = Display(title, has_keys=keyboard is not None)
-        self._sources: Sequence[LiveSource] = ()
         self._silence = ""
         self._next_ask_s = time.monotonic() + DISCOVERY_S
         self._asking: threading.Thread | None = None
@@ -214,13 +213,17 @@ class App:
                     signal.raise_signal(signal.SIGSTOP)  # returns when the process continues
                     has_changed = True
                 self._subscriber.tick()
-                self._sources = self._live.update()
+                sources = self._live.update()
                 self._check_silence()
                 has_changed |= size != self._screen.size
                 start_s = time.monotonic()
-                if has_changed or start_s >= next_draw_s:
+                if self._screen.is_open and (has_changed or start_s >= next_draw_s):
                     size = self._screen.size
-                    self._draw()
+                    notices = [self._silence] if self._silence else []
+                    if self._live.defect is not None:
+                        notices.append(f"a defect in this program: {self._live.defect!r}")
+                    notices += [*self._notices][-1:]
+                    self._screen.draw(self._display.lines(sources, notices, *size))
                     end_s = time.monotonic()
                     next_draw_s = start_s + max(_DRAW_S, _DRAW_SHARE * (end_s - start_s))
         finally:
@@ -268,16 +271,6 @@ class App:
 
             self._asking = threading.Thread(target=ask, name="top-silence", daemon=True)
             self._asking.start()
-
-    def _draw(self) -> None:
-        if not self._screen.is_open:
-            return
-        notices = [self._silence] if self._silence else []
-        if self._live.defect is not None:
-            notices.append(f"a defect in this program: {self._live.defect!r}")
-        notices += [*self._notices][-1:]
-        size = self._screen.size
-        self._screen.draw(self._display.lines(self._sources, notices, size.columns, size.lines))
 
 
 _PICTURE_S: Final = 2.5

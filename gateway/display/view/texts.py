@@ -36,14 +36,9 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def count_text(number: int) -> str:
-    """Return a whole number, such as "12,345"."""
-    return f"{number:,}"
-
-
 def counted(number: int, noun: str) -> str:
     """Return a number of things, such as "1 source" or "12,345 sources"."""
-    return f"{count_text(number)} {noun}{'' if number == 1 else 's'}"
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def rate_text(rate_hz: float | None) -> str:
@@ -154,9 +149,9 @@ def source_html(source: LiveSource, *, is_take: bool, is_paused: bool = False) -
     for key, component in components.items():
         num_items = rate = ""
         if key != "event":
-            num_items = count_text(len(component.newest_items))
+            num_items = f"{len(component.newest_items):,}"
             rate = _rate(component, is_take=is_take, is_paused=is_paused)
-        rates.append((key, num_items, rate, count_text(source.series_by_key[key].num_messages)))
+        rates.append((key, num_items, rate, f"{source.series_by_key[key].num_messages:,}"))
         latency = component.latency
         stages = (latency.to_gateway, latency.to_here, Percentiles.of([*latency.shown_ms]))
         latencies.append((key, *map(percentiles_text, stages[:1] if is_take else stages)))
@@ -244,7 +239,7 @@ def _losses_html(source: LiveSource, components: Mapping[str, LiveComponent]) ->
 
 
 def _figure(number: int) -> str:
-    return f"<span class=bad>{count_text(number)}</span>" if number else "0"
+    return f"<span class=bad>{number:,}</span>" if number else "0"
 
 
 def _dropped(report: SourceReport | None, key: str, *causes: str) -> int:

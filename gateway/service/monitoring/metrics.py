@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
@@ -130,20 +130,8 @@ _OUTPUT_LOSSES: Final[Mapping[str, _OfLoss]] = {
 }
 
 
-def metrics_registry(gateway: Gateway, loop_delay: LoopDelay, disk_facts: DiskFacts) -> CollectorRegistry:
-    """Return the registry of all metrics of ``gateway``."""
-    registry = CollectorRegistry()
-    registry.register(GatewayCollector(gateway, loop_delay, disk_facts))
-    return registry
-
-
-def metrics_page(registry: CollectorRegistry) -> Page:
-    """Return the page /metrics in Prometheus' text format."""
-    return Page(HTTPStatus.OK, CONTENT_TYPE_PLAIN_0_0_4, generate_latest(registry))
-
-
-class GatewayCollector(Collector):
-    """Reads a gateway's counters. ``collect`` must run in the thread of the event loop."""
+class GatewayMetrics(Collector):
+    """Reads a gateway's counters. It must be used in the thread of the event loop."""
 
     def __init__(self, gateway: Gateway, loop_delay: LoopDelay, disk_facts: DiskFacts) -> None:
         self._gateway = gateway
@@ -151,6 +139,10 @@ class GatewayCollector(Collector):
         self._loop_delay = loop_delay
         self._build = {"version": __version__, "python": platform.python_version()}
         self._build |= {"zenoh": version("eclipse-zenoh"), "lcm": version("lcm")}
+
+    def page(self) -> Page:
+        """Return the page /metrics in Prometheus' text format."""
+        return Page(HTTPStatus.OK, CONTENT_TYPE_PLAIN_0_0_4, generate_latest(self))
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric with its current samples."""

@@ -17,7 +17,7 @@ from gateway.logs.safe_text import safe_json
 from gateway.messages.source_report import StreamReport, streams_text
 from gateway.service.gateway import Gateway
 from gateway.service.monitoring.http_pages import HttpPages, Page
-from gateway.service.monitoring.metrics import metrics_page, metrics_registry
+from gateway.service.monitoring.metrics import GatewayMetrics
 from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay, ProcessLimits
 from gateway.service.source import Source
 from gateway.stream.process_clock import running_clock
@@ -40,12 +40,9 @@ class MonitoringServer:
         self._loop_delay = LoopDelay()
         self._disk_facts = DiskFacts(gateway)
         self._look_up: asyncio.Task[None] | None = None
-        registry = metrics_registry(gateway, self._loop_delay, self._disk_facts)
+        metrics = GatewayMetrics(gateway, self._loop_delay, self._disk_facts)
         self._pages = HttpPages(
-            {
-                "/metrics": lambda: metrics_page(registry),
-                "/healthz": lambda: health_page(gateway, limits.problems()),
-            },
+            {"/metrics": metrics.page, "/healthz": lambda: health_page(gateway, limits.problems())},
             settings.host,
         )
 
