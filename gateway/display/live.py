@@ -100,7 +100,6 @@ class Latency:
     def __init__(self) -> None:
         self._samples = np.zeros((_NUM_SAMPLES, 2))  # ms from capture to the gateway, and from there to here
         self._num_added = 0
-
         self.shown_ms: deque[float] = deque(maxlen=_NUM_SHOWN)
         """From the arrival at this program to the browsers, of what they have shown."""
 

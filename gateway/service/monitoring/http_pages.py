@@ -203,6 +203,7 @@ class HttpPages:
         return fields.encode() + (b"" if head.startswith(b"HEAD ") else page.body)
 
     def _page_for(self, head: bytes) -> Page:
+        """Return the page that a request wants, built at most MAX_PAGE_AGE_S ago, or an error page."""
         first, *lines = head.split(b"\r\n")
         request = first.decode("latin-1").split(" ")
         if len(request) != 3 or not request[2].startswith("HTTP/1."):
@@ -224,10 +225,6 @@ class HttpPages:
             return Page(HTTPStatus.NOT_FOUND, _TEXT, f"Pages:\n{paths}".encode())
         if method not in {"GET", "HEAD"}:
             return _error_page(HTTPStatus.METHOD_NOT_ALLOWED)
-        return self._page(path)
-
-    def _page(self, path: str) -> Page:
-        """Return the page, built at most MAX_PAGE_AGE_S ago."""
         now_s = time.monotonic()
         built_s, page = self._built.get(path, (-math.inf, None))
         if page is None or now_s - built_s > MAX_PAGE_AGE_S:

@@ -55,27 +55,25 @@ class MonitoringServer:
             return
         self._loop_delay.start()
         self._disk_facts.start()
-        address = self._settings.host
-        if is_address(address):
-            await self._listen([address])
+        if is_address(self._settings.host):
+            await self._listen()
         else:
-            self._look_up = asyncio.create_task(self._look_up_and_listen(address))
+            self._look_up = asyncio.create_task(self._listen())
 
-    async def _look_up_and_listen(self, name: str) -> None:
+    async def _listen(self) -> None:
+        host, port = self._settings.host, self._settings.port
+        addresses: Sequence[str] = [host]
         try:
-            async with asyncio.timeout(_LOOK_UP_TIMEOUT_S):
-                addresses = await look_up(name)
+            if not is_address(host):
+                async with asyncio.timeout(_LOOK_UP_TIMEOUT_S):
+                    addresses = await look_up(host)
         except OSError as error:  # TimeoutError has no text
             logger.warning(
                 "metrics: the host name %s cannot be resolved: %s; continuing without /metrics and /healthz: "
                 "check the name server (DNS), or set metrics.host to an IP address, and restart",
-                *(name, error.strerror or f"no answer within {_LOOK_UP_TIMEOUT_S:g} s"),
+                *(host, error.strerror or f"no answer within {_LOOK_UP_TIMEOUT_S:g} s"),
             )
-        else:
-            await self._listen(addresses)
-
-    async def _listen(self, addresses: Sequence[str]) -> None:
-        address, port = self._settings.host, self._settings.port
+            return
         try:
             await self._pages.start(addresses, port)
         except OSError as error:
@@ -83,10 +81,10 @@ class MonitoringServer:
                 "metrics: cannot listen on %s, port %d: %s; continuing without /metrics and /healthz: "
                 "stop the program that uses the port, or set metrics.host and metrics.port, and restart "
                 "the gateway",
-                *(address, port, system_reason(error)),
+                *(host, port, system_reason(error)),
             )
         else:
-            logger.info("metrics: /metrics and /healthz are served on %s, port %d", address, port)
+            logger.info("metrics: /metrics and /healthz are served on %s, port %d", host, port)
 
     async def close(self) -> None:
         """Stop listening."""
