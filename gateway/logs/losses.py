@@ -54,18 +54,6 @@ class _Cause:
             messages, frames = messages + messages_before, frames + frames_before
         self.recent.append((second, messages, frames))
 
-    def report(self, name: str, now_s: float) -> Loss:
-        recent = [entry for entry in self.recent if entry[0] > now_s - _MINUTE_S]
-        return Loss(
-            name,
-            self.messages,
-            self.frames,
-            sum(messages for _, messages, _ in recent),
-            sum(frames for _, _, frames in recent),
-            now_s - self.newest_s,
-            self.text,
-        )
-
 
 class Losses:
     """Counts what is lost on one route, for example from a source to an output, and logs it.
@@ -142,9 +130,14 @@ class Losses:
 
     def report(self) -> list[Loss]:
         """Return what was lost so far, by cause."""
-        now_s = self._monotonic()
+        losses, now_s = [], self._monotonic()
         with self._lock:
-            return [counted.report(cause, now_s) for cause, counted in sorted(self._causes.items())]
+            for cause, counted in sorted(self._causes.items()):
+                recent = [entry for entry in counted.recent if entry[0] > now_s - _MINUTE_S]
+                messages, frames = sum(each[1] for each in recent), sum(each[2] for each in recent)
+                totals = (counted.messages, counted.frames, messages, frames)
+                losses.append(Loss(cause, *totals, now_s - counted.newest_s, counted.text))
+        return losses
 
     def frames(self, cause: str) -> int:
         """Return how many frames were lost for ``cause`` so far."""

@@ -55,35 +55,6 @@ class Page(NamedTuple):
     body: bytes
 
 
-class ReservedFiles:
-    """File descriptors that are kept for when none is left.
-
-    ``use`` frees one, and whatever opens a file next gets it. ``refill`` takes back what is free again.
-    """
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-        self._reserved: list[int] = []
-
-    def use(self) -> bool:
-        """Free one; return False if none is left."""
-        if not self._reserved:
-            return False
-        os.close(self._reserved.pop())
-        return True
-
-    def refill(self) -> None:
-        """Reserve as many as are missing, if the system allows it."""
-        with contextlib.suppress(OSError):
-            while len(self._reserved) < self._number:
-                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
-
-    def close(self) -> None:
-        """Free all."""
-        while self.use():
-            pass
-
-
 class HttpPages:
     """Serves ``pages``: a function for each path, called for each request.
 
@@ -93,7 +64,8 @@ class HttpPages:
     def __init__(self, pages: Mapping[str, Callable[[], Page]], host: str = "127.0.0.1") -> None:
         self._pages = pages
         self._listening: list[socket.socket] = []
-        self._reserve = ReservedFiles(_RESERVED_FILES)
+        self._reserved: list[int] = []
+        """File descriptors for when no other is left."""
         self._host = host
         self._has_refused = False
         self._built: dict[str, tuple[float, Page]] = {}
@@ -112,7 +84,7 @@ class HttpPages:
         except OSError:
             await self.close()
             raise
-        self._reserve.refill()
+        self._reserve_files()
         for listening in self._listening:
             self._resume(listening)
 
@@ -125,7 +97,14 @@ class HttpPages:
         for task in self._connections:
             task.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
-        self._reserve.close()
+        while self._reserved:
+            os.close(self._reserved.pop())
+
+    def _reserve_files(self) -> None:
+        """Reserve as many file descriptors as are missing, if the system allows it."""
+        with contextlib.suppress(OSError):
+            while len(self._reserved) < _RESERVED_FILES:
+                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
 
     # There is no asyncio.Server: if the process has no file descriptor left, uvloop's closes connections
     # without a word, although /healthz is wanted most then.
@@ -140,13 +119,14 @@ class HttpPages:
         If that is not possible, disconnect the oldest one and wait for a moment.
         """
         loop = asyncio.get_running_loop()
-        self._reserve.refill()
+        self._reserve_files()
         try:
             try:
                 connection, _ = listening.accept()
             except OSError as error:
-                if error.errno not in NO_FILES or not self._reserve.use():
+                if error.errno not in NO_FILES or not self._reserved:
                     raise
+                os.close(self._reserved.pop())
                 connection, _ = listening.accept()
         except OSError as error:
             if error.errno in NO_FILES:
@@ -161,7 +141,7 @@ class HttpPages:
     def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
         connection.close()
         self._connections.close(task)
-        self._reserve.refill()
+        self._reserve_files()
         if not task.cancelled() and (defect := task.exception()) is not None:
             self._defects.log(defect)
 
