@@ -194,9 +194,7 @@ class HttpPages:
             fields.setdefault(name.strip().lower(), []).append(value.strip().decode("latin-1"))
         refusal = foreign_request(self._host, fields.get(b"host", []), fields.get(b"origin", []))
         if refusal:
-            if not self._has_refused:
-                self._has_refused = True
-                logger.warning("metrics: a request was refused: %s", refusal)
+            self._log_refusal(refusal)
             return _error_page(HTTPStatus.FORBIDDEN, refusal)
         method, target, _ = request
         path = target.partition("?")[0]
@@ -216,6 +214,11 @@ class HttpPages:
                 page = _error_page(HTTPStatus.INTERNAL_SERVER_ERROR, "see the log")
             self._built[path] = now_s, page
         return page
+
+    def _log_refusal(self, refusal: str) -> None:
+        if not self._has_refused:
+            self._has_refused = True
+            logger.warning("metrics: a request was refused: %s", refusal)
 
 
 def _error_page(status: HTTPStatus, reason: str = "only GET and HEAD are served") -> Page:
