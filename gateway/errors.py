@@ -1,29 +1,9 @@
-"""All errors of the gateway, in one tree.
+"""All errors of the gateway, in one tree below GatewayError.
 
-::
-
-    GatewayError                  base of all errors that this package raises on purpose
-    ├── ConfigError               a configuration is invalid: every problem, with file and line
-    ├── TakeError                 a recording (.lcmlog, .c3d) cannot be read, written or converted
-    │   └── SelectionError        a recording lacks the chosen source or part, or no format has this extension
-    ├── ProtocolError             bytes that violate RTC3D
-    │   ├── PacketError           §4: a size out of bounds; the connection must end
-    │   ├── FrameError            §7: sizes and counts contradict each other; the frame is rejected
-    │   ├── CommandError          §5: a text that is not a command of the protocol
-    │   └── ParametersError       §6: no parameters can be read from the XML
-    ├── ServerError               the server answered with an error packet (type 0)
-    ├── LinkError                 a connection to a server is not usable
-    │   ├── ConnectError          it could not be opened
-    │   ├── ReplyTimeoutError     a command was not answered in time
-    │   ├── SilenceError          nothing arrived although something should have
-    │   ├── RequestError          the server accepts no request for frames
-    │   ├── DefectError           a defect in this program ended it
-    │   └── ClosedError           it was closed by the server, by the gateway, or by the network
-    ├── OutputError               an output did not open or did not accept a message
-    ├── PeerError                 a client of an output violates its protocol; the connection must end
-    ├── SpoolError                a C3D file from a server could not be stored
-    ├── ViewError                 the live view cannot be served
-    └── QueryError                a peer's query cannot be answered; the text goes to the peer
+- ConfigError, ServerError, PortError, OutputError, PeerError, SpoolError, ViewError, QueryError
+- TakeError: SelectionError
+- ProtocolError: PacketError, FrameError, CommandError, ParametersError
+- LinkError: ConnectError, ReplyTimeoutError, SilenceError, RequestError, DefectError, ClosedError
 
 A message says what happened, to which server or file, and what to do.
 """

@@ -17,7 +17,7 @@ import uvloop
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling, Scheduling
 
-from gateway.logs.limits import HOLD_S
+from gateway.logs.failures import HOLD_S
 from tests.support.needs import need
 
 # uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection

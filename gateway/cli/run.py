@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Final
 
 from gateway.cli.options import ConfigOption, LogOptions, ServerOption, with_options
-from gateway.logs.log_format import set_up_log
+from gateway.logs.log_format import LogLimit, set_up_log
 from gateway.service.process_end import end_at_once
 
 
@@ -62,7 +62,6 @@ def run(
     import uvloop
 
     from gateway.cli.config import chosen_file, configuration_from_options
-    from gateway.logs.limits import LogLimit
     from gateway.service.daemon import serve
 
     limit = LogLimit()

@@ -21,7 +21,7 @@ from gateway.logs.safe_text import safe_lines, safe_text
 if TYPE_CHECKING:
     from gateway.client.client import GatewayAddress
     from gateway.client.transport import GatewaySubscriber
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
 
 _MAX_TITLE: Final = 60
 _MAX_WIDTH: Final = 10_000
@@ -55,7 +55,7 @@ def top(
 def _run(address: "GatewayAddress", wanted: list[str], *, is_once: bool, as_json: bool) -> None:
     from gateway.client.client import GatewayClient
     from gateway.client.transport import close_in_time
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
 
     is_shown = not (is_once or as_json) and has_screen(sys.stdout, os.environ)
     notices: deque[str] = deque(maxlen=1)

@@ -19,9 +19,8 @@ from gateway.outputs.listen_address import is_loopback
 if TYPE_CHECKING:
     from gateway.client.client import GatewayAddress
     from gateway.client.transport import GatewaySubscriber
-    from gateway.display.live.live_data import LiveData
-    from gateway.display.view.server import ViewServer
-    from gateway.display.view.viewer import Viewer
+    from gateway.display.live import LiveData
+    from gateway.display.view.viewer import Viewer, ViewServer
 
 VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
@@ -77,7 +76,7 @@ def _live_data(
     """Subscribe, and provide a viewer of what arrives."""
     from gateway.client.client import GatewayClient
     from gateway.client.transport import close_in_time
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
     from gateway.display.view.viewer import RunningTakes, Viewer
 
     live = LiveData()
@@ -102,7 +101,7 @@ def _take(
     path: Path, sources: Sequence[str], server: "ViewServer"
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Open a take, and provide a viewer that plays it."""
-    from gateway.display.live.live_data import LiveData
+    from gateway.display.live import LiveData
     from gateway.display.view.viewer import Playback, Viewer
 
     live = LiveData()
@@ -117,7 +116,7 @@ def _take(
 def _open_server(host: str, port: int) -> "ViewServer":
     """Return the server of the page. Raises ViewError."""
     try:
-        from gateway.display.view.server import open_server
+        from gateway.display.view.viewer import open_server
     except ImportError as error:
         if not (error.name or "").startswith("viser"):
             raise
@@ -132,7 +131,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
 
 def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     """Print where the page is, and open it. A computer without a browser is no error."""
-    from gateway.display.view.server import address_of
+    from gateway.display.view.viewer import address_of
 
     address = address_of(host, port)
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)

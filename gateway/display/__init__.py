@@ -1,14 +1,11 @@
 """What people look at: the 3D view, the tables of ``top``, and the live data that both show.
 
 ``live`` is the beginning: ``LiveData`` takes the messages that a ``gateway.client`` receives, or those of a
-take that is replayed, and decodes the newest ones when somebody looks at them. ``component`` has one
-component with its rate, its latency, and what is visible.
+take that is replayed, and decodes the newest ones when somebody looks at them.
 
 - ``top``: ``facts`` makes values of the live data, for tables and JSON; ``pages`` and ``table`` lay them out;
   ``app`` draws them and takes keys.
-- ``view``: a web page with viser, which is imported only there. ``viewer`` shows what has arrived about 30
-  times a second; ``scene`` is the picture, of ``laboratory`` and ``markers_and_tools``; ``panel`` is what
-  stands beside it.
+- ``view``: a web page with viser, which is imported only there.
 - ``terminal``: keys, screens and lists for all commands.
 
 What a gateway says about a source is read in one place for all of them: ``messages.source_report``.

@@ -46,27 +46,21 @@ _NAMES: Final = {
     b"\x1b[B": "down",
     b"\x1b[C": "right",
     b"\x1b[D": "left",
-    b"\x1bOA": "up",
-    b"\x1bOB": "down",
-    b"\x1bOC": "right",
-    b"\x1bOD": "left",
     b"\x1b[5~": "page-up",
     b"\x1b[6~": "page-down",
     b"\x1b[H": "home",
     b"\x1b[1~": "home",
-    b"\x1bOH": "home",
     b"\x1b[F": "end",
     b"\x1b[4~": "end",
-    b"\x1bOF": "end",
 }
-"""What the keys send, and their names. Any other printable character is its own name."""
+"""What the keys send, some with O in place of [. Any other printable character is its own name."""
 
 
 def key_names(data: bytes) -> list[str]:
     """Return the names of the keys that sent ``data``; keys without a name are left out."""
     names = []
     for code in _KEY.findall(data):
-        text = _NAMES.get(code) or code.decode("utf-8", "replace")
+        text = _NAMES.get(code.replace(b"\x1bO", b"\x1b[")) or code.decode("utf-8", "replace")
         if text.isprintable() and text != "\N{REPLACEMENT CHARACTER}":
             names.append(text)
     return names
@@ -237,10 +231,15 @@ class Screen:
 
     def close(self) -> None:
         """Switch back."""
-        if self.is_open:
-            self.is_open = False
-            with contextlib.suppress(OSError, termios.error):  # the terminal is gone
-                self._write_anyway(_LEAVE)
+        if not self.is_open:
+            return
+        self.is_open = False
+        with contextlib.suppress(OSError, termios.error):  # the terminal is gone
+            settings = termios.tcgetattr(self.descriptor)
+            flags = settings[0] & ~termios.IXON  # without it, the terminal goes on after Ctrl-S
+            termios.tcsetattr(self.descriptor, termios.TCSANOW, [flags, *settings[1:]])
+            self._write(_LEAVE)
+            termios.tcsetattr(self.descriptor, termios.TCSANOW, settings)
 
     def redraw(self) -> None:
         """Draw everything at the next call of ``draw``."""
@@ -265,14 +264,6 @@ class Screen:
         ]
         self._drawn = texts
         self._write("".join(parts))
-
-    def _write_anyway(self, text: str) -> None:
-        """Write, also after Ctrl-S: without IXON, the terminal goes on."""
-        settings = termios.tcgetattr(self.descriptor)
-        flags = settings[0]
-        termios.tcsetattr(self.descriptor, termios.TCSANOW, [flags & ~termios.IXON, *settings[1:]])
-        self._write(text)
-        termios.tcsetattr(self.descriptor, termios.TCSANOW, [flags, *settings[1:]])
 
     def _write(self, text: str) -> None:
         data = encoded(text, self._encoding)

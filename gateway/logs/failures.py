@@ -1,15 +1,33 @@
-"""Logging of failures, defects and repeated events, and of the context of log records."""
+"""Logging of failures, defects and repeated events, and of the context of log records.
+
+Servers, peers and failing disks can cause messages without end. EventLog logs the first few events of each
+kind, and says how many it left out (``Repeats``). FailureLog, and Losses (``losses``), join what comes and
+goes into one period, with a message at its beginning and one at its end (``Hold``). DefectLog logs each
+defect once, by its place in the source code. LogLimit (``log_format``) is for what nobody expected.
+"""
 
 import logging
+import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from time import monotonic
 from typing import Final, TypeVar
 
-from gateway.logs.limits import HOLD_S as HOLD_S  # noqa: PLC0414 - for the callers of FailureLog
-from gateway.logs.limits import MAX_REPEATS, Hold, Repeats
 from gateway.logs.safe_text import safe_text
+
+MAX_REPEATS: Final = 5
+REPEATS_WINDOW_S: Final = 300.0
+"""How many messages of one kind are logged in this time."""
+
+HOLD_S: Final = 5.0
+MAX_HOLD_S: Final = 60.0
+"""A period of failure or loss is over when nothing has failed for HOLD_S.
+
+If the next one begins soon after that, the wait doubles, up to MAX_HOLD_S. So failures that come and go do
+not fill the log.
+"""
 
 FIELDS: Final = ("source", "stream", "peer")
 """The context that a record can have besides its text: fields in the journal and in JSON."""
@@ -40,6 +58,44 @@ def current_log_fields() -> Mapping[str, str]:
     return _fields.get({})
 
 
+class Repeats:
+    """The times of the newest messages of one kind, and how many others were not logged since then."""
+
+    def __init__(self, most: int = MAX_REPEATS, window_s: float = REPEATS_WINDOW_S) -> None:
+        self._window_s = window_s
+        self._times_s: deque[float] = deque(maxlen=most)
+        self._num_hidden = 0
+
+    def count(self, now_s: float) -> str | None:
+        """Count a message. Return what to add to its text, None if it is one too many."""
+        times_s = self._times_s
+        if len(times_s) == times_s.maxlen and now_s - times_s[0] < self._window_s:
+            self._num_hidden += 1
+            return None
+        times_s.append(now_s)
+        num_hidden, self._num_hidden = self._num_hidden, 0
+        return f" ({num_hidden} more like this since the last one)" if num_hidden else ""
+
+
+class Hold:
+    """How long nothing must fail until a period of failure or loss is over: ``first_s``, or longer."""
+
+    def __init__(self, first_s: float) -> None:
+        self.seconds = first_s
+        """For the current period."""
+        self._first_s = first_s
+        self._ended_s = -math.inf
+
+    def begin(self, now_s: float) -> None:
+        """Begin a period: wait twice as long as in the last one if that has just ended."""
+        is_soon = now_s - self._ended_s < MAX_HOLD_S
+        self.seconds = min(2 * self.seconds, MAX_HOLD_S) if is_soon else self._first_s
+
+    def end(self, now_s: float) -> None:
+        """End the period."""
+        self._ended_s = now_s
+
+
 class EventLog:
     """Logs events that a server or a peer can cause as often as it likes.
 
@@ -57,10 +113,7 @@ class EventLog:
 
         ``most`` is how many of this kind are logged in a few minutes.
         """
-        repeats = self._repeats.get(kind)
-        if repeats is None:
-            repeats = self._repeats[kind] = Repeats(most)
-        addition = repeats.count(monotonic())
+        addition = self._repeats.setdefault(kind, Repeats(most)).count(monotonic())
         if addition is None:
             self._logger.debug("%s: %s", self._subject, text)
         else:

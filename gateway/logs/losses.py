@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from gateway.logs.limits import HOLD_S, Hold
+from gateway.logs.failures import HOLD_S, Hold
 
 _MINUTE_S: Final = 60
 
@@ -54,18 +54,6 @@ class _Cause:
             messages, frames = messages + messages_before, frames + frames_before
         self.recent.append((second, messages, frames))
 
-    def report(self, name: str, now_s: float) -> Loss:
-        recent = [entry for entry in self.recent if entry[0] > now_s - _MINUTE_S]
-        return Loss(
-            name,
-            self.messages,
-            self.frames,
-            sum(messages for _, messages, _ in recent),
-            sum(frames for _, _, frames in recent),
-            now_s - self.newest_s,
-            self.text,
-        )
-
 
 class Losses:
     """Counts what is lost on one route, for example from a source to an output, and logs it.
@@ -94,13 +82,7 @@ class Losses:
         self._newest_s = 0.0
 
     def lost(
-        self,
-        cause: str,
-        text: str,
-        *,
-        messages: int = 1,
-        frames: int = 1,
-        level: int = logging.WARNING,
+        self, cause: str, text: str, *, messages: int = 1, frames: int = 1, level: int = logging.WARNING
     ) -> None:
         """Count lost ``messages`` that belong to ``frames``. ``text`` says what happened and what to do."""
         now_s = self._monotonic()
@@ -148,9 +130,14 @@ class Losses:
 
     def report(self) -> list[Loss]:
         """Return what was lost so far, by cause."""
-        now_s = self._monotonic()
+        losses, now_s = [], self._monotonic()
         with self._lock:
-            return [counted.report(cause, now_s) for cause, counted in sorted(self._causes.items())]
+            for cause, counted in sorted(self._causes.items()):
+                recent = [entry for entry in counted.recent if entry[0] > now_s - _MINUTE_S]
+                messages, frames = sum(each[1] for each in recent), sum(each[2] for each in recent)
+                totals = (counted.messages, counted.frames, messages, frames)
+                losses.append(Loss(cause, *totals, now_s - counted.newest_s, counted.text))
+        return losses
 
     def frames(self, cause: str) -> int:
         """Return how many frames were lost for ``cause`` so far."""
@@ -184,12 +171,9 @@ def last_minute_text(losses: Iterable[Loss]) -> str:
 
     For example "lost in the last minute: 872 messages of 436 frames (skipped while behind)".
     """
-    counts = [
-        (loss.cause, loss.messages_last_minute, loss.frames_last_minute)
-        for loss in losses
-        if loss.messages_last_minute
-    ]
-    return f"lost in the last minute: {counts_text(counts)}" if counts else ""
+    counts = [(loss.cause, loss.messages_last_minute, loss.frames_last_minute) for loss in losses]
+    text = counts_text(count for count in counts if count[1])
+    return f"lost in the last minute: {text}" if text else ""
 
 
 def counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
@@ -197,9 +181,8 @@ def counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
 
     For example "1 message (closed), 872 messages of 436 frames (skipped while behind)".
     """
-    return ", ".join(f"{_amount(messages, frames)} ({cause})" for cause, messages, frames in counts)
-
-
-def _amount(messages: int, frames: int) -> str:
-    text = f"{messages} message{'' if messages == 1 else 's'}"
-    return f"{text} of {frames} frame{'' if frames == 1 else 's'}" if frames else text
+    texts = []
+    for cause, messages, frames in counts:
+        of_frames = f" of {frames} frame{'' if frames == 1 else 's'}" if frames else ""
+        texts.append(f"{messages} message{'' if messages == 1 else 's'}{of_frames} ({cause})")
+    return ", ".join(texts)

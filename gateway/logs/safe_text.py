@@ -23,7 +23,7 @@ def safe_text(text: str, max_characters: int = MAX_CHARACTERS) -> str:
     # Cut first: the text may be long. Escaping makes it longer, so cut once more.
     cut = text[: max_characters + 1]
     if not cut.isprintable():
-        cut = "".join(map(_escaped, cut))
+        cut = "".join(each if each.isprintable() else repr(each)[1:-1] for each in cut)
     return cut if len(cut) <= max_characters else cut[: max_characters - 1] + "…"
 
 
@@ -44,10 +44,6 @@ def safe_json(json_text: str) -> str:
     The values stay the same. Line ends stay too: in JSON they are between values only.
     """
     return _NOT_ASCII.sub(_json_escaped, json_text)
-
-
-def _escaped(character: str) -> str:
-    return character if character.isprintable() else repr(character)[1:-1]
 
 
 def _json_escaped(match: re.Match[str]) -> str:

@@ -16,14 +16,13 @@ from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.health import status_lines
 from gateway.service.monitoring.process_limits import (
     ProcessLimits,
     limit_arenas,
     raise_file_limit,
     return_free_memory,
 )
-from gateway.service.monitoring.server import MonitoringServer
+from gateway.service.monitoring.server import MonitoringServer, status_lines
 from gateway.service.process_end import Signals, named_tasks
 from gateway.workers import WorkerThread
 
@@ -49,24 +48,13 @@ class SystemdNotifier:
         watchdog_us = int(os.environ.get("WATCHDOG_USEC", "0"))
         return min(_DEFAULT_PERIOD_S, watchdog_us / 2e6) if watchdog_us else _DEFAULT_PERIOD_S
 
-    def notify_ready(self) -> None:
-        """Report that the start or a reload is complete."""
-        self._notify("READY")
-
-    def notify_reloading(self) -> None:
-        """Report that a reload begins; ``notify_ready`` ends it."""
-        self._notify("RELOADING")
-
-    def notify_stopping(self) -> None:
-        """Report that the service is stopping."""
-        self._notify("STOPPING")
-
     def notify_alive(self, status: str) -> None:
         """Reset the watchdog and set the line that ``systemctl status`` shows."""
-        self._notify("WATCHDOG")
-        self._notify("STATUS", " ".join(status.split()))
+        self.notify("WATCHDOG")
+        self.notify("STATUS", " ".join(status.split()))
 
-    def _notify(self, name: str, value: str = "") -> None:
+    def notify(self, name: str, value: str = "") -> None:
+        """Send READY once the start or a reload is complete, and RELOADING or STOPPING when that begins."""
         if not self._enabled:
             return
         try:
@@ -148,7 +136,7 @@ class Daemon:
 
     def request_stop(self) -> None:
         """Begin to stop. Called in the event loop."""
-        self._systemd.notify_stopping()
+        self._systemd.notify("STOPPING")
         self._stop.set()
 
     def hang_up(self) -> None:
@@ -177,7 +165,7 @@ class Daemon:
         """
         await self._gateway.opened.wait()
         self._systemd.notify_alive(self._status_line())
-        self._systemd.notify_ready()
+        self._systemd.notify("READY")
         while True:
             await asyncio.sleep(self._systemd.period_s)
             self._systemd.notify_alive(self._status_line())
@@ -196,15 +184,10 @@ class Daemon:
         while True:
             await self._reload_requested.wait()
             self._reload_requested.clear()
-            self._systemd.notify_reloading()
+            self._systemd.notify("RELOADING")
             await self._reload()
             self._systemd.notify_alive(self._status_line())
-            self._systemd.notify_ready()
-
-    async def _replace_monitoring(self) -> None:
-        await self._monitoring.close()
-        self._monitoring = MonitoringServer(self._gateway.settings.metrics, self._gateway, self._limits)
-        await self._monitoring.start()
+            self._systemd.notify("READY")
 
     async def _reload(self) -> None:
         try:
@@ -213,7 +196,9 @@ class Daemon:
             metrics_before = self._gateway.settings.metrics
             changes = await self._gateway.reload(settings)
             if settings.metrics != metrics_before:
-                await self._replace_monitoring()
+                await self._monitoring.close()
+                self._monitoring = MonitoringServer(settings.metrics, self._gateway, self._limits)
+                await self._monitoring.start()
                 changes.append("metrics changed")
         except ConfigError as error:
             problems = str(error).splitlines()

@@ -3,13 +3,13 @@
 import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.logs.failures import defect_text, log_fields
 from gateway.messages.host_time import host_clock
-from gateway.outputs.contract import Answer, Command, Output, ServerFile, ServerParameters
+from gateway.outputs.contract import Answer, Command, Output
 from gateway.outputs.guard import GuardedOutput
 from gateway.outputs.registry import build_outputs
 from gateway.publish.routes import OPENING_S
@@ -20,7 +20,6 @@ from gateway.stream.tcp import Backoff
 from gateway.workers import WorkerThread
 
 _STATUS_PERIOD_S: Final = 1.0
-_SENDING_TIMEOUT_S: Final = 0.5
 _OPENING_POLL_S: Final = 0.02
 
 logger = logging.getLogger(__name__)
@@ -36,7 +35,8 @@ class Gateway:
     def __init__(self, settings: Settings, outputs: Sequence[Output] | None = None) -> None:
         self.settings = settings
         self._given_outputs = None if outputs is None else [GuardedOutput(output) for output in outputs]
-        self._outputs = self._build_outputs(settings)
+        self.outputs = self._build_outputs(settings)
+        """The outputs. None of them raises anything."""
         self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
         self._histories: dict[str, SourceHistory] = {}  # also of removed sources: a reload may add them again
@@ -45,7 +45,7 @@ class Gateway:
         self._reload_lock = asyncio.Lock()
         self.opened = asyncio.Event()
         """Set once the outputs are open, but at most 2 s after the start: one may be unavailable for long."""
-        for output in self._outputs:
+        for output in self.outputs:
             self._serve_queries(output)
         for source in settings.sources:
             self._add_source(source)
@@ -55,34 +55,33 @@ class Gateway:
         """The sources."""
         return list(self._sources.values())
 
-    @property
-    def outputs(self) -> Sequence[GuardedOutput]:
-        """The outputs. None of them raises anything."""
-        return self._outputs
-
     def _serve_queries(self, output: GuardedOutput) -> None:
-        output.serve_queries(SourceQueryService(self._queries, self._commands, output.name))
+        def queries() -> Mapping[str, SourceQueries]:
+            return {name: source.queries for name, source in self._sources.items()}
 
-    def _queries(self) -> Mapping[str, SourceQueries]:
-        return {name: source.queries for name, source in self._sources.items()}
+        output.serve_queries(SourceQueryService(queries, self._commands, output.name))
 
     def _commands(self) -> Mapping[str, Command]:
-        of_outputs = {name: command for output in self._outputs for name, command in output.commands.items()}
+        of_outputs = {name: command for output in self.outputs for name, command in output.commands.items()}
         return {FRAME_KEY: self._answer_frame, **of_outputs}
 
     async def _answer_frame(self, source: str, options: Mapping[str, str]) -> Answer:
-        names = {output.name: output.topic_names(source) for output in self._outputs}
+        names = {output.name: output.topic_names(source) for output in self.outputs}
         return frame_answer(self._sources[source].queries.frame, names, options)
 
     # Running.
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then send Bye to every server and close the outputs."""
-        for output in self._outputs:
+        for output in self.outputs:
             output.start()
         self._spool.reader.submit(self._spool.delete_abandoned)
         try:
-            await self._wait_for_outputs(stop)
+            deadline_s = asyncio.get_running_loop().time() + OPENING_S
+            while not stop.is_set() and not all(output.health().connected for output in self.outputs):
+                if asyncio.get_running_loop().time() >= deadline_s:
+                    break
+                await asyncio.sleep(_OPENING_POLL_S)
             async with self._tasks:
                 for name in self._sources:
                     self._start_source(name)
@@ -94,16 +93,9 @@ class Gateway:
                 for task in (periodic, *self._source_tasks.values()):
                     task.cancel()
         finally:
-            await _close_all(self._outputs)
+            await _close_all(self.outputs)
             for source in self._sources.values():
                 source.fan_out.end_losses()
-
-    async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
-        deadline_s = asyncio.get_running_loop().time() + OPENING_S
-        while asyncio.get_running_loop().time() < deadline_s and not stop.is_set():
-            if all(output.health().connected for output in self._outputs):
-                return
-            await asyncio.sleep(_OPENING_POLL_S)
 
     def _start_source(self, name: str) -> None:
         self._source_tasks[name] = self._tasks.create_task(self._run_source(name), name=f"source {name}")
@@ -138,7 +130,7 @@ class Gateway:
         while True:
             await asyncio.sleep(_STATUS_PERIOD_S)
             host_clock.read()  # detects a step of the wall clock even if no frame arrives
-            for output in self._outputs:
+            for output in self.outputs:
                 output.maintain()
             for source in self._sources.values():
                 try:
@@ -162,7 +154,7 @@ class Gateway:
         async with self._reload_lock:
             built = self._build_outputs(settings)
             outputs = [
-                next((running for running in self._outputs if running.is_configured_like(output)), output)
+                next((running for running in self.outputs if running.is_configured_like(output)), output)
                 for output in built
             ]
             kept = [pair for pair in zip(outputs, built, strict=True) if pair[0] is not pair[1]]
@@ -183,9 +175,9 @@ class Gateway:
         return [GuardedOutput(output) for output in build_outputs(settings)]
 
     async def _change_outputs(self, outputs: list[GuardedOutput]) -> list[str]:
-        removed = [output for output in self._outputs if output not in outputs]
-        new = [output for output in outputs if output not in self._outputs]
-        self._outputs = outputs
+        removed = [output for output in self.outputs if output not in outputs]
+        new = [output for output in outputs if output not in self.outputs]
+        self.outputs = outputs
         for output in new:
             self._serve_queries(output)
         for source in self._sources.values():
@@ -193,16 +185,13 @@ class Gateway:
         await _close_all(removed)  # first, because a new output may use the same address
         for output in new:
             output.start()
-            self._publish_known_parameters(output)
+            for name, source in self._sources.items():
+                parameters = source.known_parameters
+                if parameters.version:
+                    output.publish_parameters(name, parameters)
+                else:
+                    source.fan_out.begin(parameters)
         return _changes("output", [output.name for output in removed], [output.name for output in new])
-
-    def _publish_known_parameters(self, output: GuardedOutput) -> None:
-        for name, source in self._sources.items():
-            parameters = source.known_parameters
-            if parameters.version:
-                output.publish_parameters(name, parameters)
-            else:
-                source.fan_out.begin(parameters)
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}
@@ -247,35 +236,10 @@ class Gateway:
         """Build a source, anew if there is or was one of this name."""
         history = self._histories.get(settings.name)
         if history is None:
-            history = self._histories[settings.name] = SourceHistory(settings, self._outputs)
+            history = self._histories[settings.name] = SourceHistory(settings, self.outputs)
         elif settings.name not in self._sources:
-            history.fan_out.set_outputs(self._outputs)
-        self._sources[settings.name] = Source(
-            settings,
-            history,
-            self._spool,
-            self._publish_parameters,
-            self._announce_file,
-            self._follow_recording,
-        )
-
-    async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish on every output; wait until they have sent it, but at most _SENDING_TIMEOUT_S."""
-        sent = [output.publish_parameters(source, parameters) for output in self._outputs]
-        pending = [future for future in sent if future is not None]
-        if pending:
-            await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
-
-    def _announce_file(self, source: str, file: ServerFile) -> None:
-        for output in self._outputs:
-            output.announce_file(source, file)
-
-    async def _follow_recording(self, source: str, start: bool, name: str) -> dict[str, Any]:
-        """Let the outputs follow a recording; return what they add to the reply to the peer."""
-        reply: dict[str, Any] = {}
-        for output in self._outputs:
-            reply |= await output.follow_recording(source, start=start, name=name)
-        return reply
+            history.fan_out.set_outputs(self.outputs)
+        self._sources[settings.name] = Source(settings, history, self._spool)
 
 
 async def _run_to_defect(source: Source) -> BaseException:
@@ -295,16 +259,16 @@ async def _run_to_defect(source: Source) -> BaseException:
 
 
 async def _close_all(outputs: Sequence[GuardedOutput]) -> None:
-    closing = (asyncio.create_task(_close(output), name=f"output {output.name}") for output in outputs)
-    await asyncio.gather(*closing)
+    async def close(output: GuardedOutput) -> None:
+        await output.stop_queries()
+        try:
+            await WorkerThread(f"close {output.name}").run(output.close)
+        except RuntimeError:  # there is no room for another thread
+            output.close()
 
-
-async def _close(output: GuardedOutput) -> None:
-    await output.stop_queries()
-    try:
-        await WorkerThread(f"close {output.name}").run(output.close)
-    except RuntimeError:  # there is no room for another thread
-        output.close()
+    await asyncio.gather(
+        *(asyncio.create_task(close(output), name=f"output {output.name}") for output in outputs)
+    )
 
 
 def _changes(what: str, removed: Collection[str], new: Collection[str]) -> list[str]:

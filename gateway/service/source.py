@@ -3,9 +3,8 @@
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Awaitable, Mapping, Sequence
+from typing import Any, Final
 
 import rtc3d
 
@@ -34,6 +33,8 @@ from gateway.stream.status import SessionNumbers, SourceWarnings, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
 
+_SENDING_TIMEOUT_S: Final = 0.5
+
 logger = logging.getLogger(__name__)
 
 
@@ -55,22 +56,9 @@ class SourceHistory:
 
 
 class Source:
-    """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries.
+    """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries."""
 
-    ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
-    they change, and returns when they have been sent; ``announce_file`` with the name and every C3D file
-    that was stored.
-    """
-
-    def __init__(
-        self,
-        settings: SourceSettings,
-        history: SourceHistory,
-        spool: Spool,
-        publish_parameters: Callable[[str, ServerParameters], Awaitable[None]],
-        announce_file: Callable[[str, ServerFile], None],
-        follow_recording: Callable[[str, bool, str], Awaitable[Mapping[str, Any]]],
-    ) -> None:
+    def __init__(self, settings: SourceSettings, history: SourceHistory, spool: Spool) -> None:
         # The names and units of the former server do not apply to another one, not even until its handshake.
         former = history.settings
         self._has_new_server = (former.host, former.port) != (settings.host, settings.port)
@@ -79,12 +67,21 @@ class Source:
         history.settings = settings
         self.history = history
         self._warnings = SourceWarnings(settings.name)
-        self._publish_parameters = publish_parameters
-        self._announce_file = announce_file
-        self._follow_recording = follow_recording
         self.spool = spool
         self.fan_out = history.fan_out
-        self.queries = self._new_queries()
+        self.queries = SourceQueries(
+            settings,
+            lambda: [
+                StreamAccess(stream.settings.components, stream.status, stream.session)
+                for stream in self.streams
+            ],
+            newest_message=self.fan_out.newest,
+            status_message=lambda: self._newest_status,
+            last_c3d=self._last_c3d,
+            recording=RecordingAccess(self._record, self._follow_recording),
+            announce_parameters=self._announce_parameters,
+            history=history.queries,
+        )
         parameters = self.queries.parameters
         self._refresh = ParameterRefresh(settings, parameters.refresh, lambda: parameters.last_read_s)
         self.fan_out.on_items_changed = self._refresh.request
@@ -97,21 +94,6 @@ class Source:
         )
         self._failure: asyncio.Future[None] | None = None  # ends ``run``
         self._newest_status: bytes = encode_within_limits(self._status_message())
-
-    def _new_queries(self) -> SourceQueries:
-        return SourceQueries(
-            self.settings,
-            lambda: [
-                StreamAccess(stream.settings.components, stream.status, stream.session)
-                for stream in self.streams
-            ],
-            newest_message=self.fan_out.newest,
-            status_message=lambda: self._newest_status,
-            last_c3d=self._last_c3d,
-            recording=RecordingAccess(self._record, partial(self._follow_recording, self.settings.name)),
-            announce_parameters=self._announce_parameters,
-            history=self.history.queries,
-        )
 
     @property
     def settings(self) -> SourceSettings:
@@ -152,10 +134,10 @@ class Source:
         elif self._has_new_frame and self.known_parameters.version:
             await self.queries.parameters.begin_version()
         elif self._has_new_components and self.known_parameters.version:
-            await self._publish_parameters(self.name, self.known_parameters)
+            await self._publish_parameters()
         try:
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(_wait_for(self._failure))
+                tasks.create_task(asyncio.wait_for(self._failure, None))
                 tasks.create_task(self._refresh.run())
                 await self._streams.run()
                 raise RuntimeError("the streams have ended, and nobody stopped them")
@@ -220,7 +202,8 @@ class Source:
 
     def _publish_clock(self) -> None:
         # One server has one clock: publish the best estimate of all streams.
-        best = min(self.statuses, key=_uncertainty_us)
+        clocks = [(each.clock.uncertainty_us if each.clock.has_clock else math.inf) for each in self.statuses]
+        best = self.statuses[clocks.index(min(clocks))]
         clock = clock_message(self.queries.session, self.history.sequence, best)
         self.fan_out.publish_clock(encode_within_limits(clock))
 
@@ -249,10 +232,7 @@ class Source:
             known_defects=self.history.defects,
             warnings=self._warnings,
         )
-        return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
-
-    def _callbacks(self, status: StreamStatus) -> Callbacks:
-        return Callbacks(
+        callbacks = Callbacks(
             publish=self.fan_out.publish,
             skip=self.fan_out.skip,
             read_parameters=self._read_parameters,
@@ -260,6 +240,7 @@ class Source:
             files=self._files.receiver(lambda error: status.file_lost(str(error))),
             has_subscribers=self.fan_out.has_subscribers,
         )
+        return Supervisor(self.settings, stream, status, callbacks, listener)
 
     def _on_state(self, status: StreamStatus, former: StreamState) -> None:
         is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
@@ -294,10 +275,18 @@ class Source:
     def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:
         return self.queries.parameters.read_for_handshake(connection)
 
+    async def _publish_parameters(self) -> None:
+        """Publish them on every output; wait until they have been sent, but at most _SENDING_TIMEOUT_S."""
+        parameters = self.known_parameters
+        sent = [output.publish_parameters(self.name, parameters) for output, _ in self.fan_out.outputs]
+        pending = [future for future in sent if future is not None]
+        if pending:
+            await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
+
     async def _announce_parameters(self, answer: ServerAnswer | None, version: int) -> None:
         """Publish parameters, empty ones if the former are void; then mark the frames with their version."""
         try:
-            await self._publish_parameters(self.name, self.known_parameters)
+            await self._publish_parameters()
         finally:
             if version != self.history.parameters_version:
                 self.history.parameters_version = version
@@ -311,23 +300,21 @@ class Source:
     # C3D files and recordings.
 
     def _on_stored(self, stored: StoredFile) -> None:
-        try:
-            self._report_stored(stored)
-        except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
-            self.history.defects.log(defect)
-
-    def _report_stored(self, stored: StoredFile) -> None:
         """Log and announce a file. It is there, even if old ones could not be deleted."""
-        deleted = f"; deleted the oldest ({len(stored.deleted)})"
+        deleted = f"; deleted the oldest ({len(stored.deleted)})" if stored.deleted else ""
         logger.info(
             "%s: the server sent a C3D file of %d bytes, kept as %s%s",
-            *(self.name, stored.num_bytes, stored.path, deleted if stored.deleted else ""),
+            *(self.name, stored.num_bytes, stored.path, deleted),
         )
         if stored.problem:
             self._spool_problems.failed(f"old C3D files are not deleted: {stored.problem}")
         else:
             self._spool_problems.recovered("old C3D files can be deleted again")
-        self._announce_file(self.name, ServerFile(stored.path, stored.num_bytes))
+        for output, _ in self.fan_out.outputs:
+            try:
+                output.announce_file(self.name, ServerFile(stored.path, stored.num_bytes))
+            except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
+                self.history.defects.log(defect)
 
     async def _last_c3d(self) -> Answer:
         spool, timeout_s = self.spool, self.settings.query_timeout_s
@@ -359,10 +346,9 @@ class Source:
                 return True
         return False
 
-
-async def _wait_for(failure: "asyncio.Future[None]") -> None:
-    await failure
-
-
-def _uncertainty_us(status: StreamStatus) -> float:
-    return status.clock.uncertainty_us if status.clock.has_clock else math.inf
+    async def _follow_recording(self, start: bool, name: str) -> Mapping[str, Any]:
+        """Let the outputs follow a recording; return what they add to the reply to the peer."""
+        reply: dict[str, Any] = {}
+        for output, _ in self.fan_out.outputs:
+            reply |= await output.follow_recording(self.name, start=start, name=name)
+        return reply

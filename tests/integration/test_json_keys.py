@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.display.live.live_data import LiveData
+from gateway.display.live import LiveData
 from gateway.takes.files.event_log import EventLogReader
 from tests.support.commands import run_command
 from tests.support.configurations import write_config

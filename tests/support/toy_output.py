@@ -1,10 +1,11 @@
 """An output that tests steer: who subscribes, and what goes wrong."""
 
+import asyncio
 from typing import Any
 
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Output, OutputHealth
+from gateway.outputs.contract import Output, OutputHealth, ServerFile, ServerParameters
 
 
 class ToyOutput(Output):
@@ -23,6 +24,10 @@ class ToyOutput(Output):
         self.closed_topics: list[Topic] = []
         self.messages: list[tuple[Topic, bytes]] = []
         self.announced: list[str] = []
+        self.parameters: list[tuple[str, ServerParameters]] = []
+        self.sending: asyncio.Future[None] | None = None
+        """Done when parameters have been sent."""
+        self.files: list[tuple[str, ServerFile]] = []
 
     def start(self) -> None: ...
 
@@ -39,6 +44,13 @@ class ToyOutput(Output):
     def show_streaming(self, source: str, is_streaming: bool) -> None:
         assert source in self.announced
         self.streaming.append(is_streaming)
+
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
+        self.parameters.append((source, parameters))
+        return self.sending
+
+    def announce_file(self, source: str, file: ServerFile) -> None:
+        self.files.append((source, file))
 
     def health(self) -> OutputHealth:
         return OutputHealth(True)

@@ -10,16 +10,16 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from gateway.display.view.panel import Panel
-from gateway.display.view.server import ViewServer, open_server
-from gateway.display.view.viewer import PERIOD_S
+from gateway.display.view.viewer import PERIOD_S, ViewServer
 from gateway.rtc3d.components import ComponentType
 from tests.support.browser import NewPage, chromium, new_page
 from tests.support.statuses import stream
 from tests.unit.display.live_lab import Lab
+from tests.unit.display.view.conftest import server
 
 pytestmark = pytest.mark.chromium
 
-__all__ = ["chromium", "new_page"]
+__all__ = ["chromium", "new_page", "server"]
 
 HOSTILE: Final = ("<img src=x onerror=alert(1)>", "[x](http://192.0.2.1)")
 SPIKE: Final = 500.0
@@ -75,13 +75,6 @@ class Shown:
                 self.lab.send_status(stream())
             self.lab.send_markers(True, number % 2 == 0)
             self.lab.send(ComponentType.ANALOG, [0.5, self.value])
-
-
-@pytest.fixture
-def server() -> Iterator[ViewServer]:
-    server = open_server("127.0.0.1", 0)
-    yield server
-    server.stop()
 
 
 @pytest.fixture

@@ -1,18 +1,17 @@
 """``top``: pages on a terminal that keys change, all tables once, or a line of JSON every second."""
 
-import contextlib
 import select
 import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, TextIO
 
 from rich.cells import cell_len
 
 from gateway.client.transport import GatewaySubscriber, silence_text
-from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.live import LiveData, LiveSource
 from gateway.display.terminal import Keyboard, Line, Screen, Style, encoded, is_in_front, line_text
 from gateway.display.top.facts import source_facts
 from gateway.display.top.pages import PAGES
@@ -25,17 +24,12 @@ from gateway.outputs.discovery import DISCOVERY_S, missing_source
 
 _MAX_FILTER: Final = 60
 _MAX_NOTICE_LINES: Final = 3
-_KEYS: Final = (
-    ("q", "quit"),
-    ("1-8 ←→", "page"),
-    ("↑↓", "scroll"),
-    ("s", "sort"),
-    ("r", "reverse"),
-    ("/", "filter"),
-)
+_KEYS: Final = {"q": "quit", "1-8 ←→": "page", "↑↓": "scroll", "s": "sort", "r": "reverse", "/": "filter"}
 
 _PAGE_STEPS: Final = {"tab": 1, "right": 1, "l": 1, "shift-tab": -1, "left": -1, "h": -1}
 _PAGES_BY_KEY: Final = {str(number): number - 1 for number in range(1, len(PAGES) + 1)}
+_FAR: Final = 1 << 30
+"""More lines than any page has."""
 
 
 class Display:
@@ -59,11 +53,15 @@ class Display:
         if self._is_typing:
             self._type(key)
             return
-        page = _PAGE_STEPS.get(key)
-        if page is not None:
-            self._page = (self._page + page) % len(PAGES)
+        page = max(self._num_rows - 1, 1)
+        steps = {"up": -1, "k": -1, "down": 1, "j": 1, "page-up": -page, "page-down": page, "space": page}
+        steps |= {"home": -_FAR, "g": -_FAR, "end": _FAR, "G": _FAR}
+        if key in _PAGE_STEPS:
+            self._page = (self._page + _PAGE_STEPS[key]) % len(PAGES)
         elif key in _PAGES_BY_KEY:
             self._page = _PAGES_BY_KEY[key]
+        elif key in steps:
+            self._offsets[self._page] = max(self._offsets[self._page] + steps[key], 0)
         elif key in {"s", "r"}:
             self._sort(is_reverse=key == "r")
         elif key == "/":
@@ -72,8 +70,6 @@ class Display:
             self._filter = ""
         elif key in {"q", "Q"}:
             self.is_over = True
-        else:
-            self._scroll(key)
 
     def _type(self, key: str) -> None:
         match key:
@@ -90,19 +86,6 @@ class Display:
                 if len(text) == 1:
                     self._filter = (self._filter + text)[:_MAX_FILTER]
         self._offsets[self._page] = 0
-
-    def _scroll(self, key: str) -> None:
-        page = max(self._num_rows - 1, 1)
-        steps = {"up": -1, "k": -1, "down": 1, "j": 1, "page-up": -page, "page-down": page, "space": page}
-        offset = self._offsets[self._page]
-        match key:
-            case "home" | "g":
-                offset = 0
-            case "end" | "G":
-                offset = 1 << 30
-            case _:
-                offset += steps.get(key, 0)
-        self._offsets[self._page] = max(offset, 0)
 
     @property
     def _order(self) -> Order | None:
@@ -125,7 +108,12 @@ class Display:
         self._shown = PAGES[self._page].table(sources)
         order = self._order
         table = laid_out(sorted_by(filtered(self._shown, self._filter), order), width, order)
-        above: list[Line] = [self._title_line(len(sources), width), self._tabs(width)]
+        clock = time.strftime("%H:%M:%S")
+        left = f"{self._title}  {len(sources)} source{'' if len(sources) == 1 else 's'}"
+        if len(long := f"rtc3d-gateway top  {left}") + len(clock) + 2 <= width:
+            left = long
+        title: Line = [(left.ljust(width - len(clock)), Style.STRONG), (clock, Style.FAINT)]
+        above: list[Line] = [title, self._tabs(width)]
         shown_notices = [line for text in notices for line in wrapped(safe_text(text), width)]
         above += [[(line, Style.BAD)] for line in shown_notices[:_MAX_NOTICE_LINES]]
         above.append(table.titles)
@@ -137,14 +125,6 @@ class Display:
         footer = self._footer(offset, len(table.body), width)
         return [*[*above, *body][: max(height - 1, 0)], footer]
 
-    def _title_line(self, num_sources: int, width: int) -> Line:
-        count = f"{num_sources} source{'' if num_sources == 1 else 's'}"
-        clock = time.strftime("%H:%M:%S")
-        left = f"rtc3d-gateway top  {self._title}  {count}"
-        if len(left) + len(clock) + 2 > width:
-            left = f"{self._title}  {count}"
-        return [(left.ljust(width - len(clock)), Style.STRONG), (clock, Style.FAINT)]
-
     def _tabs(self, width: int) -> Line:
         """Return the names of the pages; if they do not fit, the numbers of those that are not shown."""
         names = [f" {number} {page.name} " for number, page in enumerate(PAGES, start=1)]
@@ -152,21 +132,18 @@ class Display:
             names = [name.rstrip() for name in names]
         if sum(map(len, names)) > width:
             names = [name if number == self._page else f" {number + 1} " for number, name in enumerate(names)]
-        return [
-            (name, Style.MARKED if number == self._page else Style.PLAIN) for number, name in enumerate(names)
-        ]
+        tabs = [(name, Style.PLAIN) for name in names]
+        tabs[self._page] = (names[self._page], Style.MARKED)
+        return tabs
 
     def _footer(self, offset: int, num_lines: int, width: int) -> Line:
         if self._is_typing:
             return [("filter: ", Style.STRONG), (self._filter, Style.PLAIN), (" ", Style.MARKED)]
         parts: list[tuple[str, Style]] = []
         if self._filter:
-            parts += [
-                (f"filter: {self._filter}  ", Style.WARNING),
-                ("Esc ", Style.STRONG),
-                ("clear  ", Style.FAINT),
-            ]
-        for key, meaning in _KEYS if self._has_keys else ():
+            parts.append((f"filter: {self._filter}  ", Style.WARNING))
+            parts += [("Esc ", Style.STRONG), ("clear  ", Style.FAINT)]
+        for key, meaning in (_KEYS if self._has_keys else {}).items():
             parts += [(f"{key} ", Style.STRONG), (f"{meaning}  ", Style.FAINT)]
         if num_lines <= self._num_rows:
             return _cut(parts, width)
@@ -211,8 +188,6 @@ class App:
         self._keyboard = keyboard
         self._notices = notices
         self._display = Display(title, has_keys=keyboard is not None)
-        self._sources: Sequence[LiveSource] = ()
-        self._is_suspending = False
         self._silence = ""
         self._next_ask_s = time.monotonic() + DISCOVERY_S
         self._asking: threading.Thread | None = None
@@ -221,29 +196,42 @@ class App:
         """Show the pages until q, or until a signal raises an exception; the terminal is restored."""
         next_draw_s = 0.0
         size = self._screen.size
-        with _suspending(self._suspend):
-            try:
-                while not self._display.is_over:
-                    has_changed = self._read_keys()
-                    if self._is_suspending:
-                        self._stop_process()
-                        has_changed = True
-                    self._subscriber.tick()
-                    self._sources = self._live.update()
-                    self._check_silence()
-                    has_changed |= size != self._screen.size
-                    start_s = time.monotonic()
-                    if has_changed or start_s >= next_draw_s:
-                        size = self._screen.size
-                        self._draw()
-                        end_s = time.monotonic()
-                        next_draw_s = start_s + max(_DRAW_S, _DRAW_SHARE * (end_s - start_s))
-            finally:
-                self._give_back()
+        is_suspending = False
+
+        def suspend(*_: object) -> None:  # at Ctrl-Z
+            nonlocal is_suspending
+            is_suspending = True
+
+        former: Any = signal.signal(signal.SIGTSTP, suspend)
+        try:
+            while not self._display.is_over:
+                self._take()
+                has_changed = self._read_keys()
+                if is_suspending:
+                    is_suspending = False
+                    self._give_back()
+                    signal.raise_signal(signal.SIGSTOP)  # returns when the process continues
+                    has_changed = True
+                self._subscriber.tick()
+                sources = self._live.update()
+                self._check_silence()
+                has_changed |= size != self._screen.size
+                start_s = time.monotonic()
+                if self._screen.is_open and (has_changed or start_s >= next_draw_s):
+                    size = self._screen.size
+                    notices = [self._silence] if self._silence else []
+                    if self._live.defect is not None:
+                        notices.append(f"a defect in this program: {self._live.defect!r}")
+                    notices += [*self._notices][-1:]
+                    self._screen.draw(self._display.lines(sources, notices, *size))
+                    end_s = time.monotonic()
+                    next_draw_s = start_s + max(_DRAW_S, _DRAW_SHARE * (end_s - start_s))
+        finally:
+            self._give_back()
+            signal.signal(signal.SIGTSTP, former)
 
     def _read_keys(self) -> bool:
         """Wait for a key, but not longer than until the next update; return whether there was one."""
-        self._take()
         keyboard = self._keyboard
         if keyboard is None or not keyboard.is_taken:
             time.sleep(_UPDATE_S)
@@ -271,46 +259,18 @@ class App:
         if self._keyboard is not None:
             self._keyboard.give_back()
 
-    def _suspend(self) -> None:
-        self._is_suspending = True
-
-    def _stop_process(self) -> None:
-        """Stop the process, as Ctrl-Z does, with the terminal as it was; return when it continues."""
-        self._is_suspending = False
-        self._give_back()
-        signal.raise_signal(signal.SIGSTOP)
-
     def _check_silence(self) -> None:
         """If nothing is heard, find out why, in another thread: it may take a second."""
         if self._live.first_heard_s is not None:
             self._silence = ""
         elif time.monotonic() >= self._next_ask_s and not (self._asking and self._asking.is_alive()):
             self._next_ask_s = time.monotonic() + _ASK_AGAIN_S
-            self._asking = threading.Thread(target=self._ask, name="top-silence", daemon=True)
+
+            def ask() -> None:
+                self._silence = silence_text(self._subscriber, self._live)
+
+            self._asking = threading.Thread(target=ask, name="top-silence", daemon=True)
             self._asking.start()
-
-    def _ask(self) -> None:
-        self._silence = silence_text(self._subscriber, self._live)
-
-    def _draw(self) -> None:
-        if not self._screen.is_open:
-            return
-        notices = [self._silence] if self._silence else []
-        if self._live.defect is not None:
-            notices.append(f"a defect in this program: {self._live.defect!r}")
-        notices += [*self._notices][-1:]
-        size = self._screen.size
-        self._screen.draw(self._display.lines(self._sources, notices, size.columns, size.lines))
-
-
-@contextlib.contextmanager
-def _suspending(suspend: Callable[[], None]) -> Iterator[None]:
-    """Call ``suspend`` at Ctrl-Z, during the block."""
-    former: Any = signal.signal(signal.SIGTSTP, lambda *_: suspend())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTSTP, former)
 
 
 _PICTURE_S: Final = 2.5
@@ -355,29 +315,20 @@ def print_tables(sources: Sequence[LiveSource], out: TextIO, width: int, *, is_c
     for page in PAGES:
         table = page.table(sources)
         lines = laid_out(sorted_by(table, table.order), width, table.order)
-        shown: list[Line] = [[(page.name, Style.MARKED)]]
-        shown += (
-            [lines.titles, *lines.body] if any(section.rows for section in table.sections) else lines.body
-        )
-        for line in [*shown, []]:
-            text = line_text(line if is_coloured else _plain(line), width, has_colours=is_coloured)
+        titles = [lines.titles] if any(section.rows for section in table.sections) else []
+        shown: list[Line] = [[(page.name, Style.MARKED)], *titles, *lines.body, []]
+        for line in shown:
+            plain = [(text, Style.PLAIN) for text, _ in line]
+            text = line_text(line if is_coloured else plain, width, has_colours=is_coloured)
             print(encoded(text.rstrip(), encoding).decode(encoding, "replace"), file=out)
     out.flush()
 
 
-def _plain(line: Line) -> Line:
-    return [(text, Style.PLAIN) for text, _ in line]
-
-
 def json_line(live: LiveData, sources: Sequence[LiveSource]) -> str:
     """Return one JSON object, in one line, with everything about the sources."""
-    facts: dict[str, Any] = {
-        "utime": now_utime(),
-        "sources": [source_facts(source) for source in sources],
-        "num_foreign": live.num_foreign,
-        "num_beyond": live.num_beyond,
-    }
-    return safe_json(json_text(facts))
+    facts = {"utime": now_utime(), "sources": [source_facts(source) for source in sources]}
+    counts = {"num_foreign": live.num_foreign, "num_beyond": live.num_beyond}
+    return safe_json(json_text(facts | counts))
 
 
 def print_json_lines(

@@ -10,8 +10,7 @@ from typing import Any, Final
 
 from gateway.client.series import POSE, Series
 from gateway.descriptions.labels import describe
-from gateway.display.live.component import LiveComponent
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveComponent, LiveSource
 from gateway.logs.safe_text import safe_text
 from gateway.messages.source_report import Level, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -108,18 +107,15 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
     announced_hz = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
-    can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
     to_gateway_p50_ms, to_gateway_p99_ms = component.latency.to_gateway or (None, None)
     to_here_p50_ms, to_here_p99_ms = component.latency.to_here or (None, None)
+    can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
     return ComponentFacts(
         kind.key,
         0.0 if component.is_stopped else component.rate_hz,
         announced_hz if announced_hz is not None and math.isfinite(announced_hz) else None,
         *_message_counts([] if series is None else [series]),
-        to_gateway_p50_ms,
-        to_gateway_p99_ms,
-        to_here_p50_ms,
-        to_here_p99_ms,
+        *(to_gateway_p50_ms, to_gateway_p99_ms, to_here_p50_ms, to_here_p99_ms),
         num_items=len(component.newest_items) if has_come else None,
         num_visible=int(component.is_visible.sum()) if can_be_seen else None,
         age_s=component.age_s,
@@ -178,10 +174,10 @@ def losses(source: LiveSource) -> list[LossFacts]:
         routes = [(f"stream {each.components}", each.losses) for each in source.report.streams]
         routes += [(f"output {each.output}", each.losses) for each in source.report.outputs]
         found = [LossFacts(where, *loss) for where, losses in routes for loss in losses]
-    checks = [(series.key, series.check) for series in source.series]
+    checks = [series.check for series in source.series]
     here = {
-        "missing in the sequence of messages": sum(check.num_lost for _, check in checks),
-        "repeated": sum(check.num_repeated for _, check in checks),
+        "missing in the sequence of messages": sum(check.num_lost for check in checks),
+        "repeated": sum(check.num_repeated for check in checks),
         "not decoded: too many waited": source.num_skipped,
         "malformed": sum(each.num_malformed for each in [*source.components.values()]),
         "unreadable parameters or status": source.num_unreadable,
@@ -198,22 +194,9 @@ def events(source: LiveSource) -> list[EventFacts]:
 
 
 _STREAM_FIELDS: Final = (
-    "components",
-    "state",
-    "problem",
-    "session",
-    "byte_order",
-    "rate",
-    "frame_rate_hz",
-    "lag_ms",
-    "num_reconnects",
-    "num_restarts",
-    "has_clock",
-    "clock_drift_ppm",
-    "clock_uncertainty_us",
-    "limitations",
-    "last_error",
-    "last_error_utime",
+    *("components", "state", "problem", "session", "byte_order", "rate", "frame_rate_hz", "lag_ms"),
+    *("num_reconnects", "num_restarts", "has_clock", "clock_drift_ppm", "clock_uncertainty_us"),
+    *("limitations", "last_error", "last_error_utime"),
 )
 _LEVELS: Final = {Level.GOOD: "ok", Level.WAITING: "warning", Level.BAD: "error"}
 _OUTPUT_FIELDS: Final = ("output", "is_connected", "problem", "messages", "queries")

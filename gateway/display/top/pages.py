@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Final, NamedTuple
 
-from gateway.display.live.component import SLOW_SHARE, visible_percent
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import SLOW_SHARE, LiveSource, visible_percent
 from gateway.display.terminal import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
@@ -48,32 +48,38 @@ def overview(sources: Sequence[LiveSource]) -> Table:
         Column("age s", is_number=True, rank=4),
         Column("note"),
     )
-    return Table(columns, [_overview_of(source) for source in sources], "no source so far")
-
-
-def _overview_of(source: LiveSource) -> Section:
-    state = facts.state(source)
-    heading = [(f"{_name(source)}: {state.text}", _LEVEL_STYLES[state.level])]
-    if facts.has_two_gateways(source):
-        heading.append((TWO_GATEWAYS, Style.BAD))
-    heading += [(text, Style.BAD) for text in _output_problems(source)]
-    return Section([_component_row(each) for each in facts.components(source)], heading)
+    sections = []
+    for source in sources:
+        state = facts.state(source)
+        heading = [(f"{_name(source)}: {state.text}", _LEVEL_STYLES[state.level])]
+        if facts.has_two_gateways(source):
+            heading.append((TWO_GATEWAYS, Style.BAD))
+        rows = [_component_row(each) for each in facts.components(source)]
+        sections.append(Section(rows, heading + _output_problems(source)))
+    return Table(columns, sections, "no source so far")
 
 
 def _component_row(component: facts.ComponentFacts) -> Row:
-    note, style = _component_note(component)
-    is_slow = (
-        component.rate_hz is not None
-        and component.announced_rate_hz is not None
-        and component.num_messages > 0
-        and component.rate_hz < SLOW_SHARE * component.announced_rate_hz
-    )
+    note, style = "", Style.PLAIN
+    if component.is_stopped:
+        note, style = "stopped", Style.BAD
+    elif component.has_two_gateways:
+        note, style = "two gateways", Style.BAD
+    elif component.num_malformed:
+        note, style = f"{component.num_malformed} malformed", Style.WARNING
+    elif component.num_skipped:
+        note, style = f"{component.num_skipped} not decoded here", Style.WARNING
+    elif not component.num_messages:
+        note, style = "none so far", Style.FAINT
+    rate_hz, announced_hz = component.rate_hz, component.announced_rate_hz
+    has_rates = rate_hz is not None and announced_hz is not None and component.num_messages > 0
+    is_slow = has_rates and (rate_hz or 0.0) < SLOW_SHARE * (announced_hz or 0.0)
     is_missing = component.num_visible is not None and component.num_visible < (component.num_items or 0)
     lost_style = Style.BAD if component.num_lost else Style.PLAIN
     return (
         text_cell(component.component),
-        number_cell(component.rate_hz, 1, style if style is Style.BAD else _warning_if(is_slow)),
-        number_cell(component.announced_rate_hz, 1),
+        number_cell(rate_hz, 1, style if style is Style.BAD else _warning_if(is_slow)),
+        number_cell(announced_hz, 1),
         number_cell(component.num_lost, 0, lost_style),
         number_cell(component.num_gaps, 0, lost_style),
         number_cell(component.num_restarts, 0, _warning_if(component.num_restarts > 0)),
@@ -86,37 +92,14 @@ def _component_row(component: facts.ComponentFacts) -> Row:
     )
 
 
-def _component_note(component: facts.ComponentFacts) -> tuple[str, Style]:
-    if component.is_stopped:
-        return "stopped", Style.BAD
-    if component.has_two_gateways:
-        return "two gateways", Style.BAD
-    if component.num_malformed:
-        return f"{component.num_malformed} malformed", Style.WARNING
-    if component.num_skipped:
-        return f"{component.num_skipped} not decoded here", Style.WARNING
-    if not component.num_messages:
-        return "none so far", Style.FAINT
-    return "", Style.PLAIN
-
-
 def _latency_cell(p50_ms: float | None, p99_ms: float | None) -> Cell:
     if p50_ms is None or p99_ms is None:
         return Cell("")
     return Cell(f"{number_cell(p50_ms, 1).text}/{number_cell(p99_ms, 1).text}", Style.PLAIN, p99_ms)
 
 
-def markers(sources: Sequence[LiveSource]) -> Table:
-    """How often each marker was visible, and where it is."""
-    return _items(sources, ComponentType.MARKERS, "marker")
-
-
-def tools(sources: Sequence[LiveSource]) -> Table:
-    """How often each tool was visible, its error, and where it is."""
-    return _items(sources, ComponentType.TOOLS, "tool")
-
-
-def _items(sources: Sequence[LiveSource], kind: ComponentType, noun: str) -> Table:
+def items(sources: Sequence[LiveSource], kind: ComponentType, noun: str) -> Table:
+    """How often each marker or tool was visible, the error of tools, and where they are."""
     has_error = kind is ComponentType.TOOLS
     columns = (
         Column(noun),
@@ -165,41 +148,38 @@ def server(sources: Sequence[LiveSource]) -> Table:
         Column("drift ppm", is_number=True, rank=2),
         Column("uncertainty µs", is_number=True, rank=2),
     )
-    return Table(columns, [_server_of(source) for source in sources], "no source so far")
-
-
-def _server_of(source: LiveSource) -> Section:
-    report = source.report
-    where = "" if report is None else f" from {report.server} by {report.host} (version {report.version})"
-    state = facts.state(source)
-    rows, notes = [], []
-    for stream in report.streams if report else ():
-        drift_ppm = stream.clock_drift_ppm if stream.has_clock else None
-        uncertainty_us = stream.clock_uncertainty_us if stream.has_clock else None
-        rows.append(
-            (
-                text_cell(stream.components),
-                text_cell(stream.state, Style.GOOD if stream.state == "streaming" else Style.WARNING),
-                number_cell(stream.frame_rate_hz, 1),
-                number_cell(stream.session),
-                number_cell(stream.num_reconnects),
-                number_cell(stream.num_restarts),
-                text_cell(stream.byte_order),
-                text_cell(stream.rate),
-                number_cell(stream.lag_ms, 1),
-                number_cell(drift_ppm, 2),
-                number_cell(uncertainty_us, 1),
+    sections = []
+    for source in sources:
+        report = source.report
+        where = f" from {report.server} by {report.host} (version {report.version})" if report else ""
+        rows, notes = [], []
+        for stream in report.streams if report else ():
+            rows.append(
+                (
+                    text_cell(stream.components),
+                    text_cell(stream.state, Style.GOOD if stream.state == "streaming" else Style.WARNING),
+                    number_cell(stream.frame_rate_hz, 1),
+                    number_cell(stream.session),
+                    number_cell(stream.num_reconnects),
+                    number_cell(stream.num_restarts),
+                    text_cell(stream.byte_order),
+                    text_cell(stream.rate),
+                    number_cell(stream.lag_ms, 1),
+                    number_cell(stream.clock_drift_ppm if stream.has_clock else None, 2),
+                    number_cell(stream.clock_uncertainty_us if stream.has_clock else None, 1),
+                )
             )
-        )
-        problem = [f"{stream.components}: {stream.problem}"] if stream.problem else []
-        limitations = [f"{stream.components}: {text}" for text in stream.limitations]
-        notes += [(text, Style.BAD) for text in problem] + [(text, Style.WARNING) for text in limitations]
-        if stream.last_error:
-            time_text = event_time(stream.last_error_utime)
-            notes.append((f"{stream.components}: last error, {time_text}: {stream.last_error}", Style.FAINT))
-        if not stream.has_clock and stream.state == "streaming":
-            notes.append((f"{stream.components}: its time stamps are no clock", Style.WARNING))
-    return Section(rows, [(f"{_name(source)}{where}", _LEVEL_STYLES[state.level])], notes)
+            found = [(stream.problem, Style.BAD)] if stream.problem else []
+            found += [(text, Style.WARNING) for text in stream.limitations]
+            if stream.last_error:
+                error = f"last error, {event_time(stream.last_error_utime)}: {stream.last_error}"
+                found.append((error, Style.FAINT))
+            if not stream.has_clock and stream.state == "streaming":
+                found.append(("its time stamps are no clock", Style.WARNING))
+            notes += [(f"{stream.components}: {text}", style) for text, style in found]
+        style = _LEVEL_STYLES[facts.state(source).level]
+        sections.append(Section(rows, [(f"{_name(source)}{where}", style)], notes))
+    return Table(columns, sections, "no source so far")
 
 
 def drops(sources: Sequence[LiveSource]) -> Table:
@@ -237,31 +217,24 @@ def outputs(sources: Sequence[LiveSource]) -> Table:
     rows, notes = [], []
     for source in sources:
         for output in _outputs(source):
+            state = "connected" if output.is_connected else "not connected"
             is_fine = output.is_connected and not output.problem
             rows.append(
                 (
                     text_cell(_name(source)),
                     text_cell(output.output),
-                    text_cell(
-                        "connected" if output.is_connected else "not connected",
-                        Style.GOOD if is_fine else Style.BAD,
-                    ),
+                    text_cell(state, Style.GOOD if is_fine else Style.BAD),
                     number_cell(sum(output.messages.values())),
                     text_cell(", ".join(f"{name} {count}" for name, count in output.messages.items())),
                 )
             )
-        notes += [(text, Style.BAD) for text in _output_problems(source)]
+        notes += _output_problems(source)
     return Table(columns, [Section(rows, (), notes)], "no output so far")
 
 
 def questions(sources: Sequence[LiveSource]) -> Table:
     """How many queries of peers the gateways have answered, by result."""
-    columns = (
-        Column("source"),
-        Column("output"),
-        Column("result"),
-        Column("queries", is_number=True),
-    )
+    columns = (Column("source"), Column("output"), Column("result"), Column("queries", is_number=True))
     rows = [
         (
             text_cell(_name(source)),
@@ -295,8 +268,8 @@ def events(sources: Sequence[LiveSource]) -> Table:
 
 PAGES: Final = (
     Page("overview", overview),
-    Page("markers", markers),
-    Page("tools", tools),
+    Page("markers", partial(items, kind=ComponentType.MARKERS, noun="marker")),
+    Page("tools", partial(items, kind=ComponentType.TOOLS, noun="tool")),
     Page("server", server),
     Page("drops", drops),
     Page("outputs", outputs),
@@ -315,8 +288,9 @@ def event_time(utime: int) -> str:
     return local.strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
 
 
-def _output_problems(source: LiveSource) -> list[str]:
-    return [f"{_name(source)} to {each.output}: {each.problem}" for each in _outputs(source) if each.problem]
+def _output_problems(source: LiveSource) -> list[tuple[str, Style]]:
+    problems = ((each.output, each.problem) for each in _outputs(source) if each.problem)
+    return [(f"{_name(source)} to {output}: {problem}", Style.BAD) for output, problem in problems]
 
 
 def _outputs(source: LiveSource) -> Sequence[OutputReport]:

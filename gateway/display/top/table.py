@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -105,11 +105,10 @@ def filtered(table: Table, wanted: str) -> Table:
 
 def sorted_by(table: Table, order: Order | None) -> Table:
     """Return the table with the rows of each section sorted; None means as they are."""
-    index = next(
-        (number for number, column in enumerate(table.columns) if order and column.title == order.title), None
-    )
-    if order is None or index is None:
+    titles = [column.title for column in table.columns]
+    if order is None or order.title not in titles:
         return table
+    index = titles.index(order.title)
     sections = []
     for section in table.sections:
         known = [row for row in section.rows if row[index].value is not None]
@@ -130,8 +129,13 @@ def _sort_key(value: float | str | None) -> tuple[float | str, ...]:
 
 def laid_out(table: Table, width: int, order: Order | None = None) -> LaidOut:
     """Return the lines of a table in ``width`` columns; ``order`` is marked at its title."""
-    titles = [_title(column, order) for column in table.columns]
-    widths = _widths(table, titles)
+    titles = [column.title for column in table.columns]
+    if order is not None and order.title in titles:
+        titles[titles.index(order.title)] += "↓" if order.is_reversed else "↑"
+    widths = [max(cell_len(title), column.width) for title, column in zip(titles, table.columns, strict=True)]
+    for section in table.sections:
+        for row in section.rows:
+            widths = [max(each, _num_cells(cell.text)) for each, cell in zip(widths, row, strict=True)]
     _fit(table.columns, widths, width)
     body: list[Line] = []
     for section in table.sections:
@@ -162,22 +166,6 @@ def wrapped(text: str, width: int) -> list[str]:
         *full, line = chop_cells(word, width) or [""]
         lines += full
     return [*lines, line] if line else lines
-
-
-def _title(column: Column, order: Order | None) -> str:
-    if order is None or order.title != column.title:
-        return column.title
-    return f"{column.title}{'↓' if order.is_reversed else '↑'}"
-
-
-def _widths(table: Table, titles: Iterable[str]) -> list[int]:
-    widths = [max(cell_len(title), column.width) for title, column in zip(titles, table.columns, strict=True)]
-    for section in table.sections:
-        for row in section.rows:
-            for number, cell in enumerate(row):
-                num_cells = len(cell.text) if cell.text.isascii() else cell_len(cell.text)
-                widths[number] = max(widths[number], num_cells)
-    return widths
 
 
 def _fit(columns: Sequence[Column], widths: list[int], width: int) -> None:
@@ -214,13 +202,12 @@ def _row_line(row: Sequence[Cell], columns: Sequence[Column], widths: Sequence[i
             continue
         if parts:
             parts.append((" " * _GAP, Style.PLAIN))
-        parts.append((_padded(cell.text, width, is_number=column.is_number), cell.style))
+        spaces = width - _num_cells(cell.text)
+        text = cell.text if spaces >= 0 else set_cell_size(cell.text, width - 1) + "…"
+        padding = " " * max(spaces, 0)
+        parts.append((padding + text if column.is_number else text + padding, cell.style))
     return parts
 
 
-def _padded(text: str, width: int, *, is_number: bool) -> str:
-    num_cells = len(text) if text.isascii() else cell_len(text)
-    if num_cells > width:
-        return set_cell_size(text, width - 1) + "…"
-    spaces = " " * (width - num_cells)
-    return spaces + text if is_number else text + spaces
+def _num_cells(text: str) -> int:
+    return len(text) if text.isascii() else cell_len(text)  # as cell_len, but faster

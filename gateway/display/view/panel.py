@@ -1,23 +1,27 @@
 """The panel beside the picture: state, rates, latency, losses, visibility, events and plots."""
 
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
 
-import numpy as np
 import viser
 
 from gateway.descriptions.force_plates import METRES_PER_NEWTON
-from gateway.display.live.component import Percentiles
-from gateway.display.live.live_data import LiveData, LiveSource
-from gateway.display.view.laboratory import UP_AXES, UpAxis
-from gateway.display.view.markers_and_tools import SourceColor
+from gateway.display.live import LiveData, LiveSource
 from gateway.display.view.plots import Plots
-from gateway.display.view.server import set_theme
-from gateway.display.view.source_text import data_state, gateway_states, ignored_html, source_html
-from gateway.display.view.texts import clock_text, counted, events_html, html_text, items_html
-from gateway.messages.host_time import now_utime
+from gateway.display.view.scene_items import UP_AXES, Rgb, UpAxis
+from gateway.display.view.texts import (
+    clock_text,
+    counted,
+    data_state,
+    events_html,
+    gateway_states,
+    html_text,
+    ignored_html,
+    items_html,
+    source_html,
+)
 from gateway.messages.source_report import Level, State
 
 _SCRIPT: Final = """
@@ -94,46 +98,37 @@ def banner_html(
 
     ``now_s`` is the time since the Unix epoch. ``is_paused`` is for takes: nothing comes, on purpose.
     """
-    if not sources:
-        lines = f"<p class=waiting>{'The take begins.' if is_take else 'No source is heard yet.'}</p>"
-    else:
-        lines = "".join(
-            _take_line(source, is_paused=is_paused) if is_take else _live_line(source, now_s)
-            for source in sources[:MAX_SOURCES]
-        )
+    lines = [f"<p class=waiting>{'The take begins.' if is_take else 'No source is heard yet.'}</p>"]
+    if sources:
+        lines = [_banner_line(each, now_s, is_take, is_paused) for each in sources[:MAX_SOURCES]]
     if len(sources) > MAX_SOURCES:
-        lines += f"<p class=dim>and {counted(len(sources) - MAX_SOURCES, 'more source')}</p>"
-    # The second changes as long as this program runs; otherwise, the page itself says so (style.py).
-    return f"<section data-second={int(now_s)}>{lines}</section>"
+        lines.append(f"<p class=dim>and {counted(len(sources) - MAX_SOURCES, 'more source')}</p>")
+    # The second changes as long as this program runs; otherwise, the page itself says so (_SCRIPT).
+    return f"<section data-second={int(now_s)}>{''.join(lines)}</section>"
 
 
-def _live_line(source: LiveSource, now_s: float) -> str:
-    state, age_s = data_state(source), source.age_s
-    take = ""
-    if source.running_take and not source.is_silent:
-        take = f"<p><span class=bad>● recording</span> {html_text(source.running_take, _MAX_CHARACTERS)}</p>"
-    last = "" if age_s is None else f"last data {clock_text(now_s - age_s)}"
-    if state.level is not Level.BAD:
-        return _line(source, state, last) + take
-    reasons = ", ".join(each.text for each in gateway_states(source) if each.level is not Level.GOOD)
-    details = html_text(" · ".join(filter(None, (last, reasons))), _MAX_CHARACTERS)
-    name, text = html_text(source.name), html_text(state.text, _MAX_CHARACTERS)
-    return f"<div class=stopped><b>{name}: {text}</b>. The picture is old.<br>{details}</div>{take}"
-
-
-def _take_line(source: LiveSource, *, is_paused: bool) -> str:
-    state = data_state(source)
-    if is_paused:
-        return _line(source, State(Level.WAITING, "paused"), "")
-    return _line(source, state._replace(text="recorded") if state.level is Level.GOOD else state, "")
-
-
-def _line(source: LiveSource, state: State, last: str) -> str:
+def _banner_line(source: LiveSource, now_s: float, is_take: bool, is_paused: bool) -> str:
+    name, state, last, recording = html_text(source.name), data_state(source), "", ""
+    if is_take:
+        if is_paused:
+            state = State(Level.WAITING, "paused")
+        elif state.level is Level.GOOD:
+            state = State(Level.GOOD, "recorded")
+    else:
+        age_s = source.age_s
+        last = "" if age_s is None else f"last data {clock_text(now_s - age_s)}"
+        if source.running_take and not source.is_silent:
+            take = html_text(source.running_take, _MAX_CHARACTERS)
+            recording = f"<p><span class=bad>● recording</span> {take}</p>"
     text = html_text(state.text, _MAX_CHARACTERS)
-    name = html_text(source.name)
-    return (
-        f"<p><span class={state.level.value}>● {text}</span> <b>{name}</b> <span class=last>{last}</span></p>"
-    )
+    if state.level is Level.BAD and not is_take:
+        reasons = ", ".join(each.text for each in gateway_states(source) if each.level is not Level.GOOD)
+        details = html_text(" · ".join(filter(None, (last, reasons))), _MAX_CHARACTERS)
+        line = f"<div class=stopped><b>{name}: {text}</b>. The picture is old.<br>{details}</div>"
+    else:
+        state_text = f"<span class={state.level.value}>● {text}</span>"
+        line = f"<p>{state_text} <b>{name}</b> <span class=last>{last}</span></p>"
+    return line + recording
 
 
 _LEGEND: Final = (
@@ -185,50 +180,26 @@ class Switches:
         chosen = self._up.value
         return chosen if chosen in UP_AXES else "z"
 
-    def suggest_up(self, up: UpAxis) -> None:
-        """Choose the axis that points up, unless somebody has chosen it."""
-        if not self.has_chosen_up:
-            dropdown: Any = self._up  # viser's types do not know that its value can be set
-            dropdown.value = up
+    def suggest_up(self, up: UpAxis | None) -> None:
+        """Choose the axis that points up, unless somebody has chosen it, or it is not known."""
+        if up is not None and not self.has_chosen_up:
+            self._up.value = up  # type: ignore[misc] # mypy does not find the setter
 
-    def add_source(self, name: str, color: SourceColor) -> viser.GuiCheckboxHandle:
+    def add_source(self, name: str, color: Rgb) -> viser.GuiCheckboxHandle:
         """Add the switch of a source, with a stripe in its colour."""
         with self._group:
-            red, green, blue = color.rgb
-            self._server.gui.add_html(
-                f'<div style="margin: 0 0.8em; height: 3px; background: rgb({red}, {green}, {blue})"></div>'
-            )
+            style = f"margin: 0 0.8em; height: 3px; background: rgb{color}"
+            self._server.gui.add_html(f'<div style="{style}"></div>')
             return self._server.gui.add_checkbox(name, initial_value=True)
 
 
-_NUM_LATENCIES: Final = 300
-"""10 s at 30 pictures per second."""
+@dataclass
+class _Turn:
+    """What is shown at an interval, next at ``due_s``."""
 
-
-class ShownLatency:
-    """The time from the arrival of what is shown to its sending, by source and component."""
-
-    def __init__(self) -> None:
-        self._samples_ms: dict[str, dict[str, deque[float]]] = {}
-
-    def add(self, sources: Sequence[LiveSource]) -> None:
-        """Take the newest messages, which are sent to the browsers now."""
-        now = now_utime()
-        for source in sources:
-            samples_ms = self._samples_ms.setdefault(source.name, {})
-            for key, component in [*source.components.items()]:
-                arrived_utime = component.newest_arrived_utime
-                if len(component.batch.heads) and arrived_utime is not None:
-                    of_component = samples_ms.setdefault(key, deque(maxlen=_NUM_LATENCIES))
-                    of_component.append((now - arrived_utime) / 1000)
-
-    def percentiles(self, source: str) -> dict[str, Percentiles]:
-        """Return the percentiles of the newest samples, by component."""
-        found = {}
-        for key, samples_ms in self._samples_ms.get(source, {}).items():
-            p50, p99 = np.percentile([*samples_ms], (50, 99))
-            found[key] = Percentiles(float(p50), float(p99))
-        return found
+    interval_s: float
+    due_s: float
+    show: Callable[[Sequence[LiveSource]], None]
 
 
 _PLOT_INTERVAL_S: Final = 0.1
@@ -239,7 +210,7 @@ _WIDTH_PX: Final = 410
 """The tables need it."""
 
 _MIN_WINDOW_PX: Final = 720
-"""In a narrower window, the panel is closed at first. On phones, viser has a sheet instead: see style.py."""
+"""In a narrower window, the panel is closed at first. On phones, viser has a sheet instead: see _SCRIPT."""
 
 
 class Panel:
@@ -260,10 +231,8 @@ class Panel:
         self._live = live
         self._is_take = is_take
         self._is_paused = False
-        self._shown_latency = ShownLatency()
         self._stopped: tuple[bool, ...] = ()
         server.gui.main_panel.set_width(_WIDTH_PX)
-        server.on_client_connect(_close_in_narrow_window)
         server.gui.add_html(STYLE, order=-2)
         self._banner = server.gui.add_html("", order=-1)
         with tabs.add_tab("Sources"):
@@ -275,14 +244,28 @@ class Panel:
         with tabs.add_tab("Plots"):
             self._plots = Plots(server)
         # Not all texts in the same turn: the picture would wait for them.
+        now_s = time.monotonic()
         self._turns = [
-            _Turn(_BANNER_INTERVAL_S, 0.0, self._show_banner),
-            _Turn(_TEXT_INTERVAL_S, 0.05, self._show_sources),
-            _Turn(_TEXT_INTERVAL_S, 0.15, self._show_items),
-            _Turn(_TEXT_INTERVAL_S, 0.35, self._show_events),
-            _Turn(_TEXT_INTERVAL_S, 0.45, self._plots.offer),
-            _Turn(_PLOT_INTERVAL_S, 0.0, self._show_plots),
+            _Turn(_BANNER_INTERVAL_S, now_s, self._show_banner),
+            _Turn(_TEXT_INTERVAL_S, now_s + 0.05, self._show_sources),
+            _Turn(
+                _TEXT_INTERVAL_S,
+                now_s + 0.15,
+                lambda sources: _show(self._items, map(items_html, sources[:MAX_SOURCES])),
+            ),
+            _Turn(
+                _TEXT_INTERVAL_S,
+                now_s + 0.35,
+                lambda sources: _show(self._events, map(events_html, sources[:MAX_SOURCES])),
+            ),
+            _Turn(_TEXT_INTERVAL_S, now_s + 0.45, self._plots.offer),
+            _Turn(_PLOT_INTERVAL_S, now_s, lambda _: self._plots.show()),
         ]
+
+        @server.on_client_connect
+        def _(client: viser.ClientHandle) -> None:
+            if client.camera.image_width < _MIN_WINDOW_PX:
+                client.gui.main_panel.minimize()
 
     def update(self, sources: list[LiveSource], *, is_paused: bool = False) -> None:
         """Show the sources as they are now. Call it after the picture was sent, at every picture.
@@ -290,7 +273,9 @@ class Panel:
         ``is_paused`` says that a take stands still on purpose.
         """
         self._is_paused = is_paused
-        self._shown_latency.add(sources)
+        for source in sources:
+            for component in [*source.components.values()]:
+                component.note_shown()
         self._plots.take(sources)
         if not self._server.get_clients():
             return
@@ -300,60 +285,26 @@ class Panel:
             self._stopped = stopped
             self._show_banner(sources)
         for turn in self._turns:
-            turn.run(sources, now_s)
+            if now_s >= turn.due_s:
+                turn.due_s += turn.interval_s
+                if turn.due_s <= now_s:  # nobody looked, or the computer was busy
+                    turn.due_s = now_s + turn.interval_s
+                turn.show(sources)
 
     def _show_banner(self, sources: Sequence[LiveSource]) -> None:
-        self._banner.content = _block(
-            banner_html(sources, time.time(), is_take=self._is_take, is_paused=self._is_paused)
-        )
+        banner = banner_html(sources, time.time(), is_take=self._is_take, is_paused=self._is_paused)
+        _show(self._banner, [banner])
 
     def _show_sources(self, sources: Sequence[LiveSource]) -> None:
-        texts = [
-            source_html(
-                source,
-                self._shown_latency.percentiles(source.name),
-                is_take=self._is_take,
-                is_paused=self._is_paused,
-            )
-            for source in sources[:MAX_SOURCES]
-        ]
-        self._sources.content = _block(*texts, ignored_html(self._live))
-
-    def _show_items(self, sources: Sequence[LiveSource]) -> None:
-        self._items.content = _block(*map(items_html, sources[:MAX_SOURCES]))
-
-    def _show_events(self, sources: Sequence[LiveSource]) -> None:
-        self._events.content = _block(*map(events_html, sources[:MAX_SOURCES]))
-
-    def _show_plots(self, _: Sequence[LiveSource]) -> None:
-        self._plots.follow_user()
-        self._plots.show()
+        shown = sources[:MAX_SOURCES]
+        texts = [source_html(each, is_take=self._is_take, is_paused=self._is_paused) for each in shown]
+        _show(self._sources, [*texts, ignored_html(self._live)])
 
 
-class _Turn:
-    """Something that is shown at an interval, first after a delay."""
-
-    def __init__(
-        self, interval_s: float, delay_s: float, show: Callable[[Sequence[LiveSource]], None]
-    ) -> None:
-        self._interval_s = interval_s
-        self._due_s = time.monotonic() + delay_s
-        self._show = show
-
-    def run(self, sources: Sequence[LiveSource], now_s: float) -> None:
-        """Show it if it is due."""
-        if now_s < self._due_s:
-            return
-        self._due_s += self._interval_s
-        if self._due_s <= now_s:  # nobody looked, or the computer was busy
-            self._due_s = now_s + self._interval_s
-        self._show(sources)
+def _show(tab: viser.GuiHtmlHandle, parts: Iterable[str]) -> None:
+    tab.content = f"<div class=gateway>{''.join(parts)}</div>"
 
 
-def _close_in_narrow_window(client: viser.ClientHandle) -> None:
-    if client.camera.image_width < _MIN_WINDOW_PX:
-        client.gui.main_panel.minimize()
-
-
-def _block(*parts: str) -> str:
-    return f"<div class=gateway>{''.join(parts)}</div>"
+def set_theme(gui: viser.GuiApi, *, dark: bool) -> None:
+    """Choose the colours of the page, of all browsers or of one."""
+    gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)

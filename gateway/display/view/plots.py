@@ -1,7 +1,7 @@
 """Scrolling plots of selected analog and force channels."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,8 +9,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from gateway.display.live.component import LiveComponent
-from gateway.display.live.live_data import LiveSource
+from gateway.display.live import LiveComponent, LiveSource
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.takes.files.component_rows import Array
@@ -48,13 +47,6 @@ def choices(sources: Sequence[LiveSource]) -> dict[str, Channel]:
     return found
 
 
-def first_choice(offered: Mapping[str, Channel]) -> str | None:
-    """Return what most people look at first: the vertical force on a plate, otherwise the first channel."""
-    return next(
-        (text for text, channel in offered.items() if channel.field == "fz"), next(iter(offered), None)
-    )
-
-
 def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
     for key in _KEYS:
         component = source.components.get(key)
@@ -74,12 +66,6 @@ def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
 
 def _cut(text: str) -> str:
     return safe_text(text, _MAX_LABEL_CHARACTERS)
-
-
-def component_of(channel: Channel, sources: Mapping[str, LiveSource]) -> LiveComponent | None:
-    """Return the component that has a channel; None if there is none."""
-    source = sources.get(channel.source)
-    return None if source is None else source.components.get(channel.key)
 
 
 def samples(channel: Channel, component: LiveComponent) -> Iterator[tuple[Array, Array]]:
@@ -102,6 +88,8 @@ NUM_COLUMNS: Final = 320
 COLUMN_US: Final = 31_250
 """320 columns of 31.25 ms are 10 s."""
 
+_COLUMNS: Final = np.arange(1 - NUM_COLUMNS, 1)
+
 _MAX_STEP_COLUMNS: Final = 32
 """If times go back, or forward, by more than a second, the envelope starts again there.
 
@@ -117,8 +105,7 @@ class Envelope:
     """
 
     def __init__(self) -> None:
-        self._lowest = np.full(NUM_COLUMNS, np.nan)
-        self._highest = np.full(NUM_COLUMNS, np.nan)
+        self._values = np.full((2, NUM_COLUMNS), np.nan)  # the smallest ones, and the largest ones
         self._newest: int | None = None  # the newest column, counted from the epoch
 
     @property
@@ -138,36 +125,30 @@ class Envelope:
         lowest, highest = np.fmin.reduceat(values, begins), np.fmax.reduceat(values, begins)
         for column, low, high in zip(columns[begins].tolist(), lowest, highest, strict=True):
             self._make_room(column)
-            place = column % NUM_COLUMNS
-            self._lowest[place] = np.fmin(self._lowest[place], low)
-            self._highest[place] = np.fmax(self._highest[place], high)
+            smallest, largest = self._values[:, column % NUM_COLUMNS]
+            self._values[:, column % NUM_COLUMNS] = np.fmin(smallest, low), np.fmax(largest, high)
 
-    def columns(self, end_utime: int) -> tuple[Array, Array]:
-        """Return the smallest and the largest values, oldest first, each of shape (NUM_COLUMNS,).
+    def columns(self, end_utime: int) -> Array:
+        """Return the smallest and the largest values, oldest first, shape (2, NUM_COLUMNS).
 
         The last column is that of ``end_utime``. Columns without a sample are NaN.
         """
         newest = self._newest
         if newest is None:
-            return self._lowest.copy(), self._highest.copy()
-        wanted = end_utime // COLUMN_US + np.arange(1 - NUM_COLUMNS, 1)
+            return self._values.copy()
+        wanted = end_utime // COLUMN_US + _COLUMNS
         is_kept = (wanted <= newest) & (wanted > newest - NUM_COLUMNS)
-        places = wanted % NUM_COLUMNS
-        lowest, highest = self._lowest[places], self._highest[places]
-        return np.where(is_kept, lowest, np.nan), np.where(is_kept, highest, np.nan)
+        return np.where(is_kept, self._values[:, wanted % NUM_COLUMNS], np.nan)
 
     def _make_room(self, column: int) -> None:
         newest = self._newest
         if newest is None or abs(column - newest) > _MAX_STEP_COLUMNS:
-            self._clear(slice(None))
-            self._newest = column
+            self._values[:] = np.nan
         elif column > newest:
-            self._clear(np.arange(newest + 1, column + 1) % NUM_COLUMNS)
-            self._newest = column
-
-    def _clear(self, places: slice | Array) -> None:
-        self._lowest[places] = np.nan
-        self._highest[places] = np.nan
+            self._values[:, np.arange(newest + 1, column + 1) % NUM_COLUMNS] = np.nan
+        else:
+            return
+        self._newest = column
 
 
 MAX_PLOTS: Final = 8
@@ -183,8 +164,6 @@ _HEIGHT_PX: Final = 120
 _FONT: Final = "11px sans-serif"
 _LINE: Final = "#4dabf7"
 _FILL: Final = "rgba(77, 171, 247, 0.35)"
-
-_COLUMNS: Final = np.arange(1 - NUM_COLUMNS, 1)
 
 
 class _Plot:
@@ -211,12 +190,11 @@ class _Plot:
             padding=(8, 8, 0, 0),
         )
 
-    def take(self, component: LiveComponent | None) -> None:
+    def take(self, source: LiveSource | None) -> None:
         """Take what came since the last call."""
-        self._component = component
-        if component is not None:
-            for utimes, values in samples(self.channel, component):
-                self._envelope.add(utimes, values)
+        component = self._component = source.components.get(self.channel.key) if source else None
+        for utimes, values in samples(self.channel, component) if component else ():
+            self._envelope.add(utimes, values)
 
     def show(self) -> None:
         """Send the plot to the browsers. It scrolls on when data have stopped."""
@@ -254,18 +232,12 @@ class Plots:
 
     def take(self, sources: Sequence[LiveSource]) -> None:
         """Take what came since the last call."""
-        if self._plots:
-            by_name = {source.name: source for source in sources}
-            for plot in self._plots.values():
-                plot.take(component_of(plot.channel, by_name))
+        by_name = {source.name: source for source in sources}
+        for plot in self._plots.values():
+            plot.take(by_name.get(plot.channel.source))
 
     def show(self) -> None:
-        """Send the plots to the browsers."""
-        for plot in self._plots.values():
-            plot.show()
-
-    def follow_user(self) -> None:
-        """Add and remove the plots that the user chose."""
+        """Add and remove the plots that the user chose, and send them to the browsers."""
         added, removed = self._add.value, self._remove.value
         if added in self._choices and len(self._plots) < MAX_PLOTS and added not in self._plots:
             self._plot(added)
@@ -277,6 +249,8 @@ class Plots:
             self._add.value = _CHOOSE  # type: ignore[misc] # mypy does not find the setter
             self._remove.value = _CHOOSE  # type: ignore[misc]
             self._offer()
+        for plot in self._plots.values():
+            plot.show()
 
     def _plot(self, title: str) -> None:
         self._has_begun = True
@@ -286,7 +260,8 @@ class Plots:
     def offer(self, sources: Sequence[LiveSource]) -> None:
         """Offer the channels that there are now. The first time that they are known, plot a useful one."""
         former, self._choices = self._choices, choices(sources)
-        first = first_choice(self._choices)
+        forces = [text for text, channel in self._choices.items() if channel.field == "fz"]
+        first = next(iter([*forces, *self._choices]), None)  # what most people look at first
         # Once the channels of the same sources and components came twice, no more come a moment later.
         if first and not self._has_begun and self._add.value == _CHOOSE and [*former] == [*self._choices]:
             self._plot(first)

@@ -1,29 +1,151 @@
-"""The picture: the world, and a group for each source."""
+"""The picture: the floor, the axes and the camera, and a group for each source."""
 
+import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 import viser
 
-from gateway.display.live.component import LiveComponent
-from gateway.display.live.live_data import LiveSource
-from gateway.display.view.laboratory import (
-    Plates,
-    Sphere,
-    UpAxis,
-    World,
-    fit,
-    on_floor,
-    sphere_around,
-    up_axis_of,
-)
-from gateway.display.view.markers_and_tools import Markers, Tools, color_of
+from gateway.descriptions.force_plates import METRES_PER_NEWTON, placed_plates
+from gateway.display.live import LiveComponent, LiveSource
 from gateway.display.view.panel import Switches
+from gateway.display.view.scene_items import (
+    GREY,
+    PLANES,
+    UP_AXES,
+    Markers,
+    Plates,
+    Tools,
+    UpAxis,
+    color_of,
+    on_floor,
+)
 from gateway.rtc3d.parameters import Parameters
+from gateway.takes.files.component_rows import Array
+
+_VERTICAL: Final = 0.95
+"""The cosine from which a plate counts as horizontal."""
+
+
+def up_axis_of(parameters: Iterable[Parameters]) -> UpAxis | None:
+    """Return the axis that points up, by the plates: people step on them; None if they do not show it."""
+    found: set[UpAxis] = set()
+    for each in parameters:
+        for plate in placed_plates(each):
+            if plate is not None:
+                by_size = {axis: abs(part) for axis, part in zip("xyz", plate.normal, strict=True)}
+                found |= {axis for axis in UP_AXES if by_size[axis] > _VERTICAL}
+    return found.pop() if len(found) == 1 else None
+
+
+_MIN_RADIUS_M: Final = 0.3
+_MARGIN: Final = 1.15
+_FROM: Final = (0.6, -1.0, 0.5)
+"""The direction from what is seen to the camera: on the two axes of the floor, and up."""
+
+_FAR: Final = 4.0
+"""Points that are this much farther from the middle than most others are not what the picture is about."""
+
+
+class Sphere(NamedTuple):
+    """What is to be seen, in metres."""
+
+    centre: tuple[float, float, float]
+    radius: float
+
+
+def sphere_around(parts: Sequence[Array]) -> Sphere | None:
+    """Return a sphere around points, each part of shape (points, 3); None without any. NaN is left out."""
+    points = np.concatenate([np.empty((0, 3)), *parts])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    near = points[distances <= _FAR * np.percentile(distances, 75) + _MIN_RADIUS_M]
+    centre = (near.min(axis=0) + near.max(axis=0)) / 2
+    radius = max(_MIN_RADIUS_M, float(np.linalg.norm(near - centre, axis=1).max()))
+    x, y, z = centre.tolist()
+    return Sphere((x, y, z), radius)
+
+
+def fit(client: viser.ClientHandle, sphere: Sphere, up: UpAxis) -> None:
+    """Turn the camera of one browser so that it sees the sphere.
+
+    Raises ValueError if the browser has said that its camera is at no place.
+    """
+    camera = client.camera
+    aspect = camera.image_width / max(1, camera.image_height)  # the height of a page can be 0
+    angle = min(camera.fov, 2 * math.atan(math.tan(camera.fov / 2) * max(0.1, aspect)))
+    distance = _MARGIN * sphere.radius / math.sin(min(max(0.1, angle), math.pi) / 2)
+    direction = np.array(on_floor(up, *_FROM))
+    position = np.array(sphere.centre) + distance * direction / np.linalg.norm(direction)
+    with client.atomic():
+        camera.up_direction = on_floor(up, 0.0, 0.0, 1.0)
+        camera.position = position
+        camera.look_at = sphere.centre
+
+
+_AXIS_M: Final = 0.5
+_GRID_M: Final = 10.0
+_LINE_COLOR: Final = (110, 115, 125)
+
+
+class World:
+    """What does not move. ``up`` is the axis that points up."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        server.scene.configure_default_lights(cast_shadow=False)  # shadows cost browsers more than all else
+        self._grids = {
+            axis: server.scene.add_grid(
+                f"/world/floor {axis}",
+                _GRID_M,
+                _GRID_M,
+                plane=PLANES[axis],
+                cell_size=0.25,
+                cell_color=GREY,
+                cell_thickness=0.4,
+                section_size=1.0,
+                section_color=_LINE_COLOR,
+                section_thickness=1.0,
+                fade_distance=15.0,
+                shadow_opacity=0.0,
+                visible=False,
+            )
+            for axis in UP_AXES
+        }
+        server.scene.add_frame("/world/axes", axes_length=_AXIS_M, axes_radius=0.006, origin_radius=0.012)
+        for name, position in zip("xyz", _AXIS_M * np.eye(3), strict=True):
+            server.scene.add_label(f"/world/{name}", name, position=position, anchor="bottom-center")
+        self._unit = server.scene.add_label(
+            "/world/unit", "1 m", anchor="center-center", font_screen_scale=0.8
+        )
+        self.up: UpAxis = "z"
+        self.set_up("z")
+
+    def set_up(self, up: UpAxis) -> None:
+        """Turn the picture so that this axis points up."""
+        self.up = up
+        direction = on_floor(up, 0.0, 0.0, 1.0)
+        self._server.scene.set_up_direction(direction)
+        for axis, grid in self._grids.items():
+            grid.visible = axis == up
+        self._unit.position = on_floor(up, 1.0, 0.0)
+
+    @property
+    def mark(self) -> Array:
+        """Where the mark for 1 m is, shape (1, 3)."""
+        return np.array([self._unit.position])
+
+    def update(self, *, forces: bool, floor: bool) -> None:
+        """Show the floor or not, and say how much force an arrow of 1 m is if there are ``forces``."""
+        self._unit.text = f"1 m = {1 / METRES_PER_NEWTON:.0f} N" if forces else "1 m"
+        self._grids[self.up].visible = floor
+
 
 _NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
 
@@ -38,20 +160,15 @@ class SourceScene:
     """
 
     def __init__(
-        self,
-        server: viser.ViserServer,
-        source: LiveSource,
-        number: int,
-        switch: viser.GuiCheckboxHandle,
+        self, scene: viser.SceneApi, source: LiveSource, number: int, switch: viser.GuiCheckboxHandle
     ) -> None:
         self._number = number
-        color = color_of(number)
         self._name = source.name
         self._switch = switch
-        scene = server.scene
         path = f"/sources/{quote(source.channels, safe='')}"
-        self._group = scene.add_frame(path, show_axes=False)
-        self._markers = Markers(scene, path, color)
+        self.group = scene.add_frame(path, show_axes=False)
+        """What is visible if its switch is on."""
+        self._markers = Markers(scene, path, color_of(number))
         self._tools = Tools(scene, path)
         self._plates = Plates(scene, path, number)
         self._stopped = scene.add_label(
@@ -65,42 +182,28 @@ class SourceScene:
         if source.name != self._name:  # on LCM, a status says the name
             self._name = source.name
             self._switch.label = source.name
-        self._group.visible = self._switch.value
-        if not self._group.visible:
+        self.group.visible = self._switch.value
+        if not self.group.visible:
             return
         components = {**source.components}
         prefix = "" if is_alone else f"{source.name}: "
         if "3d" in components:
-            self._markers.update(
-                components["3d"],
-                now_s,
-                prefix,
-                labels=switches.marker_labels.value,
-                trails=switches.trails.value,
-            )
+            labels, trails = switches.marker_labels.value, switches.trails.value
+            self._markers.update(components["3d"], now_s, prefix, labels=labels, trails=trails)
         if "6d" in components:
             self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels.value)
         self._plates.update(components.get("force"), source.newest_parameters, up, now_s, prefix)
         self._say_stopped(source.name, components, up)
 
-    def hide(self) -> None:
-        """Hide everything until the next update."""
-        self._group.visible = False
-
     @property
-    def is_visible(self) -> bool:
-        """Whether its switch is on."""
-        return bool(self._group.visible)
-
-    @property
-    def has_subject(self) -> bool:
-        """Whether markers or tools are in the picture."""
-        return sphere_around([self._markers.positions, self._tools.positions]) is not None
+    def subject(self) -> "Sphere | None":
+        """What is around the markers and tools in the picture; None without any."""
+        return sphere_around([self._markers.positions, self._tools.positions])
 
     @property
     def has_plates(self) -> bool:
         """Whether force plates are shown."""
-        return self.is_visible and len(self._plates.corners) > 0
+        return bool(self.group.visible) and len(self._plates.corners) > 0
 
     @property
     def points(self) -> list[np.ndarray]:
@@ -112,29 +215,20 @@ class SourceScene:
         self._stopped.visible = bool(stopped)
         if not stopped:
             return
+        expected = [key for key in _NAMES if key in components]
+        names = [_NAMES[key] for key in expected if key in stopped]
+        what = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+        if len(names) == len(expected):
+            what = "data"
         age_s = max(each.age_s or 0.0 for each in stopped.values())
-        self._stopped.text = f"{name}: no {_what(stopped, components)} for {_duration(age_s)}"
+        duration = f"{age_s / 60:.0f} min" if age_s < 6000 else f"{age_s / 3600:.0f} h"
+        if age_s < 100:
+            duration = f"{age_s:.0f} s"
+        self._stopped.text = f"{name}: no {what} for {duration}"
         # Above its own subject: between that and its plates, another source's subject may be.
-        sphere = sphere_around([self._markers.positions, self._tools.positions])
-        sphere = sphere or sphere_around([self._plates.corners]) or Sphere((0.0, 0.0, 0.0), 0.0)
+        sphere = self.subject or sphere_around([self._plates.corners]) or Sphere((0.0, 0.0, 0.0), 0.0)
         above = on_floor(up, 0.0, 0.0, sphere.radius + _GAP_M * self._number)
-        x, y, z = np.add(sphere.centre, above).tolist()
-        self._stopped.position = (x, y, z)
-
-
-def _what(stopped: Iterable[str], components: dict[str, LiveComponent]) -> str:
-    """Return what does not come, such as "markers and forces"."""
-    expected = [key for key in _NAMES if key in components]
-    names = [_NAMES[key] for key in expected if key in stopped]
-    if len(names) == len(expected):
-        return "data"
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.0f} h"
+        self._stopped.position = np.add(sphere.centre, above)
 
 
 _SETTLE_S: Final = 0.3
@@ -151,7 +245,6 @@ class Scene:
         self._parameters: list[Parameters] = []
         self._first_s: float | None = None
         """When the first data were shown."""
-        self._has_plates = False
         self._has_subject = False
         """Whether markers or tools have been shown, and not only plates."""
         self._fitted: set[int] = set()
@@ -167,37 +260,30 @@ class Scene:
             if source.channels not in self._sources:
                 number = len(self._sources)
                 switch = self._switches.add_source(source.name, color_of(number))
-                self._sources[source.channels] = SourceScene(self._server, source, number, switch)
-        self._turn(sources)
+                self._sources[source.channels] = SourceScene(self._server.scene, source, number, switch)
+        parameters = [source.newest_parameters for source in sources]
+        if [*map(id, parameters)] != [*map(id, self._parameters)]:
+            self._parameters = parameters
+            self._switches.suggest_up(up_axis_of(parameters))
+        if self._world.up != self._switches.up:
+            self._world.set_up(self._switches.up)
+            self._fitted.clear()
         for source in sources:
             self._sources[source.channels].update(
                 source, self._world.up, self._switches, now_s, is_alone=len(sources) == 1
             )
-        self._has_plates = any(scene.has_plates for scene in self._sources.values())
-        self._world.show_scale(forces=self._has_plates)
-        self._fit(clients, now_s)
+        has_plates = any(scene.has_plates for scene in self._sources.values())
+        self._world.update(forces=has_plates, floor=self._switches.floor.value)
+        self._fit(clients, now_s, has_scale=has_plates)
 
     def pause(self) -> None:
         """Hide the data while no browser is connected: the next one must not show old data first."""
         for scene in self._sources.values():
-            scene.hide()
+            scene.group.visible = False
 
-    def _turn(self, sources: list[LiveSource]) -> None:
-        """Turn the picture as chosen, or as the plates lie."""
-        parameters = [source.newest_parameters for source in sources]
-        if [*map(id, parameters)] != [*map(id, self._parameters)]:
-            self._parameters = parameters
-            found = up_axis_of(parameters)
-            if found is not None:
-                self._switches.suggest_up(found)
-        if self._world.up != self._switches.up:
-            self._world.set_up(self._switches.up)
-            self._fitted.clear()
-        self._world.show_floor(visible=self._switches.floor.value)
-
-    def _fit(self, clients: dict[int, viser.ClientHandle], now_s: float) -> None:
+    def _fit(self, clients: dict[int, viser.ClientHandle], now_s: float, *, has_scale: bool) -> None:
         """Fit the view of browsers that are new, or want it; of all when the first markers or tools come."""
-        if not self._has_subject and any(scene.has_subject for scene in self._sources.values()):
+        if not self._has_subject and any(scene.subject for scene in self._sources.values()):
             self._has_subject = True
             self._first_s = now_s
             self._fitted.clear()
@@ -205,8 +291,8 @@ class Scene:
         waiting = [client for number, client in clients.items() if number not in self._fitted]
         if not waiting:
             return
-        points = [part for scene in self._sources.values() if scene.is_visible for part in scene.points]
-        if points and self._has_plates:
+        points = [part for scene in self._sources.values() if scene.group.visible for part in scene.points]
+        if points and has_scale:
             points.append(self._world.mark)  # it says the scale of the arrows
         sphere = sphere_around(points)
         if sphere is None:

@@ -1,24 +1,110 @@
-"""The view: what has arrived, live or from a take, is shown about 30 times a second."""
+"""The view: its web server, and the loop that shows what has arrived, live or from a take."""
 
+import errno
+import logging
+import socket
 import sys
 import time
-from collections.abc import Callable, Collection
+import warnings
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
 
+import rich
 import viser
+import websockets.asyncio.server
 
 from gateway.client.transport import GatewaySubscriber
-from gateway.display.live.live_data import LiveData
-from gateway.display.view.panel import Panel
+from gateway.display.live import LiveData
+from gateway.display.view.panel import Panel, set_theme
 from gateway.display.view.scene import Scene
-from gateway.display.view.server import ViewServer
-from gateway.errors import GatewayError, SelectionError
+from gateway.errors import GatewayError, SelectionError, ViewError
 from gateway.logs.safe_text import quoted, safe_text
+from gateway.outputs.listen_address import foreign_request
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.replay.play_list import Selection, take_length_us
 from gateway.takes.replay.player import Player
 from gateway.takes.replay.timeline import time_text
+
+
+class ViewServer(viser.ViserServer):
+    """A viser server that does not contact other computers."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Share nothing: viser would publish the page through a server on the internet, if a page asks."""
+
+
+def open_server(host: str, port: int) -> ViewServer:
+    """Serve the page at this address; port 0 picks a free one. Raises ViewError if that is not possible."""
+    _check_address(host, port)
+    rich.get_console().quiet = True  # viser prints there, also when a browser connects
+    # It would log a traceback for each connection that is no browser's, as of a port scan.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Queued a ")  # to a browser that has left a moment ago
+    with _refusing_foreign_sites(host):
+        server = ViewServer(host, port, label="rtc3d-gateway", verbose=False)
+    if port not in {0, server.get_port()}:  # taken since; viser chose another port
+        server.stop()
+        raise ViewError(_in_use(host, port))
+    set_theme(server.gui, dark=True)
+    server.gui.main_panel.dock_right()  # a floating one would cover the picture
+    return server
+
+
+@contextmanager
+def _refusing_foreign_sites(host: str) -> Iterator[None]:
+    """Let a server that viser opens meanwhile refuse what browsers send for other sites; viser would not."""
+    serve: Any = websockets.asyncio.server.serve
+
+    def guarded_serve(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            refusal = foreign_request(host, headers.get_all("Host"), headers.get_all("Origin"))
+            if refusal:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n")
+            return process_request(connection, request)
+
+        return serve(*arguments, process_request=process, **options)
+
+    websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def address_of(host: str, port: int) -> str:
+    """Return the address that a browser on this computer opens."""
+    if host in {"", "0.0.0.0", "::"}:  # noqa: S104 - compared only
+        host = "localhost"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raise ViewError if the address cannot be listened on: viser would try 1000 other ports."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind, protocol) as test:
+            test.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            test.bind(address)
+            test.listen(1)
+    except OSError as error:
+        if isinstance(error, socket.gaierror):
+            raise ViewError(f"no address {host}: {error.strerror}; choose another one with --host") from None
+        if port and error.errno == errno.EADDRINUSE:
+            raise ViewError(_in_use(host, port)) from None
+        raise ViewError(
+            f"cannot serve the page on {host}:{port}: {error.strerror}; choose with --host and --port"
+        ) from None
+
+
+def _in_use(host: str, port: int) -> str:
+    return f"port {port} of {host} is in use by another program; choose another one with --port"
+
 
 RATES: Final = {"0.1 ×": 0.1, "0.25 ×": 0.25, "0.5 ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "5 ×": 5.0, "10 ×": 10.0}
 """The speeds to choose from."""
@@ -41,18 +127,19 @@ class Playback:
     """
 
     def __init__(self, path: Path, sources: Collection[str], live: LiveData) -> None:
-        self._reader = TakeReader(path)
+        reader = self._reader = TakeReader(path)
         selection = Selection(sources=frozenset(sources) or None)
-        _check_messages(self._reader, selection)
+        if not any(selection.has(message.source, message.key) for message in reader.messages()):
+            shown = f" of {', '.join(map(quoted, selection.sources))}" if selection.sources else ""
+            existing = ", ".join(reader.source_names)
+            raise SelectionError(f"{reader.path} has no messages{shown}; sources of the take: {existing}")
         self._live = live
-        self._length_us = take_length_us(self._reader) or _length_by_reading_us(self._reader)
-        self._player = Player(
-            self._reader,
-            selection,
-            live,
-            rate=1.0,
-            is_watched=True,
-        )
+        length_us = take_length_us(reader)
+        if not length_us:  # its end is damaged, so all of it has to be read
+            last_utimes = (batch.utimes[-1] for batches in reader.batches() for batch in batches)
+            length_us = max([reader.start_utime, *last_utimes]) - reader.start_utime
+        self._length_us = length_us
+        self._player = Player(reader, selection, live, rate=1.0, is_watched=True)
         self._has_begun = False
         self._shown_s = 0.0
         self._moved_s = 0.0
@@ -89,7 +176,10 @@ class Playback:
         if now_s - self._shown_s < _SHOW_S:
             return
         self._shown_s = now_s
-        self._state.content = self._state_text()
+        player, name = self._player, safe_text(self._reader.path.name).replace("`", "'")
+        state = "at the end" if player.is_at_end else "paused" if player.is_paused else "playing"
+        position, length = time_text(player.position_us), time_text(self._length_us)
+        self._state.content = f"`{name}`  \n**{position}** of {length}, {state}"
         self._button.label = "Play" if self.is_paused else "Pause"
         if now_s - self._moved_s > _HOLD_S:
             self._slider.value = min(self._player.position_us / 1e6, self._slider.max)  # type: ignore[misc]
@@ -99,13 +189,6 @@ class Playback:
         if self._has_begun:
             self._player.stop()
             self._player.join(_STOP_S)
-
-    def _state_text(self) -> str:
-        player = self._player
-        state = "at the end" if player.is_at_end else "paused" if player.is_paused else "playing"
-        name = safe_text(self._reader.path.name).replace("`", "'")
-        position, length = time_text(player.position_us), time_text(self._length_us)
-        return f"`{name}`  \n**{position}** of {length}, {state}"
 
     # In the threads of viser.
 
@@ -127,23 +210,6 @@ class Playback:
 
     def _repeat(self, is_repeated: bool) -> None:
         self._player.is_repeated = is_repeated
-
-
-def _check_messages(reader: TakeReader, selection: Selection) -> None:
-    """Raise SelectionError if nothing of the take is selected. This reads up to the first such message."""
-    if any(selection.has(message.source, message.key) for message in reader.messages()):
-        return
-    existing = ", ".join(reader.source_names)
-    shown = f" of {', '.join(map(quoted, selection.sources))}" if selection.sources else ""
-    raise SelectionError(f"{reader.path} has no messages{shown}; sources of the take: {existing}")
-
-
-def _length_by_reading_us(reader: TakeReader) -> int:
-    """Return the time from the first to the last message, in µs. This reads the whole take."""
-    last_utime = reader.start_utime
-    for batches in reader.batches():
-        last_utime = max(last_utime, *(batch.utimes[-1] for batch in batches))
-    return last_utime - reader.start_utime
 
 
 _TAKES_PERIOD_S: Final = 2.0
@@ -199,26 +265,23 @@ class Viewer:
         """Show what arrives until ``stops_within``, which waits for some seconds, returns True.
 
         ``tick`` is called before each picture. The schedule is absolute, and pictures that are late are
-        dropped. Without a browser, nothing is sent.
+        dropped. Without a browser, nothing is sent. A defect, or what a page should not send, does not end
+        the view.
         """
         next_s = time.monotonic()
         while not stops_within(max(0.0, next_s - time.monotonic())):
             tick()
-            self._update_or_report()
+            try:
+                self.update()
+            except GatewayError:
+                raise
+            except Exception as defect:  # noqa: BLE001 - the next picture may be whole
+                if self.num_defects == 0:
+                    text = f"defect in rtc3d-gateway view: {type(defect).__name__}: {defect}; report this"
+                    print(safe_text(text), file=sys.stderr, flush=True)
+                self.num_defects += 1
             now_s = time.monotonic()
             next_s += PERIOD_S * max(1, -(-(now_s - next_s) // PERIOD_S))
-
-    def _update_or_report(self) -> None:
-        """Show what has arrived. A defect, or what a page should not send, does not end the view."""
-        try:
-            self.update()
-        except GatewayError:
-            raise
-        except Exception as defect:  # noqa: BLE001 - the next picture may be whole
-            if self.num_defects == 0:
-                text = f"defect in rtc3d-gateway view: {type(defect).__name__}: {defect}; report this"
-                print(safe_text(text), file=sys.stderr, flush=True)
-            self.num_defects += 1
 
     def update(self) -> None:
         """Decode what has arrived, and show it. Raises what ended the playback of a take."""

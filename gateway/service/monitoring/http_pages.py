@@ -9,6 +9,7 @@ import contextlib
 import functools
 import logging
 import math
+import os
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,6 @@ from gateway.errors import NO_FILES
 from gateway.logs.failures import DefectLog
 from gateway.outputs.listen_address import foreign_request
 from gateway.server_limits import Clients, ServerLimits
-from gateway.service.monitoring.process_limits import ReservedFiles
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +44,9 @@ _MAX_DISCARDED_BYTES: Final = 65536
 """How much to read after the request, such as the body of a POST; more is reset."""
 
 
+_TEXT: Final = "text/plain; charset=utf-8"
+
+
 class Page(NamedTuple):
     """An HTTP response."""
 
@@ -61,7 +64,8 @@ class HttpPages:
     def __init__(self, pages: Mapping[str, Callable[[], Page]], host: str = "127.0.0.1") -> None:
         self._pages = pages
         self._listening: list[socket.socket] = []
-        self._reserve = ReservedFiles(_RESERVED_FILES)
+        self._reserved: list[int] = []
+        """File descriptors for when no other is left."""
         self._host = host
         self._has_refused = False
         self._built: dict[str, tuple[float, Page]] = {}
@@ -73,11 +77,14 @@ class HttpPages:
         """Listen on IP addresses; raises OSError if one of them or the port cannot be bound."""
         try:
             for address in addresses:
-                self._listening.append(_listen(address, port))
+                family = socket.AF_INET6 if ":" in address else socket.AF_INET
+                server = socket.create_server((address, port), family=family, backlog=_BACKLOG)
+                server.setblocking(False)
+                self._listening.append(server)
         except OSError:
             await self.close()
             raise
-        self._reserve.refill()
+        self._reserve_files()
         for listening in self._listening:
             self._resume(listening)
 
@@ -90,7 +97,14 @@ class HttpPages:
         for task in self._connections:
             task.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
-        self._reserve.close()
+        while self._reserved:
+            os.close(self._reserved.pop())
+
+    def _reserve_files(self) -> None:
+        """Reserve as many file descriptors as are missing, if the system allows it."""
+        with contextlib.suppress(OSError):
+            while len(self._reserved) < _RESERVED_FILES:
+                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
 
     # There is no asyncio.Server: if the process has no file descriptor left, uvloop's closes connections
     # without a word, although /healthz is wanted most then.
@@ -100,10 +114,20 @@ class HttpPages:
             asyncio.get_running_loop().add_reader(listening, self._accept, listening)
 
     def _accept(self, listening: socket.socket) -> None:
-        """Accept a connection; if that is not possible, disconnect the oldest one and wait for a moment."""
+        """Accept a connection, with a reserved file descriptor if no other is left.
+
+        If that is not possible, disconnect the oldest one and wait for a moment.
+        """
         loop = asyncio.get_running_loop()
+        self._reserve_files()
         try:
-            connection = self._accepted(listening)
+            try:
+                connection, _ = listening.accept()
+            except OSError as error:
+                if error.errno not in NO_FILES or not self._reserved:
+                    raise
+                os.close(self._reserved.pop())
+                connection, _ = listening.accept()
         except OSError as error:
             if error.errno in NO_FILES:
                 self._connections.disconnect_oldest()
@@ -114,20 +138,10 @@ class HttpPages:
         self._connections.open(task)
         task.add_done_callback(functools.partial(self._end, connection))
 
-    def _accepted(self, listening: socket.socket) -> socket.socket:
-        """Return the next connection, with a reserved file descriptor if no other is left. Raises OSError."""
-        self._reserve.refill()
-        try:
-            return listening.accept()[0]
-        except OSError as error:
-            if error.errno not in NO_FILES or not self._reserve.use():
-                raise
-        return listening.accept()[0]
-
     def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
         connection.close()
         self._connections.close(task)
-        self._reserve.refill()
+        self._reserve_files()
         if not task.cancelled() and (defect := task.exception()) is not None:
             self._defects.log(defect)
 
@@ -156,15 +170,29 @@ class HttpPages:
                 transport.abort()
 
     def _response(self, head: bytes) -> bytes:
-        method = head.partition(b" ")[0]
-        page = self._respond(head)
-        return _head(page) + (b"" if method == b"HEAD" else page.body)
+        """Return the response to the request with this head."""
+        page = self._page_for(head)
+        fields = (
+            f"HTTP/1.1 {page.status} {page.status.phrase}\r\n"
+            f"Content-Type: {page.content_type}\r\n"
+            f"Content-Length: {len(page.body)}\r\n"
+            "Allow: GET, HEAD\r\n"
+            "Cache-Control: no-store\r\n"
+            "Connection: close\r\n\r\n"
+        )
+        return fields.encode() + (b"" if head.startswith(b"HEAD ") else page.body)
 
-    def _respond(self, head: bytes) -> Page:
-        request = head.split(b"\r\n", 1)[0].decode("latin-1").split(" ")
+    def _page_for(self, head: bytes) -> Page:
+        """Return the page that a request wants, built at most MAX_PAGE_AGE_S ago, or an error page."""
+        first, *lines = head.split(b"\r\n")
+        request = first.decode("latin-1").split(" ")
         if len(request) != 3 or not request[2].startswith("HTTP/1."):
             return _error_page(HTTPStatus.BAD_REQUEST)
-        refusal = foreign_request(self._host, _header(head, b"host"), _header(head, b"origin"))
+        fields: dict[bytes, list[str]] = {}
+        for line in lines:
+            name, _, value = line.partition(b":")
+            fields.setdefault(name.strip().lower(), []).append(value.strip().decode("latin-1"))
+        refusal = foreign_request(self._host, fields.get(b"host", []), fields.get(b"origin", []))
         if refusal:
             self._log_refusal(refusal)
             return _error_page(HTTPStatus.FORBIDDEN, refusal)
@@ -172,18 +200,9 @@ class HttpPages:
         path = target.partition("?")[0]
         if path not in self._pages:
             paths = "".join(f"{path}\n" for path in self._pages)
-            return Page(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", f"Pages:\n{paths}".encode())
+            return Page(HTTPStatus.NOT_FOUND, _TEXT, f"Pages:\n{paths}".encode())
         if method not in {"GET", "HEAD"}:
             return _error_page(HTTPStatus.METHOD_NOT_ALLOWED)
-        return self._page(path)
-
-    def _log_refusal(self, refusal: str) -> None:
-        if not self._has_refused:
-            self._has_refused = True
-            logger.warning("metrics: a request was refused: %s", refusal)
-
-    def _page(self, path: str) -> Page:
-        """Return the page, built at most MAX_PAGE_AGE_S ago."""
         now_s = time.monotonic()
         built_s, page = self._built.get(path, (-math.inf, None))
         if page is None or now_s - built_s > MAX_PAGE_AGE_S:
@@ -196,31 +215,11 @@ class HttpPages:
             self._built[path] = now_s, page
         return page
 
-
-def _listen(address: str, port: int) -> socket.socket:
-    """Return a socket that listens on an IP address. Raises OSError."""
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    listening = socket.create_server((address, port), family=family, backlog=_BACKLOG)
-    listening.setblocking(False)
-    return listening
-
-
-def _header(head: bytes, name: bytes) -> list[str]:
-    """Return the values of a header, whose name is in lower case."""
-    fields = (line.partition(b":") for line in head.split(b"\r\n")[1:])
-    return [value.strip().decode("latin-1") for key, _, value in fields if key.strip().lower() == name]
+    def _log_refusal(self, refusal: str) -> None:
+        if not self._has_refused:
+            self._has_refused = True
+            logger.warning("metrics: a request was refused: %s", refusal)
 
 
 def _error_page(status: HTTPStatus, reason: str = "only GET and HEAD are served") -> Page:
-    return Page(status, "text/plain; charset=utf-8", f"{status.phrase}; {reason}\n".encode())
-
-
-def _head(page: Page) -> bytes:
-    return (
-        f"HTTP/1.1 {page.status} {page.status.phrase}\r\n"
-        f"Content-Type: {page.content_type}\r\n"
-        f"Content-Length: {len(page.body)}\r\n"
-        "Allow: GET, HEAD\r\n"
-        "Cache-Control: no-store\r\n"
-        "Connection: close\r\n\r\n"
-    ).encode()
+    return Page(status, _TEXT, f"{status.phrase}; {reason}\n".encode())

@@ -1,4 +1,4 @@
-"""What may stop the whole process: no further threads or open files, memory, a late event loop."""
+"""What may stop the gateway: limits of the system, memory, a late event loop, full disks, certificates."""
 
 import asyncio
 import contextlib
@@ -7,15 +7,24 @@ import errno
 import logging
 import os
 import resource
+import shutil
+import ssl
 import threading
 import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-from gateway.errors import FILES_ADVICE, NO_FILES
+from gateway.config.files import read_file
+from gateway.config.settings import OutputSettings
+from gateway.errors import FILES_ADVICE, NO_FILES, ConfigError
 from gateway.logs.failures import HOLD_S, FailureLog
-from gateway.stream.process_clock import RunningClock, running_clock
-from gateway.workers import thread_starts
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.service.gateway import Gateway
+from gateway.stream.process_clock import running_clock
+from gateway.workers import WorkerThread, thread_starts
 
 MAX_FILES: Final = 65_536
 """How many files the gateway wants to open at most: more than the clients that its outputs accept."""
@@ -82,7 +91,6 @@ class ProcessLimits:
 
 
 def _file_problem() -> str:
-    most = ""
     try:
         os.close(os.open(os.devnull, os.O_RDONLY))
     except OSError as error:
@@ -92,6 +100,7 @@ def _file_problem() -> str:
                 "end programs that have many files open, or raise fs.file-max"
             )
         if error.errno in NO_FILES:
+            most = ""
             with contextlib.suppress(OSError):  # a sandbox may forbid it
                 most = f" {resource.getrlimit(resource.RLIMIT_NOFILE)[0]}"
             return (
@@ -105,47 +114,15 @@ def _thread_problem() -> str:
     thread_starts.check()
     if not thread_starts.is_failing:
         return ""
+    try:
+        num_threads = len([*Path("/proc/self/task").iterdir()])
+    except OSError:
+        num_threads = threading.active_count()
     return (
-        f"no further thread can be started beside the {_num_threads()} of the gateway "
+        f"no further thread can be started beside the {num_threads} of the gateway "
         f"({thread_starts.num_failed} attempts failed), so parts of it do not work; end other programs of "
         "its user, or let it have more (TasksMax of the service)"
     )
-
-
-def _num_threads() -> int:
-    try:
-        return sum(1 for _ in Path("/proc/self/task").iterdir())
-    except OSError:
-        return threading.active_count()
-
-
-class ReservedFiles:
-    """File descriptors that are kept for when none is left.
-
-    ``use`` frees one, and whatever opens a file next gets it. ``refill`` takes back what is free again.
-    """
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-        self._reserved: list[int] = []
-
-    def use(self) -> bool:
-        """Free one; return False if none is left."""
-        if not self._reserved:
-            return False
-        os.close(self._reserved.pop())
-        return True
-
-    def refill(self) -> None:
-        """Reserve as many as are missing, if the system allows it."""
-        with contextlib.suppress(OSError):
-            while len(self._reserved) < self._number:
-                self._reserved.append(os.open(os.devnull, os.O_RDONLY))
-
-    def close(self) -> None:
-        """Free all."""
-        while self.use():
-            pass
 
 
 _PERIOD_S: Final = 1.0
@@ -166,7 +143,6 @@ class LoopDelay:
         self._max_s = self._previous_max_s = 0.0  # of this minute and of the one before
         self._window_end_s = self._due_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
-        self._running: RunningClock | None = None  # set by ``start``
 
     @property
     def max_s(self) -> float:
@@ -175,7 +151,7 @@ class LoopDelay:
 
     def start(self) -> None:
         """Start measuring."""
-        self._running = running_clock()
+        running_clock()  # measures from now on
         self._window_end_s = time.monotonic() + _WINDOW_S
         self._schedule()
 
@@ -200,6 +176,102 @@ class LoopDelay:
     def _measure(self) -> None:
         now_s = time.monotonic()
         self.record(now_s, max(0.0, now_s - self._due_s))  # uvloop's timers may be up to 1 ms early
-        if self._running is not None:
-            self._max_s = max(self._max_s, self._running.longest_delay_s(2 * _PERIOD_S))
+        self._max_s = max(self._max_s, running_clock().longest_delay_s(2 * _PERIOD_S))
         self._schedule()
+
+
+_DISK_PERIOD_S: Final = 60.0
+_PEM_BEGIN: Final = "-----BEGIN CERTIFICATE-----"
+_PEM_END: Final = "-----END CERTIFICATE-----"
+_SEQUENCE: Final = 0x30
+_VERSION: Final = 0xA0
+_UTC_TIME: Final = 0x17
+
+
+class DiskFacts:
+    """What metrics need from disks: when certificates end, and how much room there is for takes.
+
+    A disk may not respond, so all of this is read in a thread, once a minute, until ``close``. What cannot be
+    read is left out.
+    """
+
+    def __init__(self, gateway: Gateway) -> None:
+        self._gateway = gateway
+        self._task: asyncio.Task[None] | None = None
+        self.certificate_ends_s: Mapping[tuple[str, str], float] = {}
+        """When certificates end, in s since the Unix epoch, by output and the key that names them."""
+        self.takes_free_bytes: int | None = None
+        """The room on the disk of the takes; None if the output is off."""
+
+    def start(self) -> None:
+        """Start reading, in the running event loop."""
+        self._task = asyncio.create_task(self._read())
+
+    def close(self) -> None:
+        """Stop reading."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _read(self) -> None:
+        thread = WorkerThread("disk-facts")
+        while True:
+            with contextlib.suppress(OSError):  # no thread can be started: the health says so
+                settings = self._gateway.settings.outputs
+                self.certificate_ends_s, self.takes_free_bytes = await thread.run(
+                    partial(_disk_facts, settings)
+                )
+            await asyncio.sleep(_DISK_PERIOD_S)
+
+
+def _disk_facts(outputs: Mapping[str, OutputSettings]) -> tuple[Mapping[tuple[str, str], float], int | None]:
+    """Return what DiskFacts knows, in the same order. This may take long."""
+    ends_s: dict[tuple[str, str], float] = {}
+    free_bytes: int | None = None
+    for name, settings in outputs.items():
+        if not settings.enabled:
+            continue
+        certificates: Mapping[str, Path] = {}
+        with contextlib.suppress(ConfigError):  # the file has changed since the gateway started
+            certificates = settings.certificates
+        for key, path in certificates.items():
+            with contextlib.suppress(OSError, ValueError):  # the output itself says what is wrong with it
+                texts = read_file(path).decode("ascii").split(_PEM_END)[:-1]
+                pems = [text[max(0, text.find(_PEM_BEGIN)) :] + _PEM_END for text in texts]
+                ends_s[name, key] = min(_end_s(ssl.PEM_cert_to_DER_cert(pem)) for pem in pems)
+        if isinstance(settings, TakesSettings):
+            with contextlib.suppress(OSError):
+                free_bytes = shutil.disk_usage(settings.effective_directory).free
+    return ends_s, free_bytes
+
+
+def _end_s(certificate: bytes) -> float:
+    """Return when a certificate ends (RFC 5280, 4.1). Python's ssl has this for peers only."""
+    fields = _elements(_elements(_elements(certificate, 1)[0][1], 1)[0][1], 5)
+    fields = fields[fields[0][0] == _VERSION :]  # the version may be absent
+    validity = fields[3]  # after serial number, algorithm and issuer
+    if validity[0] != _SEQUENCE:
+        raise ValueError("no validity")
+    tag, text = _elements(validity[1], 2)[1]
+    digits = text.decode("ascii")
+    if tag == _UTC_TIME:  # with a year of two digits
+        digits = ("20" if digits < "5" else "19") + digits
+    return datetime.strptime(digits, "%Y%m%d%H%M%SZ").replace(tzinfo=UTC).timestamp()
+
+
+def _elements(data: bytes, most: int) -> list[tuple[int, bytes]]:
+    """Return the tag and the content of the first ``most`` elements in DER. Raises ValueError."""
+    found: list[tuple[int, bytes]] = []
+    while data and len(found) < most:
+        if len(data) < 2:
+            raise ValueError("cut off")
+        tag, size, start = data[0], data[1], 2
+        if size & 0x80:
+            start += size & 0x7F
+            size = int.from_bytes(data[2:start])
+        if len(data) < start + size:
+            raise ValueError("cut off")
+        found.append((tag, data[start : start + size]))
+        data = data[start + size :]
+    if len(found) < most:
+        raise ValueError("too few elements")
+    return found

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.display.live.live_data import LiveData
+from gateway.display.live import LiveData
 from gateway.display.view.viewer import RunningTakes
 from gateway.outputs.takes.folder import MAX_PIECE_BYTES, TakesFolder
 from gateway.outputs.takes.settings import TakesSettings

@@ -9,7 +9,7 @@ import pytest
 from gateway.client import GatewayAddress, GatewayClient, Messages
 from gateway.client.series import FINGERPRINTS
 from gateway.client.transport import Replies, Reply, silence_text
-from gateway.display.live.live_data import LiveData
+from gateway.display.live import LiveData
 from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
 from gateway.outputs.contract import ServerParameters

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import rtc3d
 
-from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.live import LiveData, LiveSource
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from tests.support.takes import frame, parameters

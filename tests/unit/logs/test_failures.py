@@ -8,12 +8,14 @@ import pytest
 
 from gateway.logs.failures import (
     FIELDS,
+    HOLD_S,
+    MAX_HOLD_S,
+    MAX_REPEATS,
     DefectLog,
     EventLog,
     FailureLog,
     log_fields,
 )
-from gateway.logs.limits import HOLD_S, MAX_HOLD_S, MAX_REPEATS
 from gateway.logs.log_format import ContextFilter
 from tests.support.clocks import Clock
 

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from gateway.logs.limits import HOLD_S, MAX_HOLD_S
+from gateway.logs.failures import HOLD_S, MAX_HOLD_S
 from gateway.logs.losses import Losses, last_minute_text
 from tests.support.clocks import Clock
 from tests.support.statuses import amounts

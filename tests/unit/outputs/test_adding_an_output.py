@@ -26,10 +26,9 @@ from gateway.outputs.findings import Result
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.disk_facts import DiskFacts
-from gateway.service.monitoring.health import health_page
-from gateway.service.monitoring.metrics import metrics_page, metrics_registry
-from gateway.service.monitoring.process_limits import LoopDelay
+from gateway.service.monitoring.metrics import GatewayMetrics
+from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay
+from gateway.service.monitoring.server import health_page
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.example_output import (
@@ -100,7 +99,7 @@ class Lab:
         return found()
 
     def metric(self, name: str, **labels: str) -> float:
-        page = metrics_page(metrics_registry(self.gateway, LoopDelay(), DiskFacts(self.gateway)))
+        page = GatewayMetrics(self.gateway, LoopDelay(), DiskFacts(self.gateway)).page()
         [value] = [
             sample.value
             for family in text_string_to_metric_families(page.body.decode())

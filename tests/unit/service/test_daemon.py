@@ -13,7 +13,6 @@ import socket
 import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -54,10 +53,10 @@ def received(manager: socket.socket) -> list[str]:
 
 def test_every_stage_is_reported_and_alive_sends_the_status_on_one_line(manager: socket.socket) -> None:
     notifier = SystemdNotifier()
-    notifier.notify_ready()
-    notifier.notify_reloading()
+    notifier.notify("READY")
+    notifier.notify("RELOADING")
     notifier.notify_alive("lab: streaming 200.0 Hz;\nREADY=1 → µ")
-    notifier.notify_stopping()
+    notifier.notify("STOPPING")
     alive = ["WATCHDOG=1", "STATUS=lab: streaming 200.0 Hz; READY=1 → µ"]
     assert received(manager) == ["READY=1", "RELOADING=1", *alive, "STOPPING=1"]
 
@@ -67,7 +66,7 @@ def test_without_systemd_nothing_is_sent_or_logged(
 ) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     notifier = SystemdNotifier()
-    notifier.notify_ready()
+    notifier.notify("READY")
     notifier.notify_alive("lab: streaming 200.0 Hz")
     assert not caplog.records
 
@@ -78,7 +77,7 @@ def test_an_unreachable_systemd_is_logged_as_a_warning_once(
     notifier = SystemdNotifier()
     manager.close()
     Path(os.environ["NOTIFY_SOCKET"]).unlink()
-    notifier.notify_ready()
+    notifier.notify("READY")
     notifier.notify_alive("lab: streaming 200.0 Hz")
     assert [each.levelname for each in caplog.records if each.levelno > logging.DEBUG] == ["WARNING"]
 
@@ -88,7 +87,7 @@ def test_without_cysystemd_one_warning_names_the_remedy(
 ) -> None:
     monkeypatch.setitem(sys.modules, "cysystemd.daemon", None)
     notifier = SystemdNotifier()
-    notifier.notify_ready()
+    notifier.notify("READY")
     notifier.notify_alive("lab: streaming 200.0 Hz")
     [record] = caplog.records
     assert "pip install 'rtc3d-gateway[systemd]'" in record.message
@@ -123,9 +122,7 @@ class Notifications:
 
     def __init__(self) -> None:
         self.sent: list[str] = []
-        self.notify_ready = partial(self.sent.append, "READY")
-        self.notify_reloading = partial(self.sent.append, "RELOADING")
-        self.notify_stopping = partial(self.sent.append, "STOPPING")
+        self.notify = self.sent.append
 
     def notify_alive(self, status: str) -> None:
         self.sent.append(f"STATUS={status}")

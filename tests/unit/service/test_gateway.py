@@ -248,21 +248,18 @@ async def test_a_new_output_gets_the_known_parameters_and_the_state_of_every_sou
 
 
 async def test_outputs_can_be_added_and_removed(events: list[tuple[str, str]]) -> None:
+    """A removed output takes its commands with it."""
+    both = settings(other="elsewhere")
     async with running(settings()) as gateway:
-        assert await gateway.reload(settings(other="elsewhere")) == ["output other added"]
+        assert await gateway.reload(both) == ["output other added"]
         assert [output.name for output in gateway.outputs] == ["example", "other"]
-        other = example(gateway, 1)
+        former, other = example(gateway), example(gateway, 1)
         assert (other.is_open, other.announced) == (True, {"lab"})
         assert await gateway.reload(settings()) == ["output other removed"]
         assert (other.is_open, other.announced) == (False, set())
         assert events[-1] == ("close", "elsewhere")
-
-
-async def test_a_removed_output_takes_its_commands_with_it() -> None:
-    both = settings(other="elsewhere")
-    async with running(both) as gateway:
-        off = ExampleSettings(enabled=False)
-        await gateway.reload(both.model_copy(update={"example": off}))
+        await gateway.reload(both.model_copy(update={"example": ExampleSettings(enabled=False)}))
+        assert not former.is_open
         with pytest.raises(Exception, match="unknown key 'greet'"):
             await example(gateway).query("lab/greet", name="the operator")
 

@@ -16,7 +16,6 @@ from gateway.errors import QueryError
 from gateway.logs.failures import current_log_fields
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
 from gateway.service.source import Source, SourceHistory
@@ -49,30 +48,13 @@ class Lab:
     ) -> None:
         self.server: ScriptedServer = servers[HOST]
         self.output = output or ToyOutput()
-        self.parameters: list[tuple[str, ServerParameters]] = []
-        self.files: list[tuple[str, ServerFile]] = []
-        self.followed: list[tuple[str, bool, str]] = []
         # An interval of 0 cannot be configured. Here, a refresh always reaches the server.
         of_source = SourceSettings(name="lab", host=HOST, **settings).model_copy(
             update={"fresh_interval_s": 0.0}
         )
         history = history or SourceHistory(of_source, ())
         history.fan_out.set_outputs([self.output])
-        self.source = Source(
-            of_source,
-            history,
-            spool,
-            self._publish_parameters,
-            lambda *each: self.files.append(each),
-            self._follow_recording,
-        )
-
-    async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        self.parameters.append((source, parameters))
-
-    async def _follow_recording(self, source: str, start: bool, name: str) -> dict[str, Any]:
-        self.followed.append((source, start, name))
-        return {}
+        self.source = Source(of_source, history, spool)
 
     def messages(self, component: str) -> list[Any]:
         return [decode(message) for topic, message in self.output.messages if topic.path == (component,)]
@@ -218,7 +200,7 @@ async def test_a_file_is_stored_and_announced(
     async with running(lab):
         lab.server.connection.send(packet(5, content))
         await settle()
-        [(source, file)] = lab.files
+        [(source, file)] = lab.output.files
         assert (source, file.num_bytes) == ("lab", 600)
         answer = await lab.source.queries.answer(Question("c3d"))
         assert (answer.payload, answer.attachment) == (content, file.description)
@@ -234,7 +216,7 @@ async def test_the_files_that_a_new_one_displaces_are_logged_with_it(
     caplog.set_level(logging.INFO)
     lab = new_lab(spool=Spool(tmp_path, max_files=1, max_bytes=1000))
     await receive_files(lab, 2)
-    path = lab.files[1][1].path
+    path = lab.output.files[1][1].path
     [line] = [message for message in caplog.messages if path.name in message]
     assert line.endswith(f"kept as {path}; deleted the oldest (1)")
 
@@ -249,7 +231,7 @@ async def test_a_file_is_announced_although_an_old_one_cannot_be_deleted(
     with monkeypatch.context() as disk:
         disk.setattr(Path, "unlink", refuse)
         await receive_files(lab, 3)
-    assert len(lab.files) == 3
+    assert len(lab.output.files) == 3
     [warning] = [text for text in messages_of(caplog, logging.WARNING) if "C3D" in text]
     assert warning.startswith(f"lab: old C3D files are not deleted: {tmp_path}/lab-")
     assert warning.endswith(" cannot be deleted: Operation not permitted")
@@ -268,7 +250,7 @@ async def test_files_that_cannot_be_stored_are_logged_once(
     ]
     [end] = [message for message in caplog.messages if "lost within" in message]
     assert end.endswith(" s: 6 messages (C3D file)")
-    assert lab.files == []
+    assert lab.output.files == []
 
 
 async def test_a_file_that_breaks_off_with_the_connection_is_logged(
@@ -303,7 +285,9 @@ async def test_a_defect_in_announcing_a_file_is_an_error_and_streams_continue(
     new_lab: NewLab, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab = new_lab()
-    monkeypatch.setattr(lab, "files", None)  # what takes the description of a file raises AttributeError
+    monkeypatch.setattr(
+        lab.output, "files", None
+    )  # what takes the description of a file raises AttributeError
     await receive_files(lab, 1)
     [error] = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert error.message.startswith("lab: defect in the gateway: AttributeError: ")

@@ -7,7 +7,6 @@ import pytest
 
 from gateway.config.settings import StreamSettings
 from gateway.errors import QueryError
-from gateway.outputs.contract import ServerParameters
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
 from tests.support.clocks import settle
@@ -38,7 +37,7 @@ def tools(*labels: str) -> bytes:
 
 def published(lab: Lab) -> list[tuple[bytes, int, int]]:
     """Return the XML, session and version of all parameters that were published."""
-    return [parameters[:3] for _, parameters in lab.parameters]
+    return [parameters[:3] for _, parameters in lab.output.parameters]
 
 
 async def test_a_server_that_hung_in_the_handshake_is_asked_again(new_lab: NewLab) -> None:
@@ -130,7 +129,7 @@ async def test_parameters_are_void_if_another_server_gives_none(new_lab: NewLab)
         lab.server.answer = refusing(REQUEST)
         lab.server.connection.end()
         await settle()
-        assert len(lab.parameters) == 1
+        assert len(lab.output.parameters) == 1
         await lab.connected()
         assert published(lab)[1:] == [(b"", 2, 2)]
         lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
@@ -140,25 +139,18 @@ async def test_parameters_are_void_if_another_server_gives_none(new_lab: NewLab)
 
 async def test_parameters_are_published_before_the_frames_that_have_their_version(new_lab: NewLab) -> None:
     lab = new_lab()
-    is_sent = asyncio.Event()
-    is_sent.set()
-
-    async def publish(_source: str, parameters: ServerParameters) -> None:
-        await is_sent.wait()
-        lab.parameters.append(("lab", parameters))
-
-    lab.source._publish_parameters = publish
     async with running(lab):
         lab.server.answer = sending(OTHER_XML)
-        is_sent.clear()
+        lab.output.sending = asyncio.get_running_loop().create_future()
         lab.source.fan_out.on_items_changed()
         await settle()
-        for version in (1, 2):
-            lab.server.connection.send_frames(version)
-            assert lab.messages("3d")[-1].parameters_version == version
-            assert lab.parameters[-1][1].version == version
-            is_sent.set()
-            await settle()
+        assert lab.output.parameters[-1][1].version == 2
+        lab.server.connection.send_frames(1)
+        assert lab.messages("3d")[-1].parameters_version == 1
+        lab.output.sending.set_result(None)
+        await settle()
+        lab.server.connection.send_frames(2)
+        assert lab.messages("3d")[-1].parameters_version == 2
 
 
 async def test_a_reload_continues_the_version_and_the_parameters_of_another_server_are_void(
@@ -207,4 +199,4 @@ async def test_every_message_carries_the_version_of_the_parameters(new_lab: NewL
             await lab.source.queries.answer(Question("parameters", fresh=True))
             await settle()
             await check_version(version)
-            assert lab.parameters[-1][1].version == version
+            assert lab.output.parameters[-1][1].version == version

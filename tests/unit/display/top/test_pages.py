@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from gateway.display.live.live_data import LiveData, LiveSource
+from gateway.display.live import LiveData, LiveSource
 from gateway.display.top import facts
 from gateway.display.top.pages import PAGES, TWO_GATEWAYS, Page, event_time
 from gateway.display.top.table import laid_out, sorted_by

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.display.view.server import ViewServer, open_server
+from gateway.display.view.viewer import ViewServer, open_server
 from tests.unit.display.live_lab import Lab
 
 

@@ -1,13 +1,13 @@
 """Markers and tools by visibility, the newest events, and the channels that can be plotted."""
 
+import re
 import time
 
-import numpy as np
 import pytest
 
-from gateway.display.live.live_data import LiveSource
-from gateway.display.view.plots import MAX_CHOICES, Channel, choices, component_of, first_choice, samples
-from gateway.display.view.texts import MAX_ROWS, events_html, items_html, worst_first
+from gateway.display.live import LiveSource
+from gateway.display.view.plots import MAX_CHOICES, Channel, choices, samples
+from gateway.display.view.texts import MAX_ROWS, events_html, items_html
 from gateway.rtc3d.components import ComponentType
 from tests.support.takes import START_UTIME
 from tests.unit.display.live_lab import NAN, Lab, text_of, wait
@@ -19,8 +19,11 @@ LABELS = """<The_3D><Markers>3</Markers>
 </The_3D>"""
 
 
-def test_the_least_visible_come_first() -> None:
-    assert worst_first(np.array([1, 0.5, 1, 0, 0.5])) == [3, 1, 4, 0, 2]
+def test_the_least_visible_come_first_and_equal_ones_in_their_order(lab: Lab) -> None:
+    lab.send_markers(True, True, True, False, True)
+    lab.send_markers(True, False, True, False, False)
+    names = re.findall(r"marker \d", text_of(items_html(lab.source)))
+    assert names == ["marker 4", "marker 2", "marker 5", "marker 1", "marker 3"]
 
 
 def test_markers_by_visibility_and_tools_with_their_error(lab: Lab) -> None:
@@ -29,12 +32,12 @@ def test_markers_by_visibility_and_tools_with_their_error(lab: Lab) -> None:
     lab.send_parameters(LABELS)
     for number in range(4):
         lab.send_markers(True, number == 0, number > 0)
-    lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 1, 2, 3, 0.1234), (NAN,) * 8])
+    lab.send(ComponentType.TOOLS, [(1, 0, 0, 0, 1, 2, 3, 0.1234), (NAN,) * 8, (1, 0, 0, 0, 1, 2, 3, NAN)])
     text = text_of(items_html(lab.source))
     assert "|A name in|red|is missing in the newest frame." in text
     assert "|3 markers|visible, last 10 s|" in text
     assert "|RASI|25.0 %|&lt;img src=x onerror=alert(1)&gt;|75.0 %|LASI|100 %|" in text
-    assert "|tool 2|0 %|–|tool 1|100 %|0.123 mm|" in text
+    assert "|tool 2|0 %|–|tool 1|100 %|0.123 mm|tool 3|100 %|– mm|" in text
 
 
 def test_rows_are_bounded(lab: Lab) -> None:
@@ -88,9 +91,8 @@ ANALOG = """<Analog><Channels>2</Channels><Channel><Label>EMG</Label><Unit>V</Un
 
 
 def values(source: LiveSource, channel: Channel) -> list[tuple[list[int], list[float]]]:
-    component = component_of(channel, {"lab": source})
-    assert component is not None
-    return [(utimes.tolist(), found.tolist()) for utimes, found in samples(channel, component)]
+    found = samples(channel, source.components[channel.key])
+    return [(utimes.tolist(), values.tolist()) for utimes, values in found]
 
 
 def test_channels_have_names_and_units(lab: Lab) -> None:
@@ -101,14 +103,6 @@ def test_channels_have_names_and_units(lab: Lab) -> None:
     assert [*found][:3] == ["lab analog 1: EMG (V)", "lab analog 2: Sync (mV)", "lab force 1: plate 1 Fx"]
     assert [*found.values()][2] == Channel("lab", "force", 0, "fx")
     assert len(found) == 2 + 6
-
-
-def test_the_first_choice_is_a_vertical_force_otherwise_the_first_channel(lab: Lab) -> None:
-    assert first_choice({}) is None
-    lab.send(ComponentType.ANALOG, [1.0, 2.0])
-    assert first_choice(choices([lab.source])) == "lab analog 1: channel 1 (mV)"
-    lab.send(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])
-    assert first_choice(choices([lab.source])) == "lab force 1: plate 1 Fz"
 
 
 def test_choices_are_bounded(lab: Lab) -> None:
@@ -126,4 +120,3 @@ def test_samples_of_a_force_plate_and_while_the_number_of_channels_changes(lab: 
     assert values(source, Channel("lab", "force", 1, "mx")) == [([START_UTIME], [10])]
     channel = Channel("lab", "analog", 1, "")
     assert values(source, channel) == [([START_UTIME + 1], [1]), ([START_UTIME + 2], [2])]
-    assert component_of(channel, {}) is None

@@ -152,8 +152,8 @@ def test_a_plot_scrolls_on_when_data_have_stopped(
 ) -> None:
     lab.send(ComponentType.ANALOG, [5.0])
     show()
-    panel._plots._add.value = "lab analog 1: channel 1 (mV)"  # type: ignore[misc]
     show()
+    assert [*panel._plots._plots] == ["lab analog 1: channel 1 (mV)"]  # the first one, without a force
     for _ in range(100):
         lab.send(ComponentType.ANALOG, [5.0])
     panel.update(lab.live.update())

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import viser
 
-from gateway.display.live.live_data import LiveData
-from gateway.display.view.markers_and_tools import Labels
+from gateway.display.live import LiveData
+from gateway.display.view.scene_items import Labels
 from gateway.display.view.viewer import Playback, Viewer
 from gateway.errors import TakeError
 from tests.support.takes import description, markers, parameters, write_take

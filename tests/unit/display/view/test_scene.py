@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.display.view.laboratory import Sphere
-from gateway.display.view.markers_and_tools import GHOST_S, MAX_LABELS, MAX_SEGMENTS
-from gateway.display.view.scene import Scene
-from gateway.display.view.server import ViewServer
+from gateway.display.view.scene import Scene, Sphere
+from gateway.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
+from gateway.display.view.viewer import ViewServer
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
 from tests.support.takes import parameters
@@ -335,7 +334,7 @@ def test_each_source_has_a_group_a_colour_and_a_switch(picture: Picture) -> None
     switch: Any = gym._switch
     switch.value = False
     picture.show()
-    assert (gym.is_visible, lab_scene.is_visible) == (False, True)
+    assert (gym.group.visible, lab_scene.group.visible) == (False, True)
 
 
 def test_old_data_are_hidden_while_nobody_looks(picture: Picture) -> None:

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from gateway.display.live.component import Percentiles
-from gateway.display.view.laboratory import UpAxis, on_floor, sphere_around, up_axis_of
-from gateway.display.view.markers_and_tools import MAX_M, positions_in_metres
+from gateway.display.live import Percentiles
+from gateway.display.view.scene import sphere_around, up_axis_of
+from gateway.display.view.scene_items import MAX_M, UpAxis, on_floor, positions_in_metres
 from gateway.display.view.texts import (
     NONE,
     age_text,
@@ -19,7 +19,6 @@ from gateway.display.view.texts import (
     percentiles_text,
     rate_text,
     share_text,
-    value_text,
 )
 from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 
@@ -41,7 +40,6 @@ def test_numbers() -> None:
     shares = (0, 1, 0.9999, 0.00001, 0.5)  # only all frames are 100 %
     assert [share_text(each) for each in shares] == ["0 %", "100 %", "99.9 %", "0.1 %", "50.0 %"]
     assert [counted(each, "marker") for each in (1, 12345)] == ["1 marker", "12,345 markers"]
-    assert [value_text(each) for each in (0.20849, math.nan)] == ["0.208", NONE]
 
 
 def test_times() -> None:

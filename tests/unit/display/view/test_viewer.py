@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from gateway.display.view.server import ViewServer, address_of, open_server
-from gateway.display.view.viewer import Viewer
+from gateway.display.view.viewer import Viewer, ViewServer, address_of, open_server
 from gateway.errors import ViewError
 from gateway.rtc3d.components import ComponentType
 from tests.support.waiting import wait_until

@@ -11,7 +11,7 @@ from gateway.config.settings import MetricsSettings, SourceSettings, StreamSetti
 from gateway.logs.losses import Losses
 from gateway.rtc3d.components import ComponentType
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.health import health_page, status_lines
+from gateway.service.monitoring.server import health_page, status_lines
 from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus

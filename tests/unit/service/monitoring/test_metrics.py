@@ -19,9 +19,8 @@ from gateway.rtc3d.client_protocol import ProtocolState
 from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.service.gateway import Gateway
-from gateway.service.monitoring.disk_facts import DiskFacts
-from gateway.service.monitoring.metrics import metrics_page, metrics_registry
-from gateway.service.monitoring.process_limits import LoopDelay
+from gateway.service.monitoring.metrics import GatewayMetrics
+from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay
 from gateway.stream.state import StreamState
 from tests.support.configurations import make_settings
 from tests.support.example_output import ExampleOutput, ExampleSettings
@@ -46,10 +45,10 @@ class Lab:
         self.source = self.gateway.sources[0]
         self.markers, self.analog = self.source.statuses
         self.loop_delay = LoopDelay()
-        self._registry = metrics_registry(self.gateway, self.loop_delay, DiskFacts(self.gateway))
+        self._metrics = GatewayMetrics(self.gateway, self.loop_delay, DiskFacts(self.gateway))
 
     def families(self) -> list[Metric]:
-        page = metrics_page(self._registry)
+        page = self._metrics.page()
         assert page.status == 200
         return list(text_string_to_metric_families(page.body.decode()))
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from gateway.logs.failures import log_fields
-from gateway.logs.limits import (
+from gateway.logs.log_format import (
     BURST_LINES,
     LINES_PER_MINUTE,
     MAX_LINE_LENGTH,
@@ -14,9 +14,9 @@ from gateway.logs.limits import (
     OWN_LINES_PER_MINUTE,
     TOTAL_BURST_LINES,
     TOTAL_LINES_PER_MINUTE,
+    ContextFilter,
     LogLimit,
 )
-from gateway.logs.log_format import ContextFilter
 
 LOGGER = logging.getLogger("tests.log_limit")
 

@@ -1,0 +1,446 @@
+"""The newest data of all sources that are received, decoded when they are shown.
+
+``LiveData`` has a ``LiveSource`` for each source, and that a ``LiveComponent`` for each component.
+"""
+
+import logging
+import time
+from collections import deque
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from gateway.client.reception import Reception
+from gateway.client.series import Series, Source
+from gateway.descriptions.labels import Description, EventText, describe, event_text
+from gateway.errors import ParametersError, ProtocolError
+from gateway.messages.decode import decode
+from gateway.messages.host_time import now_utime
+from gateway.messages.source_report import SourceReport, source_report
+from gateway.messages.texts import xml_bytes
+from gateway.messages.topics import lcm_channel
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array, decode_rows
+
+logger = logging.getLogger(__name__)
+
+WINDOW_S: Final = 10.0
+_STEP_S: Final = 0.5
+
+
+def visible_percent(share: float) -> float:
+    """Return a share from 0 to 1 in %, for one decimal: only 0 and 1 themselves become 0.0 and 100.0."""
+    return 100 * share if share in {0, 1} else min(max(100 * share, 0.1), 99.9)
+
+
+class Visibility:
+    """Counts in steps of half a second, over WINDOW_S, in how many frames each item was visible."""
+
+    def __init__(self) -> None:
+        self._steps: deque[tuple[float, int, Array]] = deque()  # begin, number of frames, visible frames
+
+    def add(self, is_visible: Array, now_s: float) -> None:
+        """Take frames; ``is_visible`` has the shape (frames, items).
+
+        If the number of items changes, counting starts again.
+        """
+        self._forget(now_s)
+        num_frames, num_items = is_visible.shape
+        if self._steps and len(self._steps[-1][2]) != num_items:
+            self._steps.clear()
+        begin_s, counts = now_s, is_visible.sum(axis=0)
+        if self._steps and now_s - self._steps[-1][0] < _STEP_S:
+            begin_s, former_frames, former_counts = self._steps.pop()
+            num_frames, counts = former_frames + num_frames, former_counts + counts
+        self._steps.append((begin_s, num_frames, counts))
+
+    def shares(self, now_s: float) -> Array:
+        """Return for each item the share of frames in which it was visible, from 0 to 1, shape (items,).
+
+        The shape is (0,) if no frame came within WINDOW_S.
+        """
+        self._forget(now_s)
+        num_frames = sum(frames for _, frames, _ in self._steps)
+        if not num_frames:
+            return np.zeros(0)
+        total: Array = np.sum([counts for _, _, counts in self._steps], axis=0)
+        return total / num_frames
+
+    def _forget(self, now_s: float) -> None:
+        while self._steps and now_s - self._steps[0][0] > WINDOW_S:
+            self._steps.popleft()
+
+
+_NUM_SAMPLES: Final = 2000
+_NUM_SHOWN: Final = 300
+"""10 s at 30 pictures per second."""
+
+
+class Percentiles(NamedTuple):
+    """Percentiles of a latency, in milliseconds."""
+
+    p50_ms: float
+    p99_ms: float
+
+    @classmethod
+    def of(cls, samples_ms: Any) -> "Percentiles | None":
+        """Return the percentiles of a sequence of samples; None if it is empty."""
+        return cls(*np.percentile(samples_ms, (50, 99)).tolist()) if len(samples_ms) else None
+
+
+class Latency:
+    """The latencies of the newest messages, at most 2000, by stage.
+
+    Latencies to this computer are on two clocks if the gateway runs on another computer, and then they are
+    only as exact as these clocks agree. They may be negative.
+    """
+
+    def __init__(self) -> None:
+        self._samples = np.zeros((_NUM_SAMPLES, 2))  # ms from capture to the gateway, and from there to here
+        self._num_added = 0
+        self.shown_ms: deque[float] = deque(maxlen=_NUM_SHOWN)
+        """From the arrival at this program to the browsers, of what they have shown."""
+
+    def add(self, capture_utime: Array, utime: Array, arrived_utime: Array) -> None:
+        """Take the times of messages, each with the shape (messages,), in µs since the Unix epoch."""
+        times = np.stack([capture_utime, utime, arrived_utime]).astype(np.float64)[:, -_NUM_SAMPLES:]
+        places = (self._num_added + np.arange(times.shape[1])) % _NUM_SAMPLES
+        self._samples[places] = np.diff(times, axis=0).T / 1000
+        self._num_added += times.shape[1]
+
+    @property
+    def to_gateway(self) -> Percentiles | None:
+        """From the capture to the arrival at the gateway; None before the first message."""
+        return Percentiles.of(self._samples[: self._num_added, 0])
+
+    @property
+    def to_here(self) -> Percentiles | None:
+        """From the arrival at the gateway to the arrival at this program; None before the first message."""
+        return Percentiles.of(self._samples[: self._num_added, 1])
+
+
+MAX_WAITING: Final = 20_000
+"""How many messages of one component may wait for ``update``; older ones are skipped."""
+
+_MAX_WAITING_BYTES: Final = 32 * 1024 * 1024
+
+_RATE_WINDOW_S: Final = 2.0
+
+_STOPPED_S: Final = 0.5
+"""Data that do not come for this long, and for STOPPED_FRAMES frames, have stopped."""
+_STOPPED_FRAMES: Final = 4
+
+SLOW_SHARE: Final = 0.95
+"""A rate below this share of the announced one is slow."""
+
+
+class LiveComponent:
+    """The newest messages of one component.
+
+    ``receive`` is called in the threads of Zenoh or LCM, everything else in the thread that reads.
+    """
+
+    def __init__(self, component: ComponentType) -> None:
+        self.type = component
+        self.batch = decode_rows(component, [])
+        """What came between the last two calls of ``update``, in its order."""
+        self.newest_head: Any | None = None
+        """The newest message before its items, with the fields of HEAD; None before the first."""
+        self.newest_items: Array = np.empty(0, NATIVE_ITEM_DTYPES[component])
+        """The items of the newest message, shape (items,), in native byte order."""
+        self.num_skipped = 0
+        """How many messages were not decoded, because too many waited."""
+        self.num_malformed = 0
+        """How many messages could not be decoded."""
+        self.latency = Latency()
+        self.description: Description = describe(component, None, 0)
+        """The labels, units and announced rate of the newest items."""
+        self._visibility = Visibility()
+        self._counts: deque[tuple[float, int]] = deque()  # time and number of messages so far
+        self._rate_before_stop_hz = 0.0
+        self._paused_s = 0.0  # how long it was held so far
+        self._updated_s = self._now_s
+        self._arrived_s: float | None = None
+        self._arrived_utime = 0  # of the newest message, before it waited for ``update``
+        self._waiting: deque[tuple[bytes, int]] = deque()  # messages, and when they arrived
+        self._waiting_bytes = 0
+        self._described: tuple[Parameters | None, int] = (None, 0)
+
+    # In the threads that receive, one at a time.
+
+    def receive(self, message: bytes) -> None:
+        """Take a message."""
+        self._waiting.append((message, now_utime()))
+        self._waiting_bytes += len(message)
+        while len(self._waiting) > MAX_WAITING or self._waiting_bytes > _MAX_WAITING_BYTES:
+            self._waiting_bytes -= len(self._waiting.popleft()[0])
+            self.num_skipped += 1
+
+    def take_waiting(self) -> list[tuple[bytes, int]]:
+        """Return the messages that wait, each with its time of arrival, and remove them."""
+        waiting, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
+        return [*waiting]
+
+    # In the thread that reads.
+
+    def hold(self) -> None:
+        """Count no time since the last ``update``."""
+        self._paused_s += self._now_s - self._updated_s
+
+    @property
+    def _now_s(self) -> float:
+        """The monotonic clock, which stands still in pauses."""
+        return time.monotonic() - self._paused_s
+
+    def update(self, arrived: list[tuple[bytes, int]], parameters: Parameters | None) -> None:
+        """Decode messages that have arrived, and describe their items by the source's parameters."""
+        now_s = self._updated_s = self._now_s
+        self.batch = rows = decode_rows(self.type, [message for message, _ in arrived])
+        self.num_malformed += rows.malformed
+        num_before = self._counts[-1][1] if self._counts else 0
+        self._counts.append((now_s, num_before + len(arrived)))
+        while len(self._counts) > 2 and now_s - self._counts[1][0] >= _RATE_WINDOW_S:
+            self._counts.popleft()
+        if len(rows.heads):
+            self._arrived_s = now_s
+            self._arrived_utime = arrived[-1][1]
+            self._rate_before_stop_hz = self.rate_hz
+            head = self.newest_head = rows.heads[-1]
+            self.newest_items = rows.items[int(head["num_items"])][-1]
+            if not rows.malformed:
+                times = np.array([utime for _, utime in arrived])
+                self.latency.add(rows.heads["capture_utime"], rows.heads["utime"], times)
+            if self.type in {ComponentType.MARKERS, ComponentType.TOOLS}:  # the others are never missing
+                for items in rows.items.values():
+                    self._visibility.add(_is_visible(items), now_s)
+        num_items = len(self.newest_items)
+        if self._described[0] is not parameters or self._described[1] != num_items:
+            self._described = (parameters, num_items)
+            self.description = describe(self.type, parameters, num_items)
+
+    def note_shown(self) -> None:
+        """Take note that the newest messages are sent to the browsers now."""
+        if len(self.batch.heads):
+            self.latency.shown_ms.append((now_utime() - self._arrived_utime) / 1000)
+
+    @property
+    def rate_hz(self) -> float:
+        """How many messages come per second, over two seconds; 0 before the second call of ``update``."""
+        if len(self._counts) < 2:
+            return 0.0
+        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
+        return (last - first) / max(last_s - first_s, 1e-3)
+
+    @property
+    def announced_rate_hz(self) -> float | None:
+        """The rate that the server has announced; None if it has not."""
+        return self.description.rate_hz
+
+    @property
+    def is_visible(self) -> Array:
+        """Whether each marker or tool is visible now, shape (items,): none is if data have stopped."""
+        return _is_visible(self.newest_items) & (not self.is_stopped)
+
+    @property
+    def visible_shares(self) -> Array:
+        """In which share of the frames of the last 10 s each marker or tool was visible, from 0 to 1.
+
+        The shape is (items,); it is (0,) if no frame came in this time.
+        """
+        shares = self._visibility.shares(self._now_s)
+        return shares if len(shares) == len(self.newest_items) else shares[:0]
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether fewer messages come than the server has announced."""
+        announced_hz = self.announced_rate_hz
+        return announced_hz is not None and self.rate_hz < SLOW_SHARE * announced_hz
+
+    @property
+    def age_s(self) -> float | None:
+        """How long ago the newest message arrived; None before the first."""
+        return None if self._arrived_s is None else self._now_s - self._arrived_s
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether data came before and come no more. Events come at any time, so they never stop."""
+        age_s = self.age_s
+        if self.type is ComponentType.EVENT or age_s is None:
+            return False
+        frames_s = _STOPPED_FRAMES / self._rate_before_stop_hz if self._rate_before_stop_hz else 0.0
+        return age_s > max(_STOPPED_S, frames_s)
+
+
+def _is_visible(items: Array) -> Array:
+    """Return for each marker or tool of an array whether it is visible, in the shape of ``items``.
+
+    Any NaN in a position or orientation means missing (§7.3, field note 7).
+    """
+    visible: Array = np.ones(items.shape, bool)
+    for name in items.dtype.names or ():
+        if name not in {"reliability", "error"}:
+            visible &= np.isfinite(items[name])
+    return visible
+
+
+NUM_EVENTS: Final = 20
+"""How many of the newest events of a source are kept."""
+
+_NO_STATUS_S: Final = 3.0
+"""A gateway that runs sends a status every second."""
+
+
+class LiveEvent(NamedTuple):
+    """An event, and when it was captured: µs since the Unix epoch, on the gateway's clock."""
+
+    capture_utime: int
+    text: EventText
+
+
+class LiveSource(Source):
+    """What a source publishes now."""
+
+    def __init__(self, name: str, channels: str) -> None:
+        super().__init__(name, channels)
+        self.components: dict[str, LiveComponent] = {}
+        """The components that have come so far, by key. The threads that receive add to it."""
+        self.events: deque[LiveEvent] = deque(maxlen=NUM_EVENTS)
+        """The newest events, the newest one last."""
+        self.newest_parameters = Parameters()
+        """The server's parameters; without any section until they come."""
+        self.parameters_version = 0
+        self.report: SourceReport | None = None
+        """What the newest status says; None before the first."""
+        self.first_report: SourceReport | None = None
+        """What the first status since the gateway's start says that came here."""
+        self.num_unreadable = 0
+        """How many parameters and statuses could not be read."""
+        self._read_parameters: bytes | None = None
+        self._read_status: bytes | None = None
+        self._status_s = 0.0
+
+    @property
+    def num_skipped(self) -> int:
+        """How many messages were not decoded, because too many waited."""
+        return sum(component.num_skipped for component in [*self.components.values()])
+
+    @property
+    def status_age_s(self) -> float | None:
+        """How long ago the newest status came; None before the first."""
+        return None if self.report is None else time.monotonic() - self._status_s
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether its gateway cannot be heard: it sends no status."""
+        age_s = self.status_age_s
+        return time.monotonic() - self.found_s > _NO_STATUS_S if age_s is None else age_s > _NO_STATUS_S
+
+    @property
+    def age_s(self) -> float | None:
+        """How long ago the newest data came; None before the first."""
+        ages = [each.age_s for each in [*self.components.values()] if each.age_s is not None]
+        return min(ages, default=None)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether some component has come before and comes no more."""
+        return any(component.is_stopped for component in [*self.components.values()])
+
+    def update(self, arrived: dict[str, list[tuple[bytes, int]]]) -> None:
+        """Decode what has arrived since the last call, by the key of the component."""
+        if self.parameters is not self._read_parameters:
+            self._read_parameters = self.parameters
+            self._decode_parameters(self.parameters or b"")
+        if self.status is not self._read_status:
+            self._read_status = self.status
+            self._decode_status(self.status or b"")
+        for key, component in [*self.components.items()]:
+            component.update(arrived.get(key, []), self.newest_parameters)
+        events = self.components.get("event")
+        if events is None:
+            return
+        heads = events.batch.heads
+        for num_items, items in events.batch.items.items():
+            times = heads["capture_utime"][heads["num_items"] == num_items]
+            for utime, row in zip(times[-NUM_EVENTS:], items[-NUM_EVENTS:], strict=True):
+                for item in row[-NUM_EVENTS:]:
+                    self.events.append(LiveEvent(int(utime), event_text(self.newest_parameters, item)))
+
+    def _decode_parameters(self, message: bytes) -> None:
+        try:
+            decoded = decode(message)
+            xml = xml_bytes(decoded.xml)
+            self.newest_parameters = parse_parameters(xml).parameters if xml else Parameters()
+            self.parameters_version = decoded.parameters_version
+        except (ParametersError, ProtocolError) as error:
+            self.num_unreadable += 1
+            logger.debug("%s: parameters: %s", self.name, error)
+
+    def _decode_status(self, message: bytes) -> None:
+        try:
+            former, self.report = self.report, source_report(decode(message))
+            if former is None or former.sequence > self.report.sequence:
+                self.first_report = self.report
+            self._status_s = time.monotonic()
+        except ProtocolError as error:
+            self.num_unreadable += 1
+            logger.debug("%s: status: %s", self.name, error)
+
+
+class LiveData(Reception[LiveSource, Series]):
+    """The newest data of all sources.
+
+    Messages are received in the threads of Zenoh or LCM. ``update`` decodes them; it and everything that it
+    changes belong to one thread. Messages that are not decoded in time are skipped, never queued.
+    """
+
+    def update(self) -> list[LiveSource]:
+        """Decode what has arrived; return the sources, sorted by name. Call it at least 10 times a second."""
+        with self._lock:
+            sources = [*self.sources.values()]
+            arrived = [
+                {key: component.take_waiting() for key, component in source.components.items()}
+                for source in sources
+            ]
+        for source, messages in zip(sources, arrived, strict=True):
+            source.update(messages)
+        return sorted(sources, key=lambda source: source.name)
+
+    def publish(self, source: str, key: str, message: bytes) -> None:
+        """Take a message of a recording, as a replay publishes it."""
+        found = self.source(source, lcm_channel("MOCAP", source), is_known=True)
+        series = None if found is None else self.series(found, key, f"{found.channels}_{key.upper()}")
+        if series is None:
+            self.ignore(beyond_limit=True)
+        elif key == "parameters":
+            self.receive_parameters(series, message, is_made=False)
+        else:
+            self.receive(series, message)
+
+    def hold(self) -> None:
+        """Count no time since the last ``update``: a recording pauses. Call it before each ``update``."""
+        for source in self.sources_now:
+            for component in [*source.components.values()]:
+                component.hold()
+
+    def begin_again(self) -> None:
+        """Forget everything, because a recording continues at another place."""
+        with self._lock:
+            self.sources.clear()
+            self._num_series = 0
+
+    def _new_source(self, name: str, channels: str) -> LiveSource:
+        return LiveSource(name, channels)
+
+    def _new_series(self, source: LiveSource, key: str, channel: str) -> Series:
+        if key in COMPONENTS_BY_KEY:
+            source.components[key] = LiveComponent(COMPONENTS_BY_KEY[key])
+        return Series(source, key, channel)
+
+    def _take(self, series: Series, message: bytes) -> None:
+        source: Any = series.source
+        component = source.components.get(series.key)
+        if component is not None:
+            component.receive(message)

@@ -1,1 +1,0 @@
-"""What gateways publish now, decoded for programs that show it."""
