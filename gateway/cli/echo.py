@@ -1,14 +1,13 @@
 """``rtc3d-gateway echo``: subscribe to a gateway, and print its messages or their rates."""
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from gateway.cli.main import exit_with
 from gateway.cli.options import AddressOptions, ComponentOption, SourceOption, with_options
-
-if TYPE_CHECKING:
-    from gateway.cli.echo_output import Subscribe
+from gateway.errors import QueryError
 
 
 @with_options
@@ -42,23 +41,26 @@ def echo(
 
     from gateway.cli.echo_output import Limits, print_messages, print_rates
     from gateway.cli.echo_sources import Silence, Units
-    from gateway.cli.main import exit_with
-    from gateway.errors import QueryError
     from gateway.outputs.kind import SubscriptionRequest
+    from gateway.outputs.registry import OUTPUTS
 
     request = SubscriptionRequest(
         source, component, where.prefix, where.connect or where.url, where.zenoh_config
     )
     limits = Limits(count, seconds)
     silence = Silence(name, request)
-    subscribe = _subscribe_function(name)
+    functions = {each: kind.subscribe for each, kind in OUTPUTS.items() if kind.subscribe is not None}
+    if name not in functions:
+        raise typer.BadParameter(
+            f"no messages to print from output {name!r}; choose one of: {', '.join(functions)}"
+        )
     try:
         if hz:
-            num_received = print_rates(subscribe, request, limits, silence, sys.stdout, as_json=as_json)
+            num_received = print_rates(functions[name], request, limits, silence, sys.stdout, as_json=as_json)
         else:
             units = Units(name, request)
             num_received = print_messages(
-                subscribe, request, limits, silence, units, sys.stdout, as_json=as_json
+                functions[name], request, limits, silence, units, sys.stdout, as_json=as_json
             )
     except QueryError as error:
         exit_with([error])
@@ -68,15 +70,3 @@ def echo(
     if count is not None and num_received < count:
         print(f"{num_received} of {count} messages arrived within {seconds:g} s", file=sys.stderr)
         raise typer.Exit(1)
-
-
-def _subscribe_function(output: str) -> "Subscribe":
-    """Return the function that subscribes on the output of this name; BadParameter if there is none."""
-    from gateway.outputs.registry import OUTPUTS
-
-    functions = {name: kind.subscribe for name, kind in OUTPUTS.items() if kind.subscribe is not None}
-    if output not in functions:
-        raise typer.BadParameter(
-            f"no messages to print from output {output!r}; choose one of: {', '.join(functions)}"
-        )
-    return functions[output]

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.found_sources import FoundSources
 from gateway.config.words import join_or
 from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError
@@ -155,7 +154,7 @@ class Silence:
                 if found.absence and found.heard:
                     self._error = QueryError(found.absence, code="no-gateway")
                 else:
-                    self._reason = found.absence or self._why_silent(found, client)
+                    self._reason = found.absence or self._why_silent(found.sources, client)
         except QueryError as error:
             self._error = error
         except OutputError as error:
@@ -163,56 +162,41 @@ class Silence:
         except Exception as error:  # noqa: BLE001 - what comes later is printed, whatever this is
             self._reason = f"nothing heard, and the search for gateways failed: {error}"
 
-    def _why_silent(self, found: FoundSources, client: GatewayClient) -> str:
-        """Return what the sources do; raise QueryError if they do not have the component."""
+    def _why_silent(self, sources: Sequence[SourceReport], client: GatewayClient) -> str:
+        """Return what the sources do; raise QueryError if they do not have the component or the tool."""
         component = self._request.component or ""
         key, _, label = component.partition("/")
-        if all(source.streams for source in found.sources):
-            _check_component(key, found.sources)
+        existing = dict.fromkeys(key for source in sources for key in source.components)
+        if key in COMPONENTS_BY_KEY and key not in existing and all(source.streams for source in sources):
+            raise QueryError(
+                f"no {key} from {', '.join(source.name for source in sources[:_MAX_NAMED])}; accepted for "
+                f"--component: {join_or((*existing, 'status', 'clock', 'parameters'))}",
+                code="no-gateway",
+            )
         tool_poses = ""
         if label:
             self._check_tool(label, client)
             tool_poses = f"; poses of single tools need {self._output}.tool_poses: true in the configuration"
         what = f" of {safe_text(component)}" if component else ""
-        shown = ", ".join(f"{source.name}: {_state(source)}" for source in found.sources[:_MAX_NAMED])
+        shown = ", ".join(
+            f"{source.name}: {source.problem or source.text}" for source in sources[:_MAX_NAMED]
+        )
         return f"nothing heard{what} although a gateway runs ({shown}){tool_poses}"
 
     def _check_tool(self, label: str, client: GatewayClient) -> None:
-        labels = self._tool_labels(client)
-        if not labels or label == "*" or any(self._is_same(label, each) for each in labels):
-            return
-        shown = ", ".join(map(safe_text, labels[:_MAX_NAMED])) + (", …" if len(labels) > _MAX_NAMED else "")
-        raise QueryError(f"no gateway has a tool {quoted(label)}; tools found: {shown}", code="no-gateway")
-
-    def _is_same(self, label: str, other: str) -> bool:
-        return label == other or (
-            self._output == "lcm" and lcm_channel("", "", label) == lcm_channel("", "", other)
-        )
-
-    def _tool_labels(self, client: GatewayClient) -> list[str]:
-        """Return the labels of the tools of the sources, each once; [] if they are not known."""
+        """Raise QueryError if the labels of the sources' tools are known, and none is ``label``."""
         labels: dict[str, None] = {}
         for reply in client.parameters(self._request.source, ("6d",)).received:
             try:
                 parameters = parse_parameters(reply.content).parameters
             except ParametersError:
-                return []
+                return
             num_tools = 0 if parameters.tools is None else len(parameters.tools.tools)
             labels |= dict.fromkeys(describe(ComponentType.TOOLS, parameters, num_tools).labels)
-        return list(labels)
-
-
-def _check_component(key: str, sources: Sequence[SourceReport]) -> None:
-    """Raise QueryError if ``key`` is a component of measured data, and no source has it."""
-    existing = list(dict.fromkeys(key for source in sources for key in source.components))
-    if key in COMPONENTS_BY_KEY and key not in existing:
-        names = [source.name for source in sources[:_MAX_NAMED]]
-        raise QueryError(
-            f"no {key} from {', '.join(names)}; accepted for --component: "
-            f"{join_or((*existing, 'status', 'clock', 'parameters'))}",
-            code="no-gateway",
-        )
-
-
-def _state(source: SourceReport) -> str:
-    return source.problem or source.text
+        channels = {lcm_channel("", "", each) for each in labels} if self._output == "lcm" else ()
+        if labels and label not in {"*", *labels} and lcm_channel("", "", label) not in channels:
+            shown = ", ".join(map(safe_text, list(labels)[:_MAX_NAMED]))
+            shown += ", …" if len(labels) > _MAX_NAMED else ""
+            raise QueryError(
+                f"no gateway has a tool {quoted(label)}; tools found: {shown}", code="no-gateway"
+            )

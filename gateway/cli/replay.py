@@ -18,11 +18,9 @@ from gateway.cli.options import (
     ZenohConfigOption,
     checked_key_prefix,
 )
+from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.takes.replay.timeline import MAX_GAP_S
-
-_SWITCH_S: Final = 0.0005
-"""How long another thread that runs Python, such as that of the progress, may keep the replay waiting."""
 
 _MAX_RATE: Final = 1000.0
 _MIN_RATE: Final = 0.01
@@ -97,13 +95,13 @@ def replay(
         raise typer.BadParameter("--to must be greater than --from")
     import uvloop
 
-    from gateway.cli.replay_run import ReplayRun
+    from gateway.cli.replay_run import run_replay
     from gateway.takes.files.reader import TakeReader
     from gateway.takes.replay.play_list import Selection
     from gateway.takes.replay.replay import ZenohAddress, lcm_destination, zenoh_destination
 
     set_up_log(LogLevel.WARNING)
-    sys.setswitchinterval(_SWITCH_S)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.freeze()  # or a full garbage collection looks through all modules, which takes 20 ms
     destinations = []
     if not lcm:
@@ -116,9 +114,17 @@ def replay(
         round(from_s * 1e6),
         None if to_s is None else round(to_s * 1e6),
     )
-    pace = None if rate == "max" else float(rate)
-    run = ReplayRun(TakeReader(file), selection, pace, is_repeated=loop, max_gap_s=max_gap, quiet=quiet)
-    if not uvloop.run(run.replay(destinations, are_required=zenoh or lcm)):
+    run = run_replay(
+        TakeReader(file),
+        selection,
+        destinations,
+        rate=None if rate == "max" else float(rate),
+        is_repeated=loop,
+        max_gap_s=max_gap,
+        are_required=zenoh or lcm,
+        quiet=quiet,
+    )
+    if not uvloop.run(run):
         raise typer.Exit(1)
 
 

@@ -1,13 +1,15 @@
-"""``rtc3d-gateway take``: what recordings contain, and recording in a gateway."""
+"""``rtc3d-gateway take`` and ``export``: what recordings contain, and recording in a gateway."""
 
-import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gateway.cli.main import exit_with, print_json
 from gateway.cli.options import (
     ConnectOption,
     DetailsOptions,
@@ -19,10 +21,15 @@ from gateway.cli.options import (
     checked_take_name,
     with_options,
 )
-from gateway.logs.safe_text import safe_json, safe_text
+from gateway.config.words import join_or
+from gateway.errors import QueryError
+from gateway.logs.safe_text import safe_text
+from gateway.takes.export.job import FORMATS, ExportJob, export_take
 
 if TYPE_CHECKING:
-    from gateway.cli.take_list import ListedTake
+    from rich.progress import TaskID
+
+    from gateway.cli.take_report import ListedTake
     from gateway.client.client import TakeReplies
 
 app = typer.Typer(
@@ -131,11 +138,8 @@ def fetch(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    from gateway.cli.export_progress import file_progress
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_list import size_text
+    from gateway.cli.take_report import size_text
     from gateway.client.client import GatewayAddress, GatewayClient
-    from gateway.errors import QueryError
     from gateway.takes.files.new_file import NewFiles
     from gateway.takes.files.reader import SUFFIX
 
@@ -145,10 +149,9 @@ def fetch(
     try:
         with NewFiles() as files:
             copy = files.create(path)  # before a long transfer: the file may exist already
-            with (
-                GatewayClient(address, timeout) as client,
-                file_progress(f"fetching {name}", quiet=quiet) as progress,
-            ):
+            with GatewayClient(address, timeout) as client, progress_bar(quiet=quiet) as show:
+                progress = partial(show, f"fetching {name}")
+                progress(0, 0)  # until the first piece
                 fetched = client.fetch_take(name, copy, source=source, progress=progress)
     except QueryError as error:
         exit_with([error])
@@ -173,13 +176,12 @@ def list_(
     """
     from rich.console import Console
 
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_list import write_list
+    from gateway.cli.take_report import write_list
 
     with query.client(lcm=lcm) as client:
         replies = client.takes(source)
     if as_json:
-        _print_json(replies.received)
+        print_json(replies.received)
     else:
         write_list(replies.received, Console(file=sys.stdout))
     exit_with(replies.problems)
@@ -198,14 +200,13 @@ def info(
     """
     from rich.console import Console
 
-    from gateway.cli.export_progress import file_progress
     from gateway.cli.take_report import statistics_json, write_report
     from gateway.takes.files.statistics import take_statistics
 
-    with file_progress(f"reading {file.name}", quiet=quiet) as progress:
-        statistics = take_statistics(file, progress)
+    with progress_bar(quiet=quiet) as show:
+        statistics = take_statistics(file, partial(show, f"reading {file.name}"))
     if as_json:
-        _print_json(statistics_json(statistics))
+        print_json(statistics_json(statistics))
     else:
         write_report(statistics, Console(file=sys.stdout))
     if statistics.was_cut_short:
@@ -214,12 +215,11 @@ def info(
 
 def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], *, as_json: bool) -> None:
     """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_list import ListedTake
+    from gateway.cli.take_report import ListedTake
 
     takes = {source: ListedTake(content) for source, content in replies.received.items()}
     if as_json:
-        _print_json(replies.received)
+        print_json(replies.received)
     else:
         for source, take in takes.items():
             print(safe_text(f"{source}: {text(take)}"))
@@ -228,5 +228,59 @@ def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], 
         raise typer.Exit(1)
 
 
-def _print_json(content: Any) -> None:
-    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
+def export(
+    file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
+    out: Annotated[
+        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
+    ],
+    source: SourceOption = None,
+    from_s: Annotated[
+        float | None,
+        typer.Option("--from", min=0, help="Where to begin, in s from the take's first message."),
+    ] = None,
+    to_s: Annotated[
+        float | None,
+        typer.Option(
+            "--to", min=0, help="Where to end, in s from the first message; the default is its end."
+        ),
+    ] = None,
+    quiet: NoProgressOption = False,
+) -> None:
+    """Convert a take to a file of another program, such as C3D; never overwrite a file."""
+    if from_s is not None and to_s is not None and from_s >= to_s:
+        raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
+    job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
+    with progress_bar(quiet=quiet, counts_bytes=False) as job.progress:
+        paths = export_take(job)
+    for note in job.notes:
+        print(f"note: {safe_text(note)}", file=sys.stderr)
+    for path in paths:
+        size = path.stat().st_size
+        print(f"{path} ({size / 1e6:.1f} MB)" if size >= 100_000 else f"{path} ({size / 1e3:.1f} kB)")
+
+
+@contextmanager
+def progress_bar(*, quiet: bool, counts_bytes: bool = True) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar on a terminal, unless ``quiet``, until the context ends; yield a function that moves it.
+
+    It takes what is done, how much of it, and how much there is; 0 is unknown. Each step has its own bar.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(file=sys.stderr)
+    amount = [DownloadColumn()] if counts_bytes else []
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), *amount, TimeRemainingColumn())
+    is_hidden = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=is_hidden) as bar:
+        tasks: dict[str, TaskID] = {}  # the present one
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                for task in tasks.values():
+                    bar.remove_task(task)
+                tasks.clear()
+                tasks[what] = bar.add_task(safe_text(what), total=total or None)
+            bar.update(tasks[what], completed=done, total=total or None)
+
+        yield show

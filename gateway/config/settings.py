@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import (
-    AfterValidator,
     Field,
-    PlainSerializer,
     PlainValidator,
     TypeAdapter,
+    WrapValidator,
     create_model,
     field_validator,
     model_validator,
@@ -82,25 +81,17 @@ class StreamSettings(Section):
 
 _StreamList = Annotated[
     tuple[StreamSettings, ...],
-    AfterValidator(not_empty),
+    not_empty,
     expects("auto, or a list of streams, one or more"),
     Field(json_schema_extra={"minItems": 1}),
 ]
 _STREAM_LIST: Final[TypeAdapter[tuple[StreamSettings, ...]]] = TypeAdapter(_StreamList)
 
 
-def _streams(value: object) -> Literal["auto"] | tuple[StreamSettings, ...]:
-    return "auto" if value == "auto" else _STREAM_LIST.validate_python(value)
-
-
-def _streams_to_yaml(streams: Literal["auto"] | tuple[StreamSettings, ...]) -> str | list[dict[str, Any]]:
-    return "auto" if streams == "auto" else [stream.model_dump(mode="json") for stream in streams]
-
-
+# As a mere union, a mistake in a list would also be reported as not being the word auto.
 Streams = Annotated[
-    Literal["auto"] | tuple[StreamSettings, ...],
-    PlainValidator(_streams, json_schema_input_type=Literal["auto"] | _StreamList),
-    PlainSerializer(_streams_to_yaml),
+    Literal["auto"] | _StreamList,
+    WrapValidator(lambda value, _: value if value == "auto" else _STREAM_LIST.validate_python(value)),
 ]
 """In YAML: auto, or a list of streams."""
 
@@ -183,7 +174,7 @@ class SourceSettings(Section):
 
     @property
     def effective(self) -> dict[str, Effective]:
-        """See Section."""
+        """The source's name as ``frame_id``."""
         return {} if self.frame_id is not None else {"frame_id": Effective(self.name)}
 
     @property
@@ -236,11 +227,6 @@ class ListenAddress(NamedTuple):
     key: tuple[str, ...]
     host: str
     port: int
-
-    def collides_with(self, other: "ListenAddress") -> bool:
-        """Return whether only one of the two can be opened."""
-        hosts = {self.host, other.host}
-        return self.port == other.port and (len(hosts) == 1 or not hosts.isdisjoint(_ALL_ADDRESSES))
 
 
 _ALL_ADDRESSES: Final = {"0.0.0.0", "::"}  # noqa: S104 - not bound here
@@ -334,7 +320,7 @@ class Settings(Section):
 
     sources: Annotated[
         tuple[SourceSettings, ...],
-        AfterValidator(not_empty),
+        not_empty,
         expects("a list of sources, one or more, each with name and host"),
         Field(json_schema_extra={"minItems": 1}),
     ]
@@ -390,7 +376,8 @@ class Settings(Section):
         for name, section in sections.items():
             for address in section.listens_on if section.enabled else ():
                 for other_key, other in used.items():
-                    if address.collides_with(other):
+                    hosts = {address.host, other.host}
+                    if address.port == other.port and (len(hosts) == 1 or hosts & _ALL_ADDRESSES):
                         raise validation_error(
                             f"found {address.port}, which {other_key} has too; expected another port",
                             *(name, *address.key),
