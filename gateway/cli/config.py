@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gateway.cli import options
 from gateway.cli.main import print_json
-from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption, check_exists
 from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.errors import ConfigError
@@ -26,8 +26,7 @@ app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or 
 @app.command()
 def check(
     file: Annotated[
-        Path | None,
-        typer.Argument(help=f"The configuration file to check; the default is {DEFAULT_CONFIG}."),
+        Path | None, typer.Argument(help=f"The configuration file to check; the default is {DEFAULT_CONFIG}.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", metavar="FILE", help="The same as FILE.")
@@ -60,7 +59,7 @@ def check(
 
 
 @app.command()
-def show(config: ConfigOption = None, server: ServerOption = None) -> None:
+def show(config: options.ConfigOption = None, server: options.ServerOption = None) -> None:
     """Print the effective configuration and where each value comes from. Secrets are masked."""
     from gateway.config.loading import shown_configuration
 
@@ -77,8 +76,8 @@ def schema() -> None:
 
 
 def doctor(
-    config: ConfigOption = None,
-    server: ServerOption = None,
+    config: options.ConfigOption = None,
+    server: options.ServerOption = None,
     seconds: Annotated[
         float,
         typer.Option(min=0.1, max=3600, help="How many seconds to watch each source and to wait for Zenoh."),
@@ -89,7 +88,7 @@ def doctor(
             "--no-connect", help="Ask the running gateway only; open no connection to the RT servers."
         ),
     ] = False,
-    zenoh_config: ZenohConfigOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Log what the checks do, on stderr.")
@@ -102,7 +101,7 @@ def doctor(
 
     Without options, it uses the configuration of the installed service.
     """
-    check_exists("--zenoh-config", zenoh_config)
+    options.check_exists("--zenoh-config", zenoh_config)
     import uvloop
     from rich.console import Console
 

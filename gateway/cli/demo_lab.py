@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, TypeAlias
 
 from rich.console import Console
@@ -27,6 +28,7 @@ from gateway.errors import OutputError, ViewError
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.host_time import now_utime
 from gateway.messages.summary import summarise
+from gateway.outputs.kind import DemoSide
 from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER
 from gateway.rtc3d_server.scene import Scene
@@ -151,8 +153,7 @@ async def run_demo(
         gateway = Gateway(settings, [side.output for side in sides.values()])
         await stack.enter_async_context(_running(gateway))
         for name, side in sides.items():
-            health = side.output.health
-            await _until(lambda health=health: health().connected, _START_TIMEOUT_S, f"{name} did not open")
+            await _until(partial(_is_open, side), _START_TIMEOUT_S, f"{name} did not open")
             stack.callback(side.subscribe(SOURCE, received[name].add).close)
             if view is not None and side.endpoint is not None:
                 await stack.enter_async_context(view(side.endpoint))
@@ -198,6 +199,10 @@ async def _running(gateway: Gateway) -> AsyncIterator[None]:
     finally:
         stop.set()
         await task
+
+
+def _is_open(side: DemoSide) -> bool:
+    return side.output.health().connected
 
 
 async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:

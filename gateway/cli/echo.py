@@ -1,16 +1,17 @@
 """``rtc3d-gateway echo``: subscribe to a gateway, and print its messages or their rates."""
 
 import sys
+from functools import partial
 from typing import Annotated
 
 import typer
 
+from gateway.cli import options
 from gateway.cli.main import exit_with
-from gateway.cli.options import AddressOptions, ComponentOption, SourceOption, with_options
 from gateway.errors import QueryError
 
 
-@with_options
+@options.with_options
 def echo(
     *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
@@ -19,15 +20,15 @@ def echo(
         str | None,
         typer.Option(metavar="NAME", help="Subscribe on the output with this name, such as zenoh or lcm."),
     ] = None,
-    source: SourceOption = None,
-    component: ComponentOption = None,
+    source: options.SourceOption = None,
+    component: options.ComponentOption = None,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after this number of messages.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this many seconds.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
     hz: Annotated[
         bool, typer.Option("--hz", help="Print a table of rates every second instead of the messages.")
     ] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
 ) -> None:
     """Print what gateways publish. Exit status 1 if fewer than --count messages arrive in --seconds.
 
@@ -39,29 +40,24 @@ def echo(
     if where.zenoh_config is not None and name != "zenoh":
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
 
-    from gateway.cli.echo_output import Limits, print_messages, print_rates
-    from gateway.cli.echo_sources import Silence, Units
+    from gateway.cli.echo_output import print_messages, print_rates
+    from gateway.cli.echo_sources import EchoSources
     from gateway.outputs.kind import SubscriptionRequest
     from gateway.outputs.registry import OUTPUTS
 
     request = SubscriptionRequest(
         source, component, where.prefix, where.connect or where.url, where.zenoh_config
     )
-    limits = Limits(count, seconds)
-    silence = Silence(name, request)
+    sources = EchoSources(name, request)
     functions = {each: kind.subscribe for each, kind in OUTPUTS.items() if kind.subscribe is not None}
     if name not in functions:
         raise typer.BadParameter(
             f"no messages to print from output {name!r}; choose one of: {', '.join(functions)}"
         )
+    subscribe = partial(functions[name], request)
     try:
-        if hz:
-            num_received = print_rates(functions[name], request, limits, silence, sys.stdout, as_json=as_json)
-        else:
-            units = Units(name, request)
-            num_received = print_messages(
-                functions[name], request, limits, silence, units, sys.stdout, as_json=as_json
-            )
+        show = print_rates if hz else print_messages
+        num_received = show(subscribe, sources, sys.stdout, count=count, seconds=seconds, as_json=as_json)
     except QueryError as error:
         exit_with([error])
         return

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import queue
 import sys
 import threading
@@ -19,14 +20,14 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.echo_sources import Silence, Units
+from gateway.cli.echo_sources import EchoSources
 from gateway.display.terminal import list_table, write_records
 from gateway.errors import ProtocolError
 from gateway.logs.safe_text import safe_json, safe_text
 from gateway.messages.decode import decode, to_json
 from gateway.messages.host_time import now_utime
 from gateway.messages.summary import summarise, summarise_xml
-from gateway.outputs.kind import Receive, Subscription, SubscriptionRequest
+from gateway.outputs.kind import Receive, Subscription
 
 _MAX_LINE_CHARACTERS: Final = 4000
 
@@ -79,49 +80,29 @@ def _content(message: bytes) -> Any:
 MAX_WAITING: Final = 10_000
 """How many messages may wait to be printed."""
 
-POLL_S: Final = 0.1
-"""How often the silence is checked before the first message."""
+_POLL_S: Final = 0.1
+"""How often the time is checked, and the silence before the first message."""
 
-Subscribe = Callable[[SubscriptionRequest, Receive], Subscription]
-
-
-class Limits:
-    """When ``echo`` ends: after ``count`` messages, or after ``seconds``. None means no limit."""
-
-    def __init__(self, count: int | None, seconds: float | None) -> None:
-        self.count = count
-        self._end_s = None if seconds is None else time.monotonic() + seconds
-
-    def wait_s(self, longest_s: float | None) -> float | None:
-        """Return how long to wait for messages: to the end, but not longer than ``longest_s``."""
-        if self._end_s is None:
-            return longest_s
-        left_s = max(0.0, self._end_s - time.monotonic())
-        return left_s if longest_s is None else min(left_s, longest_s)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the time is up."""
-        return self._end_s is not None and time.monotonic() >= self._end_s
+Subscribe = Callable[[Receive], Subscription]
 
 
 def print_messages(
     subscribe: Subscribe,
-    request: SubscriptionRequest,
-    limits: Limits,
-    silence: Silence,
-    units: Units,
+    sources: EchoSources,
     out: TextIO,
     *,
+    count: int | None,
+    seconds: float | None,
     as_json: bool,
 ) -> int:
-    """Print messages until ``limits`` are reached, and return how many were printed.
+    """Print ``count`` messages, or those of ``seconds``, and return how many they are. None means no limit.
 
     Raises OutputError if the output does not open, QueryError if there cannot be any messages.
     """
-    line = json_line if as_json else partial(text_line, units_of=units.of)
+    line = json_line if as_json else partial(text_line, units_of=sources.units_of)
     waiting: queue.Queue[tuple[str, bytes]] = queue.Queue(MAX_WAITING)
     num_dropped = num_printed = 0
+    end_s = time.monotonic() + (math.inf if seconds is None else seconds)
 
     def receive(name: str, message: bytes) -> None:
         nonlocal num_dropped
@@ -131,14 +112,15 @@ def print_messages(
             num_dropped += 1
 
     try:
-        with closing(subscribe(request, receive)):
-            while limits.count is None or num_printed < limits.count:
+        with closing(subscribe(receive)):
+            while count is None or num_printed < count:
                 try:
-                    received = waiting.get(timeout=limits.wait_s(None if num_printed else POLL_S))
+                    received = waiting.get(timeout=_wait_s(end_s))
                 except queue.Empty:
-                    if limits.is_over:
+                    if time.monotonic() >= end_s:
                         break
-                    silence.check()
+                    if not num_printed:
+                        sources.check_silence()
                     continue
                 print(line(*received), file=out, flush=True)
                 num_printed += 1
@@ -241,20 +223,25 @@ def _rate(key: str, arrivals_s: NDArray[np.float64], now_s: float) -> Rate:
     return Rate(key, rate_hz, *spread, len(arrivals_s), age_s, has_stopped)
 
 
+def _wait_s(end_s: float) -> float:
+    return min(_POLL_S, max(0.0, end_s - time.monotonic()))
+
+
 def print_rates(
     subscribe: Subscribe,
-    request: SubscriptionRequest,
-    limits: Limits,
-    silence: Silence,
+    sources: EchoSources,
     out: TextIO,
     *,
+    count: int | None,
+    seconds: float | None,
     as_json: bool,
 ) -> int:
-    """Print the rates every second until ``limits`` are reached; return how many messages came.
+    """Print the rates every second, with the limits of ``print_messages``; return how many messages came.
 
     On a terminal, the table is refreshed in place. Raises OutputError and QueryError as ``print_messages``.
     """
-    rates = Rates(limits.count)
+    rates = Rates(count)
+    end_s = time.monotonic() + (math.inf if seconds is None else seconds)
     console = Console(file=out)
     live = None if as_json or not console.is_terminal else Live(console=console, auto_refresh=False)
 
@@ -264,14 +251,14 @@ def print_rates(
         else:
             live.update(_table(rates.rows()), refresh=True)
 
-    with closing(subscribe(request, rates.receive)), live or contextlib.nullcontext():
+    with closing(subscribe(rates.receive)), live or contextlib.nullcontext():
         shown_s = time.monotonic()
         try:
-            while not rates.is_complete.wait(limits.wait_s(_EACH_S if rates.num_messages else POLL_S)):
-                if limits.is_over:
+            while not rates.is_complete.wait(_wait_s(end_s)):
+                if time.monotonic() >= end_s:
                     break
                 if not rates.num_messages:
-                    silence.check()
+                    sources.check_silence()
                 elif time.monotonic() - shown_s >= _EACH_S:
                     shown_s = time.monotonic()
                     show()

@@ -38,72 +38,12 @@ OUTPUTS: Final = ("zenoh", "lcm")
 _COMPONENTS: Final = {message_type: component for component, message_type in MESSAGE_TYPES.items()}
 
 
-def gateway_client(output: str, request: SubscriptionRequest) -> GatewayClient:
-    """Return a client on the output where ``echo`` subscribes: zenoh or lcm."""
-    address = GatewayAddress(
-        output == "lcm", request.address, request.config, request.address, request.prefix
-    )
-    return GatewayClient(address, QUERY_S)
-
-
 class _Known(NamedTuple):
     """The parameters of a source with their version, and the units of the items of components."""
 
     version: int
     parameters: Parameters
     units: dict[ComponentType, tuple[str, ...]]
-
-
-class Units:
-    """The units of messages on ``output``. A source is asked once for each version of its parameters."""
-
-    def __init__(self, output: str, request: SubscriptionRequest) -> None:
-        self._output = output
-        self._request = request
-        self._known: dict[str, _Known] = {}
-        self._failed_s: dict[str, float] = {}  # when sources last had no answer, on the monotonic clock
-
-    def of(self, name: str, message: Any) -> Sequence[str]:
-        """Return the unit of each item in a message with this key or channel; () if they are unknown."""
-        component = _COMPONENTS.get(type(message))
-        if component is None or self._output not in OUTPUTS or not message.parameters_version:
-            return ()
-        source = self._source(name, component)
-        known = self._known.get(source)
-        if known is None or known.version != message.parameters_version:
-            known = self._ask(source, message.parameters_version)
-        if known is None:
-            return ()
-        num_items = getattr(message, f"num_{component.item_noun}")
-        units = known.units.get(component)
-        if units is None or len(units) != num_items:
-            units = known.units[component] = describe(component, known.parameters, num_items).units
-        return units
-
-    def _source(self, name: str, component: ComponentType) -> str:
-        """Return the source of a key or channel; LCM's channels do not say which of its letters are small."""
-        if self._output == "zenoh":
-            prefix = self._request.prefix or DEFAULT_ZENOH_PREFIX
-            return name.removeprefix(f"{prefix}/").partition("/")[0]
-        prefix = self._request.prefix or DEFAULT_LCM_PREFIX
-        return name.removeprefix(f"{prefix}_").removesuffix(f"_{component.key.upper()}").lower()
-
-    def _ask(self, source: str, version: int) -> _Known | None:
-        """Return the parameters with this version; None if the source does not have them."""
-        now_s = time.monotonic()
-        if now_s - self._failed_s.get(source, -math.inf) < RETRY_S or len(self._failed_s) >= _MAX_FAILED:
-            return None
-        with (
-            contextlib.suppress(OutputError, ParametersError),
-            gateway_client(self._output, self._request) as client,
-        ):
-            for reply in client.parameters(source).received:
-                if reply.source == source and reply.version == version:
-                    known = _Known(version, parse_parameters(reply.content).parameters, {})
-                    self._known[source] = known
-                    return known
-        self._failed_s[source] = now_s
-        return None
 
 
 LOOK_S: Final = 0.4
@@ -115,19 +55,66 @@ SAY_S: Final = 2.0
 _MAX_NAMED: Final = 20
 
 
-class Silence:
-    """Finds out in a thread of its own why nothing is heard on an output, and says it once."""
+class EchoSources:
+    """Asks the gateways on an output about the sources that ``echo`` subscribes to.
+
+    A source is asked once for each version of its parameters. Why nothing is heard is found out in a thread,
+    and said once.
+    """
 
     def __init__(self, output: str, request: SubscriptionRequest) -> None:
         self._output = output
         self._request = request
+        self._known: dict[str, _Known] = {}
+        self._failed_s: dict[str, float] = {}  # when sources last had no answer, on the monotonic clock
         self._start_s = time.monotonic()
         self._thread: threading.Thread | None = None
         self._error: QueryError | None = None
         self._reason = ""
         self._is_said = False
 
-    def check(self) -> None:
+    def _client(self) -> GatewayClient:
+        where, config = self._request.address, self._request.config
+        is_lcm = self._output == "lcm"
+        return GatewayClient(GatewayAddress(is_lcm, where, config, where, self._request.prefix), QUERY_S)
+
+    def units_of(self, name: str, message: Any) -> Sequence[str]:
+        """Return the unit of each item in a message with this key or channel; () if they are unknown."""
+        component = _COMPONENTS.get(type(message))
+        if component is None or self._output not in OUTPUTS or not message.parameters_version:
+            return ()
+        if self._output == "zenoh":
+            prefix = self._request.prefix or DEFAULT_ZENOH_PREFIX
+            source = name.removeprefix(f"{prefix}/").partition("/")[0]
+        else:  # channels do not say which of its letters are small
+            prefix = self._request.prefix or DEFAULT_LCM_PREFIX
+            source = name.removeprefix(f"{prefix}_").removesuffix(f"_{component.key.upper()}").lower()
+        known = self._known.get(source)
+        if known is None or known.version != message.parameters_version:
+            known = self._ask(source, message.parameters_version)
+        if known is None:
+            return ()
+        num_items = getattr(message, f"num_{component.item_noun}")
+        units = known.units.get(component)
+        if units is None or len(units) != num_items:
+            units = known.units[component] = describe(component, known.parameters, num_items).units
+        return units
+
+    def _ask(self, source: str, version: int) -> _Known | None:
+        """Return the parameters with this version; None if the source does not have them."""
+        now_s = time.monotonic()
+        if now_s - self._failed_s.get(source, -math.inf) < RETRY_S or len(self._failed_s) >= _MAX_FAILED:
+            return None
+        with contextlib.suppress(OutputError, ParametersError), self._client() as client:
+            for reply in client.parameters(source).received:
+                if reply.source == source and reply.version == version:
+                    known = _Known(version, parse_parameters(reply.content).parameters, {})
+                    self._known[source] = known
+                    return known
+        self._failed_s[source] = now_s
+        return None
+
+    def check_silence(self) -> None:
         """Call this again and again while nothing has been heard.
 
         Raises QueryError if there are gateways, and none of them has the source or the component.
@@ -149,7 +136,7 @@ class Silence:
     def _look(self) -> None:
         """Find out what exists, in the thread."""
         try:
-            with gateway_client(self._output, self._request) as client:
+            with self._client() as client:
                 found = client.sources(self._request.source)
                 if found.absence and found.heard:
                     self._error = QueryError(found.absence, code="no-gateway")

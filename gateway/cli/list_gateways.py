@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from gateway.cli import options
 from gateway.cli.main import exit_with, print_json
-from gateway.cli.options import AddressOptions, SourceOption, with_options
 from gateway.errors import QueryError
 from gateway.messages.source_report import Level
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from gateway.client.found_sources import FoundSources
 
 
-@with_options
+@options.with_options
 def list_gateways(
     *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Look on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Listen on LCM.")] = False,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
 ) -> None:
     """List the gateways and sources that can be heard: states, rates, servers, hosts, versions.
 

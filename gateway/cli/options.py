@@ -54,6 +54,13 @@ ServerOption = Annotated[
     ),
 ]
 
+FromOption = Annotated[
+    float | None, typer.Option("--from", min=0, help="Where to begin, in s from the take's first message.")
+]
+ToOption = Annotated[
+    float | None,
+    typer.Option("--to", min=0, help="Where to end, in s from the first message; the default is its end."),
+]
 NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress, only problems.")]
 
 
@@ -212,8 +219,7 @@ ConnectOption = Annotated[
 ListenOption = Annotated[
     str | None,
     typer.Option(
-        callback=_checked_endpoint,
-        help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448.",
+        callback=_checked_endpoint, help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448."
     ),
 ]
 ZenohConfigOption = Annotated[
@@ -232,8 +238,7 @@ UrlOption = Annotated[
 PrefixOption = Annotated[
     str | None,
     typer.Option(
-        callback=checked_key_prefix,
-        help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.",
+        callback=checked_key_prefix, help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM."
     ),
 ]
 

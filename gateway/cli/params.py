@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TextIO
 
 import typer
 
+from gateway.cli import options
 from gateway.cli.main import exit_with
-from gateway.cli.options import QueryOptions, SourceOption, one_of, with_options
 from gateway.errors import ParametersError, QueryError
 from gateway.logs.safe_text import safe_json, safe_text
 from gateway.outputs.findings import counted
@@ -30,20 +30,20 @@ if TYPE_CHECKING:
     from gateway.client.transport import Reply
 
 
-@with_options
+@options.with_options
 def params(
     sections: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="SECTION",
-            autocompletion=one_of(SECTIONS),
+            autocompletion=options.one_of(SECTIONS),
             help=f"Any of {', '.join(SECTIONS)}; the default is all.",
         ),
     ] = None,
     *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Query on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Query on LCM.")] = False,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")
     ] = False,
@@ -52,7 +52,7 @@ def params(
         bool,
         typer.Option("--fresh", help="Make the gateway query the server now instead of using its cache."),
     ] = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Query the parameters of servers through their gateways: markers, tools, channels, plates, events.
 

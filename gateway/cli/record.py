@@ -8,20 +8,13 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.options import (
-    AddressOptions,
-    ComponentsOption,
-    DetailsOptions,
-    NoProgressOption,
-    SourcesOption,
-    with_options,
-)
+from gateway.cli import options
 from gateway.cli.run import StopSignals
 
 _TICK_S: Final = 0.1
 
 
-@with_options
+@options.with_options
 def record(
     file: Annotated[
         Path,
@@ -31,18 +24,18 @@ def record(
         ),
     ],
     *,
-    source: SourcesOption = None,
-    component: ComponentsOption = None,
+    source: options.SourcesOption = None,
+    component: options.ComponentsOption = None,
     seconds: Annotated[
         float | None,
         typer.Option(
             min=0, help="Stop after this many seconds of messages; the default is to record until Ctrl-C."
         ),
     ] = None,
-    details: DetailsOptions,
+    details: options.DetailsOptions,
     lcm: Annotated[bool, typer.Option("--lcm", help="Record from LCM; the default is from Zenoh.")] = False,
-    where: AddressOptions,
-    quiet: NoProgressOption = False,
+    where: options.AddressOptions,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Record what gateways publish, until Ctrl-C. The exit status is 0 only if no message is missing.
 

@@ -42,7 +42,7 @@ class RecordProgress:
         self._subscriber = subscriber
         self._wanted = wanted
         self._quiet = quiet
-        self._start_s = self._rate_s = self._checked_s = self._shown_s = time.monotonic()
+        self._start_s = self._checked_s = self._shown_s = time.monotonic()
         self._former = (0, 0)  # messages and bytes, when the line was shown last
         self._disk_problem = ""
         self._is_slow = False
@@ -65,8 +65,8 @@ class RecordProgress:
             self._check_losses()
             self._check_silence(now_s)
         if not self._quiet and now_s - self._shown_s >= (_LINE_S if self._live is None else _TERMINAL_S):
-            self._shown_s = now_s
             line = self._line(now_s)
+            self._shown_s = now_s
             if self._live is None:
                 self._print(line)
             else:
@@ -166,9 +166,9 @@ class RecordProgress:
 
     def _line(self, now_s: float) -> str:
         recording, file = self._recording, self._recording.file
-        elapsed_s = max(now_s - self._rate_s, 1e-3)
+        elapsed_s = max(now_s - self._shown_s, 1e-3)
         former_messages, former_bytes = self._former
-        self._former, self._rate_s = (recording.num_messages, recording.num_bytes), now_s
+        self._former = (recording.num_messages, recording.num_bytes)
         minutes, seconds = divmod(int(now_s - self._start_s), 60)
         parts = [
             f"{minutes}:{seconds:02}",

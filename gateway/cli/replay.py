@@ -8,16 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.options import (
-    ComponentsOption,
-    ConnectOption,
-    ListenOption,
-    NoProgressOption,
-    SourcesOption,
-    UrlOption,
-    ZenohConfigOption,
-    checked_key_prefix,
-)
+from gateway.cli import options
 from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.takes.replay.timeline import MAX_GAP_S
@@ -49,34 +40,27 @@ def replay(
         ),
     ] = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
-    from_s: Annotated[
-        float, typer.Option("--from", min=0, help="Where to begin, in s from the take's first message.")
-    ] = 0.0,
-    to_s: Annotated[
-        float | None,
-        typer.Option(
-            "--to", min=0, help="Where to end, in s from the first message; the default is its end."
-        ),
-    ] = None,
-    source: SourcesOption = None,
-    component: ComponentsOption = None,
+    from_s: options.FromOption = 0.0,
+    to_s: options.ToOption = None,
+    source: options.SourcesOption = None,
+    component: options.ComponentsOption = None,
     prefix: Annotated[
         str,
         typer.Option(
-            callback=checked_key_prefix,
+            callback=options.checked_key_prefix,
             help="The prefix on Zenoh; that on LCM is the same in upper case, with _ for other characters.",
         ),
     ] = "replay",
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Only on Zenoh.")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Only on LCM.")] = False,
-    connect: ConnectOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
+    connect: options.ConnectOption = None,
+    listen: options.ListenOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    url: options.UrlOption = None,
     max_gap: Annotated[
         float, typer.Option(min=0, help="Skip longer gaps in which nothing was recorded, in s.")
     ] = MAX_GAP_S,
-    quiet: NoProgressOption = False,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Publish a take again on Zenoh and LCM, under a prefix of its own.
 
@@ -91,7 +75,7 @@ def replay(
         raise typer.BadParameter("--url is for LCM")
     if listen and (connect or zenoh_config):
         raise typer.BadParameter("give either --listen, or --connect and --zenoh-config")
-    if to_s is not None and to_s <= from_s:
+    if to_s is not None and to_s <= (from_s or 0.0):
         raise typer.BadParameter("--to must be greater than --from")
     import uvloop
 
@@ -111,7 +95,7 @@ def replay(
     selection = Selection(
         frozenset(source) if source else None,
         frozenset(component) if component else None,
-        round(from_s * 1e6),
+        round((from_s or 0.0) * 1e6),
         None if to_s is None else round(to_s * 1e6),
     )
     run = run_replay(

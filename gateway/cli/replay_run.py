@@ -61,8 +61,7 @@ class Progress:
         self._console = console
         self._quiet = quiet
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._before = time.monotonic(), player.position_us, 0, 0
-        self._line_s = time.monotonic()
+        self._before = time.monotonic(), player.position_us, 0, 0  # when the line was shown last
         if console.is_terminal and not quiet:
             self._live.start()
 
@@ -72,8 +71,7 @@ class Progress:
             return
         if self._console.is_terminal:
             self._live.update(Text(self._text(), no_wrap=True, overflow="ellipsis"), refresh=True)
-        elif time.monotonic() - self._line_s >= LINE_S:
-            self._line_s = time.monotonic()
+        elif time.monotonic() - self._before[0] >= LINE_S:
             self._console.print(self._text(), soft_wrap=True, highlight=False)
 
     def close(self) -> None:
@@ -192,6 +190,9 @@ async def run_replay(
     def note(text: str) -> None:
         notes.print(Text(text), soft_wrap=True)
 
+    def on_jump(jump: Jump) -> None:
+        loop.call_soon_threadsafe(note, jump_text(jump))
+
     async with open_publication(destinations, are_required=are_required, warn=note) as publication:
         opened = [each for each in destinations if each.output.health().connected]
         places = [f"on {each.kind.name} under {each.request.prefix}" for each in opened]
@@ -204,7 +205,7 @@ async def run_replay(
                 rate=rate,
                 is_repeated=is_repeated,
                 max_gap_s=max_gap_s,
-                on_jump=lambda jump: loop.call_soon_threadsafe(note, jump_text(jump)),
+                on_jump=on_jump,
             )
             length_us = take_length_us(reader, selection.stop_us)
             try:

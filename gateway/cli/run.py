@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -16,15 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from gateway.cli.options import (
-    ConfigOption,
-    LogOptions,
-    ServerOption,
-    check_exists,
-    checked_host,
-    source_names,
-    with_options,
-)
+from gateway.cli import options
 from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 from gateway.service.process_end import end_at_once
@@ -43,12 +35,9 @@ message to an output releases that lock once, so that the default of 5 ms would 
 between two frames."""
 
 
-@with_options
+@options.with_options
 def run(
-    *,
-    config: ConfigOption = None,
-    server: ServerOption = None,
-    log: LogOptions,
+    *, config: options.ConfigOption = None, server: options.ServerOption = None, log: options.LogOptions
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
     for number in (signal.SIGINT, signal.SIGTERM):  # until the daemon handles them
@@ -109,11 +98,14 @@ class SceneOptions:
         int, typer.Option(min=0, max=10_000, help="Analog channels in the synthetic scene.")
     ] = 16
     plates: Annotated[int, typer.Option(min=0, max=100, help="Force plates in the synthetic scene.")] = 2
-    rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")] = (
-        200.0
-    )
-    analog_rate: Annotated[
-        float, typer.Option(min=0.1, max=100_000, help="Analog and force samples per second, in Hz.")
+    rate_hz: Annotated[
+        float, typer.Option("--rate", min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")
+    ] = 200.0
+    analog_rate_hz: Annotated[
+        float,
+        typer.Option(
+            "--analog-rate", min=0.1, max=100_000, help="Analog and force samples per second, in Hz."
+        ),
     ] = 2000.0
     c3d: Annotated[
         Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
@@ -121,14 +113,7 @@ class SceneOptions:
 
     def settings(self) -> dict[str, Any]:
         """Return the settings of the synthetic scene by their names."""
-        return {
-            "markers": self.markers,
-            "tools": self.tools,
-            "analog": self.analog,
-            "plates": self.plates,
-            "rate_hz": self.rate,
-            "analog_rate_hz": self.analog_rate,
-        }
+        return {name: value for name, value in asdict(self).items() if name != "c3d"}
 
 
 def _list_faults(context: typer.Context, wanted: bool) -> None:
@@ -139,11 +124,13 @@ def _list_faults(context: typer.Context, wanted: bool) -> None:
         raise typer.Exit
 
 
-@with_options
+@options.with_options
 def simulate(
     context: typer.Context,
     *,
-    host: Annotated[str, typer.Option(callback=checked_host, help="The address to listen on.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(callback=options.checked_host, help="The address to listen on.")
+    ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port to listen on; 0 picks a free one.")
     ] = FIRST_PRINCIPLES_PORT,
@@ -155,13 +142,14 @@ def simulate(
     take: Annotated[
         Path | None,
         typer.Option(
-            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it.",
+            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it."
         ),
     ] = None,
     source: Annotated[
         str | None,
         typer.Option(
-            autocompletion=source_names, help="The source of the take to play; needed if it has several."
+            autocompletion=options.source_names,
+            help="The source of the take to play; needed if it has several.",
         ),
     ] = None,
     from_s: Annotated[
@@ -189,7 +177,7 @@ def simulate(
         bool,
         typer.Option("--list-faults", callback=_list_faults, is_eager=True, help="List all faults and exit."),
     ] = False,
-    log: LogOptions,
+    log: options.LogOptions,
 ) -> None:
     """Simulate an RTC3D server that plays a synthetic scene, a C3D file or a take, with faults on request."""
     if once and synthetic.c3d is None and take is None:
@@ -200,8 +188,8 @@ def simulate(
         raise typer.BadParameter("--source, --from and --to need --take")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise typer.BadParameter(f"--to {to_s:g} is not after --from {from_s:g}")
-    check_exists("--c3d", synthetic.c3d)
-    check_exists("--take", take)
+    options.check_exists("--c3d", synthetic.c3d)
+    options.check_exists("--take", take)
     level = log.chosen_level()
     import asyncio
 
@@ -217,7 +205,7 @@ def simulate(
     overrides = {
         name: value
         for name, value in synthetic.settings().items()
-        if getattr(context.get_parameter_source(name.removesuffix("_hz")), "name", "") == "COMMANDLINE"
+        if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
     }
     base = Scenario(faults=()) if scenario is None else load_scenario(scenario)
     extended = base.with_overrides(overrides, map(parse_fault, fault or ()), seed)
@@ -253,7 +241,7 @@ def _stop_event() -> "asyncio.Event":
     return stop
 
 
-@with_options
+@options.with_options
 def demo(
     *,
     seconds: Annotated[
@@ -275,7 +263,7 @@ def demo(
 
     If the extra `view` is installed, the demo can be watched in a browser while it runs.
     """
-    check_exists("--c3d", synthetic.c3d)
+    options.check_exists("--c3d", synthetic.c3d)
     import asyncio
 
     import uvloop

@@ -9,26 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gateway.cli import options
 from gateway.cli.main import exit_with, print_json
-from gateway.cli.options import (
-    ConnectOption,
-    DetailsOptions,
-    NoProgressOption,
-    PrefixOption,
-    QueryOptions,
-    SourceOption,
-    ZenohConfigOption,
-    checked_take_name,
-    with_options,
-)
 from gateway.config.words import join_or
 from gateway.errors import QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.takes.export.job import FORMATS, ExportJob, export_take
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
-
     from gateway.cli.take_report import ListedTake
     from gateway.client.client import TakeReplies
 
@@ -40,7 +28,7 @@ _NameArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="NAME",
-        callback=checked_take_name,
+        callback=options.checked_take_name,
         help="The name of the take; the default is SOURCE-DATE-TIME.",
     ),
 ]
@@ -49,15 +37,15 @@ _JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object
 
 
 @app.command()
-@with_options
+@options.with_options
 def start(
     name: _NameArgument = None,
     *,
-    details: DetailsOptions,
-    source: SourceOption = None,
+    details: options.DetailsOptions,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Start a take in a running gateway. Needs takes.enabled and, for the source, remote_control.
 
@@ -70,13 +58,13 @@ def start(
 
 
 @app.command()
-@with_options
+@options.with_options
 def stop(
     *,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Stop the running take.
 
@@ -88,7 +76,7 @@ def stop(
 
 
 @app.command()
-@with_options
+@options.with_options
 def save(
     name: _NameArgument = None,
     *,
@@ -99,11 +87,11 @@ def save(
         ),
     ] = None,
     after: Annotated[float, typer.Option(min=0.0, max=3600.0, help="For how many seconds to go on.")] = 0.0,
-    details: DetailsOptions,
-    source: SourceOption = None,
+    details: options.DetailsOptions,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Keep the last seconds as a take. Needs takes.keep_last_s and, for the source, remote_control.
 
@@ -121,18 +109,18 @@ def save(
 @app.command()
 def fetch(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", callback=checked_take_name, help="The name of the take.")
+        str, typer.Argument(metavar="NAME", callback=options.checked_take_name, help="The name of the take.")
     ],
     file: Annotated[
         Path | None,
         typer.Argument(metavar="FILE", help="A new file, or a folder; the default is NAME.lcmlog here."),
     ] = None,
-    source: SourceOption = None,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    prefix: PrefixOption = None,
+    source: options.SourceOption = None,
+    connect: options.ConnectOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    prefix: options.PrefixOption = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for each piece.")] = 10.0,
-    quiet: NoProgressOption = False,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Copy a take from a running gateway, over Zenoh. Of one that is running, copy what there is.
 
@@ -162,13 +150,13 @@ def fetch(
 
 
 @app.command("list")
-@with_options
+@options.with_options
 def list_(
     *,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """List the takes of running gateways.
 
@@ -191,7 +179,7 @@ def list_(
 def info(
     file: Annotated[Path, typer.Argument(help="A recording (.lcmlog), or the folder of a saved one.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    quiet: NoProgressOption = False,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Show what a recording contains, and what is missing: gaps, restarts, damage.
 
@@ -233,18 +221,10 @@ def export(
     out: Annotated[
         Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
     ],
-    source: SourceOption = None,
-    from_s: Annotated[
-        float | None,
-        typer.Option("--from", min=0, help="Where to begin, in s from the take's first message."),
-    ] = None,
-    to_s: Annotated[
-        float | None,
-        typer.Option(
-            "--to", min=0, help="Where to end, in s from the first message; the default is its end."
-        ),
-    ] = None,
-    quiet: NoProgressOption = False,
+    source: options.SourceOption = None,
+    from_s: options.FromOption = None,
+    to_s: options.ToOption = None,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
     if from_s is not None and to_s is not None and from_s >= to_s:
@@ -273,14 +253,13 @@ def progress_bar(*, quiet: bool, counts_bytes: bool = True) -> Iterator[Callable
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), *amount, TimeRemainingColumn())
     is_hidden = quiet or not console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=is_hidden) as bar:
-        tasks: dict[str, TaskID] = {}  # the present one
 
         def show(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                for task in tasks.values():
-                    bar.remove_task(task)
-                tasks.clear()
-                tasks[what] = bar.add_task(safe_text(what), total=total or None)
-            bar.update(tasks[what], completed=done, total=total or None)
+            text = safe_text(what)
+            if [task.description for task in bar.tasks] != [text]:
+                for former in bar.task_ids:
+                    bar.remove_task(former)
+                bar.add_task(text, total=total or None)
+            bar.update(bar.task_ids[0], completed=done, total=total or None)
 
         yield show

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from gateway.cli import options
 from gateway.cli.main import exit_with
-from gateway.cli.options import AddressOptions, SourcesOption, with_options
 from gateway.errors import QueryError
 from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.logs.safe_text import safe_lines, safe_text
@@ -26,10 +26,10 @@ _MAX_WIDTH: Final = 10_000
 """How wide tables may be in files and pipes."""
 
 
-@with_options
+@options.with_options
 def top(
     *,
-    source: SourcesOption = None,
+    source: options.SourcesOption = None,
     once: Annotated[
         bool, typer.Option("--once", help="Print all tables once, as without a terminal, and end.")
     ] = False,
@@ -40,7 +40,7 @@ def top(
         ),
     ] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive on LCM; the default is Zenoh.")] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
 ) -> None:
     """Watch what gateways publish: rates, gaps, latencies, visibility, clocks, drops, outputs, queries.
 

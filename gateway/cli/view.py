@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from gateway.cli.options import AddressOptions, SourcesOption, checked_host, with_options
+from gateway.cli import options
 from gateway.cli.run import StopSignals
 from gateway.errors import ViewError
 from gateway.logs.safe_text import safe_text
@@ -29,7 +29,7 @@ _SILENCE_S: Final = 2.0
 _INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
 
 
-@with_options
+@options.with_options
 def view(
     take: Annotated[
         Path | None,
@@ -38,11 +38,11 @@ def view(
         ),
     ] = None,
     *,
-    source: SourcesOption = None,
+    source: options.SourcesOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
     host: Annotated[
-        str, typer.Option(callback=checked_host, help="The address where the page is served.")
+        str, typer.Option(callback=options.checked_host, help="The address where the page is served.")
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port of the page; 0 picks a free one.")
@@ -51,7 +51,7 @@ def view(
 ) -> None:
     """Show markers, tools and forces in the browser as they arrive, or from a take, until Ctrl-C."""
     where.check(lcm=lcm)
-    if take is not None and (lcm or where != AddressOptions()):
+    if take is not None and (lcm or where != options.AddressOptions()):
         raise typer.BadParameter(
             "a take is read from its file; --lcm, --connect and --prefix are for live data"
         )
