@@ -64,11 +64,11 @@ ToOption = Annotated[
 NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress, only problems.")]
 
 
-_Check = Callable[[Any], Any]
+_Callback = Callable[[Any], Any]
 """The callback of an option: it takes None if the option is not given, or a list if it can be repeated."""
 
 
-def _check(check: Callable[[str], str | None]) -> _Check:
+def _on_each(check: Callable[[str], str | None]) -> _Callback:
     """Return a callback that checks each value of an option; ``check`` may return another one instead."""
 
     def check_all(value: Any) -> Any:
@@ -81,7 +81,7 @@ def _check(check: Callable[[str], str | None]) -> _Check:
     return check_all
 
 
-def _checked(module: str, name: str) -> _Check:
+def _checked(module: str, name: str) -> _Callback:
     """Return a callback for an option whose value must be valid as this type of the configuration."""
 
     def check(text: str) -> str:
@@ -92,7 +92,7 @@ def _checked(module: str, name: str) -> _Check:
         except ValidationError as error:
             raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
 
-    return _check(check)
+    return _on_each(check)
 
 
 checked_host = _checked("gateway.config.values", "Host")
@@ -110,14 +110,14 @@ def _check_word(text: str, words: Sequence[str]) -> None:
         raise typer.BadParameter(f"found {describe(text)}; expected {join_or(words)}")
 
 
-@_check
+@_on_each
 def _checked_component(text: str) -> None:
     label = text.removeprefix(_POSE)
     if label == text or not (0 < len(label) <= MAX_LABEL_LENGTH and label.isprintable()):
         _check_word(text, _COMPONENTS)
 
 
-@_check
+@_on_each
 def checked_take_name(text: str) -> None:
     """Check that an argument can be the name of a take."""
     from gateway.takes.files.new_file import check_name
@@ -128,7 +128,7 @@ def checked_take_name(text: str) -> None:
         raise typer.BadParameter(str(error)) from None
 
 
-@_check
+@_on_each
 def _checked_endpoint(text: str) -> None:
     if not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
         raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")
@@ -204,7 +204,7 @@ ComponentsOption = Annotated[
     list[str] | None,
     typer.Option(
         "--component",
-        callback=_check(lambda text: _check_word(text, _RECORDED)),
+        callback=_on_each(lambda text: _check_word(text, _RECORDED)),
         autocompletion=one_of(_RECORDED),
         help=f"Only this: {join_or(_RECORDED)}; can be repeated.",
     ),

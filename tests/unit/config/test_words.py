@@ -1,3 +1,4 @@
+import copy
 import logging
 import re
 from pathlib import Path
@@ -51,14 +52,11 @@ SECRETS = [
     ],
 )
 def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> None:
-    secrets = list(find_secrets(config))
-    assert secrets
-    for location, masked in secrets:
-        replace_item(config, location, masked)
-    assert config == seen
-    assert all(masked in yaml.safe_dump(seen) for _, masked in secrets)
-    for location, masked in find_secrets(seen):
-        assert masked == "***", location
+    assert list(find_secrets(config))
+    for values in (config, copy.deepcopy(seen)):  # masking again changes nothing
+        for location, masked in list(find_secrets(values)):
+            replace_item(values, location, masked)
+        assert values == seen
 
 
 @pytest.mark.parametrize(
