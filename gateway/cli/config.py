@@ -1,18 +1,20 @@
-"""``rtc3d-gateway config``, and the configuration that the options of a command choose."""
+"""``rtc3d-gateway config`` and ``doctor``, and the configuration that the options of a command choose."""
 
-import json
 import os
-from collections.abc import Sequence
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gateway.cli.options import ConfigOption, ServerOption
+from gateway.cli import options
+from gateway.cli.main import print_json
 from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.errors import ConfigError
-from gateway.logs.safe_text import safe_json
+from gateway.logs.log_format import LogFormat, LogLevel, set_up_log
+from gateway.logs.safe_text import safe_lines
+from gateway.outputs.findings import counted
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 
 if TYPE_CHECKING:
@@ -24,8 +26,7 @@ app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or 
 @app.command()
 def check(
     file: Annotated[
-        Path | None,
-        typer.Argument(help=f"The configuration file to check; the default is {DEFAULT_CONFIG}."),
+        Path | None, typer.Argument(help=f"The configuration file to check; the default is {DEFAULT_CONFIG}.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", "-c", metavar="FILE", help="The same as FILE.")
@@ -40,34 +41,27 @@ def check(
     if file is not None and config is not None:
         raise typer.BadParameter("give the file once, as FILE or as --config FILE")
     path = chosen_file(file or config, None, wanted="FILE")
+    names: list[str] = []
+    mistakes: list[str] = []
     try:
         names = [source.name for source in read(path, settings_type()).settings.sources]
     except ConfigError as error:
         if not as_json:
             raise
-        _print_json(path, mistakes=str(error).splitlines())
-        raise typer.Exit(2) from None
+        mistakes = str(error).splitlines()
     if as_json:
-        _print_json(path, sources=names)
+        shown = None if path is None else str(path)
+        print_json({"file": shown, "is_valid": not mistakes, "sources": names, "mistakes": mistakes})
     elif not quiet:
-        sources = f"{len(names)} source{'' if len(names) == 1 else 's'}: {', '.join(names)}"
-        print(f"{path or 'environment'}: valid; {sources}")
-
-
-def _print_json(path: Path | None, *, sources: Sequence[str] = (), mistakes: Sequence[str] = ()) -> None:
-    content = {
-        "file": None if path is None else str(path),
-        "is_valid": not mistakes,
-        "sources": sources,
-        "mistakes": mistakes,
-    }
-    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
+        print(f"{path or 'environment'}: valid; {counted(len(names), 'source')}: {', '.join(names)}")
+    if mistakes:
+        raise typer.Exit(2)
 
 
 @app.command()
-def show(config: ConfigOption = None, server: ServerOption = None) -> None:
+def show(config: options.ConfigOption = None, server: options.ServerOption = None) -> None:
     """Print the effective configuration and where each value comes from. Secrets are masked."""
-    from gateway.config.show import shown_configuration
+    from gateway.config.loading import shown_configuration
 
     print(shown_configuration(configuration_from_options(config, server)), end="")
 
@@ -75,10 +69,74 @@ def show(config: ConfigOption = None, server: ServerOption = None) -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of configuration files, for editors; same as config/gateway.schema.json."""
-    from gateway.config.show import schema_text
+    from gateway.config.loading import schema_text
     from gateway.outputs.registry import settings_type
 
     print(schema_text(settings_type()), end="")
+
+
+def doctor(
+    config: options.ConfigOption = None,
+    server: options.ServerOption = None,
+    seconds: Annotated[
+        float,
+        typer.Option(min=0.1, max=3600, help="How many seconds to watch each source and to wait for Zenoh."),
+    ] = 3.0,
+    no_connect: Annotated[
+        bool,
+        typer.Option(
+            "--no-connect", help="Ask the running gateway only; open no connection to the RT servers."
+        ),
+    ] = False,
+    zenoh_config: options.ZenohConfigOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log what the checks do, on stderr.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print only warnings and failures; nothing if all is well.")
+    ] = False,
+) -> None:
+    """Find out why no data arrives, layer by layer. Exit status 1 if a check fails.
+
+    Without options, it uses the configuration of the installed service.
+    """
+    options.check_exists("--zenoh-config", zenoh_config)
+    import uvloop
+    from rich.console import Console
+
+    from gateway.doctor.all_checks import run_checks, run_checks_without_settings
+    from gateway.doctor.report import Report
+    from gateway.doctor.source_checks import CONNECTION
+
+    # Without --verbose, warnings would repeat the findings.
+    set_up_log(LogLevel.DEBUG if verbose else LogLevel.ERROR, LogFormat.TEXT)
+    report = Report(Console(quiet=as_json), quiet=quiet)
+
+    async def report_findings() -> None:
+        file = chosen_file(config, server)
+        try:
+            settings = configuration_from_options(file, server).settings
+        except ConfigError as error:
+            for finding in run_checks_without_settings(error):
+                report.add(finding)
+            return
+        origin = str(file or server or "environment")
+        sections = {}
+        if zenoh_config is not None:
+            sections["zenoh"] = settings.outputs["zenoh"].model_copy(update={"config": zenoh_config})
+        findings = run_checks(settings, origin, seconds, connects=not no_connect, output_sections=sections)
+        async for finding in findings:
+            report.add(finding)
+            if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
+                print(safe_lines(f"{finding.subject}: {finding.found}"), file=sys.stderr)
+
+    uvloop.run(report_findings())
+    report.end()
+    if as_json:
+        print(report.as_json())
+    if not report.is_ok:
+        raise typer.Exit(1)
 
 
 def chosen_file(

@@ -16,13 +16,14 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, TypeAlias
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from gateway.config.settings import MetricsSettings, Settings, SourceSettings
+from gateway.config.settings import MetricsSettings, SourceSettings
 from gateway.errors import OutputError, ViewError
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.host_time import now_utime
@@ -57,7 +58,11 @@ async def view_process(endpoint: str, *, is_required: bool, opens_browser: bool)
 
     If it ``is_required``, raise ViewError if it does not start, and open a browser if ``opens_browser``.
     """
-    port = _free_port()
+    port = _PORT
+    for candidate in (_PORT, 0):  # the usual port of the view, or another one if that is taken
+        with contextlib.suppress(OSError), socket.create_server((_HOST, candidate)) as test:
+            port = int(test.getsockname()[1])
+            break
     command = [sys.executable, "-m", "gateway", "view", "--connect", endpoint, "--port", str(port)]
     if not (is_required and opens_browser):
         command.append("--no-browser")
@@ -84,14 +89,6 @@ async def view_process(endpoint: str, *, is_required: bool, opens_browser: bool)
             process.kill()
 
 
-def _free_port() -> int:
-    """Return the usual port of the view, or another one if that is taken."""
-    for port in (_PORT, 0):
-        with contextlib.suppress(OSError), socket.create_server((_HOST, port)) as test:
-            return int(test.getsockname()[1])
-    return _PORT
-
-
 SOURCE: Final = "demo"
 _START_TIMEOUT_S: Final = 10.0
 _QUIET_S: Final = 3.0
@@ -110,6 +107,8 @@ class _Received:
     count: Counter[str] = field(default_factory=Counter)
     late: Counter[str] = field(default_factory=Counter)
     newest: dict[str, bytes] = field(default_factory=dict)
+    shown: Counter[str] = field(default_factory=Counter)
+    """What was counted when the live table was shown last."""
 
     def add(self, name: str, message: bytes) -> None:
         """Count a message. ``name`` is a key or channel, such as mocap/demo/3d or MOCAP_DEMO_3D."""
@@ -118,6 +117,10 @@ class _Received:
         self.newest[component] = message
         if component in COMPONENTS_BY_KEY:
             self.late[component] += now_utime() - prefix_of(message).capture_utime > 1e6 * self.max_lag_s
+
+    def num_missing(self, sent: Counter[str]) -> int:
+        """Return how many of the messages that were sent have not arrived."""
+        return sum(max(0, count - self.count[component]) for component, count in sent.items())
 
 
 async def run_demo(
@@ -138,12 +141,19 @@ async def run_demo(
     async with contextlib.AsyncExitStack() as stack:
         simulator = await stack.enter_async_context(Simulator(scene))
         simulator.stop_measurement()
-        settings = _settings(simulator.port, sides)
-        received = {name: _Received(settings.sources[0].max_lag_ms / 1000) for name in sides}
+        source_settings = SourceSettings(name=SOURCE, host="127.0.0.1", port=simulator.port)
+        settings = settings_type().model_validate(
+            {
+                "sources": (source_settings,),
+                "metrics": MetricsSettings(enabled=False),
+                **{name: side.settings for name, side in sides.items()},
+            }
+        )
+        received = {name: _Received(source_settings.max_lag_ms / 1000) for name in sides}
         gateway = Gateway(settings, [side.output for side in sides.values()])
         await stack.enter_async_context(_running(gateway))
         for name, side in sides.items():
-            await _until_open(name, side)
+            await _until(partial(_is_open, side), _START_TIMEOUT_S, f"{name} did not open")
             stack.callback(side.subscribe(SOURCE, received[name].add).close)
             if view is not None and side.endpoint is not None:
                 await stack.enter_async_context(view(side.endpoint))
@@ -161,14 +171,16 @@ async def run_demo(
         simulator.start_measurement()
         await _show(received, stop, seconds, console)
         simulator.stop_measurement()
-        await _wait_for_missing(simulator, received)
-        skipped = _num_skipped(gateway)
-    console.print(_report(simulator.components_sent, received))
-    lost = sum(max(0, _num_missing(simulator.components_sent, each) - skipped) for each in received.values())
+        sent = simulator.components_sent
+        await _wait_for_missing(sent, received)
+        losses = [loss for status in source.statuses for loss in status.losses.report()]
+        skipped = sum(loss.messages for loss in losses if loss.cause == SKIPPED)  # before any output
+    console.print(_report(sent, received))
+    lost = sum(max(0, each.num_missing(sent) - skipped) for each in received.values())
     late = sum(each.late.total() for each in received.values())
     console.print(
         f"{skipped} messages were skipped, and {late} arrived late "
-        f"(more than {settings.sources[0].max_lag_ms:g} ms after their capture)."
+        f"(more than {source_settings.max_lag_ms:g} ms after their capture)."
     )
     if simulator.frames_dropped:
         console.print(
@@ -189,12 +201,8 @@ async def _running(gateway: Gateway) -> AsyncIterator[None]:
         await task
 
 
-def _settings(port: int, sides: dict[str, DemoSide]) -> Settings:
-    sections = {name: side.settings for name, side in sides.items()}
-    source = SourceSettings(name=SOURCE, host="127.0.0.1", port=port)
-    return settings_type().model_validate(
-        {"sources": (source,), "metrics": MetricsSettings(enabled=False), **sections}
-    )
+def _is_open(side: DemoSide) -> bool:
+    return side.output.health().connected
 
 
 async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
@@ -206,17 +214,12 @@ async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) 
         raise OutputError(f"{failure} within {timeout_s:g} s", cause="demo") from None
 
 
-async def _until_open(name: str, side: DemoSide) -> None:
-    await _until(lambda: side.output.health().connected, _START_TIMEOUT_S, f"{name} did not open")
-
-
 async def _show(
     received: dict[str, _Received], stop: asyncio.Event, seconds: float | None, console: Console
 ) -> None:
     """Wait for ``seconds``, or until ``stop``, and show the live table if the output is a terminal."""
     end = "s; Ctrl-C ends it" if seconds is None else f"of {seconds:.0f} s"
     start_s = time.monotonic()
-    previous: dict[str, Counter[str]] = {output: Counter() for output in received}
     elapsed_s = 0.0
     with Live(console=console, auto_refresh=False, transient=True) as live:
         while not stop.is_set() and (seconds is None or elapsed_s < seconds):
@@ -224,72 +227,48 @@ async def _show(
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), wait_s)
             now_s = time.monotonic() - start_s
-            rates = {
-                output: {
-                    component: (each.count[component] - previous[output][component]) / (now_s - elapsed_s)
-                    for component in each.count
-                }
-                for output, each in received.items()
-            }
-            previous = {output: Counter(each.count) for output, each in received.items()}
-            elapsed_s = now_s
             if console.is_terminal:
                 title = f"RTC3D simulator → gateway → subscribers, {now_s:.0f} {end}"
-                live.update(_table(received, rates, title), refresh=True)
+                live.update(_table(received, now_s - elapsed_s, title), refresh=True)
+            elapsed_s = now_s
 
 
-async def _wait_for_missing(simulator: Simulator, received: dict[str, _Received]) -> None:
+async def _wait_for_missing(sent: Counter[str], received: dict[str, _Received]) -> None:
     """Wait until every message that was sent has arrived, or none arrives for _QUIET_S."""
-    while missing := sum(_num_missing(simulator.components_sent, each) for each in received.values()):
+
+    def num_missing() -> int:
+        return sum(each.num_missing(sent) for each in received.values())
+
+    while missing := num_missing():
         try:
-            await _until(
-                lambda: (
-                    sum(_num_missing(simulator.components_sent, each) for each in received.values()) < missing
-                ),
-                _QUIET_S,
-                "messages are missing",
-            )
+            await _until(lambda: num_missing() < missing, _QUIET_S, "messages are missing")
         except OutputError:
             return
 
 
-def _num_missing(sent: Counter[str], received: _Received) -> int:
-    return sum(max(0, count - received.count[component]) for component, count in sent.items())
-
-
-def _num_skipped(gateway: Gateway) -> int:
-    """Return how many messages the gateway skipped before any output."""
-    statuses = [status for source in gateway.sources for status in source.statuses]
-    return sum(
-        loss.messages for status in statuses for loss in status.losses.report() if loss.cause == SKIPPED
-    )
-
-
-def _table(received: dict[str, _Received], rates: dict[str, dict[str, float]], title: str) -> Table:
-    table = Table(title=title)
-    table.add_column("component")
+def _table(received: dict[str, _Received], elapsed_s: float, title: str) -> Table:
+    """Return the live table, ``elapsed_s`` after the one before."""
+    table = Table("component", title=title)
     for output in received:
         table.add_column(f"{output} Hz", justify="right")
     table.add_column("newest message", width=_MESSAGE_WIDTH, no_wrap=True, overflow="ellipsis")
     for component in WIRE_ORDER:
-        newest = next(iter(received.values())).newest.get(component.key)
-        text = "" if newest is None else summarise(decode(newest))
-        table.add_row(
-            component.key,
-            *(f"{rates[output].get(component.key, 0.0):.1f}" for output in received),
-            text,
-        )
+        key = component.key
+        cells = [key]
+        for each in received.values():
+            count = each.count[key]
+            cells.append(f"{(count - each.shown[key]) / elapsed_s:.1f}")
+            each.shown[key] = count
+        newest = next(iter(received.values())).newest.get(key)
+        table.add_row(*cells, "" if newest is None else summarise(decode(newest)))
     return table
 
 
 def _report(sent: Counter[str], received: dict[str, _Received]) -> Table:
-    table = Table(title="Messages sent, received, late and missing")
-    for heading in (
-        "component",
-        "sent",
-        *(f"{output}\n{what}" for output in received for what in ("received", "late", "missing")),
-    ):
-        table.add_column(heading, justify="left" if heading == "component" else "right")
+    table = Table("component", title="Messages sent, received, late and missing")
+    columns = [f"{output}\n{what}" for output in received for what in ("received", "late", "missing")]
+    for heading in ("sent", *columns):
+        table.add_column(heading, justify="right")
     for component in WIRE_ORDER:
         cells = []
         for each in received.values():

@@ -1,17 +1,17 @@
 """``rtc3d-gateway echo``: subscribe to a gateway, and print its messages or their rates."""
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from functools import partial
+from typing import Annotated
 
 import typer
 
-from gateway.cli.options import AddressOptions, ComponentOption, SourceOption, with_options
+from gateway.cli import options
+from gateway.cli.main import exit_with
+from gateway.errors import QueryError
 
-if TYPE_CHECKING:
-    from gateway.cli.echo_output import Subscribe
 
-
-@with_options
+@options.with_options
 def echo(
     *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
@@ -20,15 +20,15 @@ def echo(
         str | None,
         typer.Option(metavar="NAME", help="Subscribe on the output with this name, such as zenoh or lcm."),
     ] = None,
-    source: SourceOption = None,
-    component: ComponentOption = None,
+    source: options.SourceOption = None,
+    component: options.ComponentOption = None,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after this number of messages.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this many seconds.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
     hz: Annotated[
         bool, typer.Option("--hz", help="Print a table of rates every second instead of the messages.")
     ] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
 ) -> None:
     """Print what gateways publish. Exit status 1 if fewer than --count messages arrive in --seconds.
 
@@ -40,26 +40,24 @@ def echo(
     if where.zenoh_config is not None and name != "zenoh":
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
 
-    from gateway.cli.echo_output import Limits, print_messages, print_rates
-    from gateway.cli.echo_sources import Silence, Units
-    from gateway.cli.main import exit_with
-    from gateway.errors import QueryError
+    from gateway.cli.echo_output import print_messages, print_rates
+    from gateway.cli.echo_sources import EchoSources
     from gateway.outputs.kind import SubscriptionRequest
+    from gateway.outputs.registry import OUTPUTS
 
     request = SubscriptionRequest(
         source, component, where.prefix, where.connect or where.url, where.zenoh_config
     )
-    limits = Limits(count, seconds)
-    silence = Silence(name, request)
-    subscribe = _subscribe_function(name)
+    sources = EchoSources(name, request)
+    functions = {each: kind.subscribe for each, kind in OUTPUTS.items() if kind.subscribe is not None}
+    if name not in functions:
+        raise typer.BadParameter(
+            f"no messages to print from output {name!r}; choose one of: {', '.join(functions)}"
+        )
+    subscribe = partial(functions[name], request)
     try:
-        if hz:
-            num_received = print_rates(subscribe, request, limits, silence, sys.stdout, as_json=as_json)
-        else:
-            units = Units(name, request)
-            num_received = print_messages(
-                subscribe, request, limits, silence, units, sys.stdout, as_json=as_json
-            )
+        show = print_rates if hz else print_messages
+        num_received = show(subscribe, sources, sys.stdout, count=count, seconds=seconds, as_json=as_json)
     except QueryError as error:
         exit_with([error])
         return
@@ -68,15 +66,3 @@ def echo(
     if count is not None and num_received < count:
         print(f"{num_received} of {count} messages arrived within {seconds:g} s", file=sys.stderr)
         raise typer.Exit(1)
-
-
-def _subscribe_function(output: str) -> "Subscribe":
-    """Return the function that subscribes on the output of this name; BadParameter if there is none."""
-    from gateway.outputs.registry import OUTPUTS
-
-    functions = {name: kind.subscribe for name, kind in OUTPUTS.items() if kind.subscribe is not None}
-    if output not in functions:
-        raise typer.BadParameter(
-            f"no messages to print from output {output!r}; choose one of: {', '.join(functions)}"
-        )
-    return functions[output]

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import queue
 import sys
 import threading
@@ -16,32 +17,32 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.echo_sources import Silence, Units
+from gateway.cli.echo_sources import EchoSources
 from gateway.display.terminal import list_table, write_records
 from gateway.errors import ProtocolError
 from gateway.logs.safe_text import safe_json, safe_text
 from gateway.messages.decode import decode, to_json
 from gateway.messages.host_time import now_utime
 from gateway.messages.summary import summarise, summarise_xml
-from gateway.outputs.kind import Receive, Subscription, SubscriptionRequest
+from gateway.outputs.kind import Receive, Subscription
 
 _MAX_LINE_CHARACTERS: Final = 4000
 
 
 def json_line(name: str, message: bytes) -> str:
     """Return a JSON object: the fields of the message, and ``name`` (the key or channel) as ``key``."""
-    try:
-        fields = to_json(decode(message))
-    except ProtocolError as error:
-        match _xml_or_json(message):
-            case bytes() as xml:
-                fields = {"xml": xml.decode("utf-8", "replace")}
-            case dict() as json_object:
-                fields = json_object
-            case _:
-                fields = {"error": str(error)}
+    match _content(message):
+        case ProtocolError() as error:
+            fields: dict[str, Any] = {"error": str(error)}
+        case bytes() as xml:
+            fields = {"xml": xml.decode("utf-8", "replace")}
+        case dict() as json_object:
+            fields = json_object
+        case decoded:
+            fields = to_json(decoded)
     return safe_json(json.dumps({"key": name} | fields))
 
 
@@ -50,123 +51,87 @@ def text_line(name: str, message: bytes, units_of: Callable[[str, Any], Sequence
 
     ``units_of`` returns the units of the items of a decoded message with this name.
     """
-    try:
-        decoded = decode(message)
-        line = f"{name} {summarise(decoded, units_of(name, decoded))}"
-    except ProtocolError as error:
-        match _xml_or_json(message):
-            case bytes() as xml:
-                line = f"{name} {summarise_xml(xml)}"
-            case dict() as json_object:
-                line = f"{name} " + ", ".join(f"{key} {value}" for key, value in json_object.items())
-            case _:
-                line = f"{name}: {error}"
+    match _content(message):
+        case ProtocolError() as error:
+            line = f"{name}: {error}"
+        case bytes() as xml:
+            line = f"{name} {summarise_xml(xml)}"
+        case dict() as json_object:
+            line = f"{name} " + ", ".join(f"{key} {value}" for key, value in json_object.items())
+        case decoded:
+            line = f"{name} {summarise(decoded, units_of(name, decoded))}"
     return safe_text(line, _MAX_LINE_CHARACTERS)
 
 
-def _xml_or_json(message: bytes) -> bytes | dict[str, Any] | None:
-    """Return XML unchanged, or the object in a JSON text (both exist on Zenoh); None for other bytes."""
-    if message.lstrip().startswith(b"<"):
-        return message
+def _content(message: bytes) -> Any:
+    """Return the decoded message; XML unchanged; the object in a JSON text; or why it is none of these."""
     try:
-        value = json.loads(message)
-    except (ValueError, RecursionError):
-        return None
-    return value if isinstance(value, dict) else None
+        return decode(message)
+    except ProtocolError as error:
+        if message.lstrip().startswith(b"<"):  # XML and JSON exist on Zenoh
+            return message
+        try:
+            value = json.loads(message)
+        except (ValueError, RecursionError):
+            return error
+        return value if isinstance(value, dict) else error
 
 
 MAX_WAITING: Final = 10_000
 """How many messages may wait to be printed."""
 
-POLL_S: Final = 0.1
-"""How often the silence is checked before the first message."""
+_POLL_S: Final = 0.1
+"""How often the time is checked, and the silence before the first message."""
 
-Subscribe = Callable[[SubscriptionRequest, Receive], Subscription]
-
-
-class Limits:
-    """When ``echo`` ends: after ``count`` messages, or after ``seconds``. None means no limit."""
-
-    def __init__(self, count: int | None, seconds: float | None) -> None:
-        self.count = count
-        self._end_s = None if seconds is None else time.monotonic() + seconds
-
-    def wait_s(self, longest_s: float | None) -> float | None:
-        """Return how long to wait for messages: to the end, but not longer than ``longest_s``."""
-        if self._end_s is None:
-            return longest_s
-        left_s = max(0.0, self._end_s - time.monotonic())
-        return left_s if longest_s is None else min(left_s, longest_s)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the time is up."""
-        return self._end_s is not None and time.monotonic() >= self._end_s
-
-
-class WaitingMessages:
-    """The messages that wait to be printed, each with its key or channel, up to ``max_waiting``."""
-
-    def __init__(self, max_waiting: int = MAX_WAITING) -> None:
-        self._messages: queue.Queue[tuple[str, bytes]] = queue.Queue(max_waiting)
-        self.num_dropped = 0
-        """How many messages came while too many were waiting."""
-
-    def put(self, name: str, message: bytes) -> None:
-        """Take a message, in the thread that receives."""
-        try:
-            self._messages.put_nowait((name, message))
-        except queue.Full:
-            self.num_dropped += 1
-
-    def get(self, timeout_s: float | None) -> tuple[str, bytes] | None:
-        """Return the next message; None if there is none in time."""
-        try:
-            return self._messages.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
+Subscribe = Callable[[Receive], Subscription]
 
 
 def print_messages(
     subscribe: Subscribe,
-    request: SubscriptionRequest,
-    limits: Limits,
-    silence: Silence,
-    units: Units,
+    sources: EchoSources,
     out: TextIO,
     *,
+    count: int | None,
+    seconds: float | None,
     as_json: bool,
 ) -> int:
-    """Print messages until ``limits`` are reached, and return how many were printed.
+    """Print ``count`` messages, or those of ``seconds``, and return how many they are. None means no limit.
 
     Raises OutputError if the output does not open, QueryError if there cannot be any messages.
     """
-    messages = WaitingMessages()
-    line = json_line if as_json else partial(text_line, units_of=units.of)
-    num_printed = 0
+    line = json_line if as_json else partial(text_line, units_of=sources.units_of)
+    waiting: queue.Queue[tuple[str, bytes]] = queue.Queue(MAX_WAITING)
+    num_dropped = num_printed = 0
+    end_s = time.monotonic() + (math.inf if seconds is None else seconds)
+
+    def receive(name: str, message: bytes) -> None:
+        nonlocal num_dropped
+        try:
+            waiting.put_nowait((name, message))
+        except queue.Full:
+            num_dropped += 1
+
     try:
-        with closing(subscribe(request, messages.put)):
-            while limits.count is None or num_printed < limits.count:
-                received = messages.get(limits.wait_s(None if num_printed else POLL_S))
-                if received is not None:
-                    print(line(*received), file=out, flush=True)
-                    num_printed += 1
-                elif limits.is_over:
-                    break
-                else:
-                    silence.check()
+        with closing(subscribe(receive)):
+            while count is None or num_printed < count:
+                try:
+                    received = waiting.get(timeout=_wait_s(end_s))
+                except queue.Empty:
+                    if time.monotonic() >= end_s:
+                        break
+                    if not num_printed:
+                        sources.check_silence()
+                    continue
+                print(line(*received), file=out, flush=True)
+                num_printed += 1
     finally:
-        _report_dropped(messages.num_dropped)
+        if num_dropped:
+            print(
+                f"{num_dropped} messages were not printed, because they came faster than they can be "
+                "printed; choose fewer with --source or --component, or count them with --hz",
+                file=sys.stderr,
+            )
     return num_printed
-
-
-def _report_dropped(num_dropped: int) -> None:
-    if num_dropped:
-        print(
-            f"{num_dropped} messages were not printed, because they came faster than they can be printed; "
-            "choose fewer with --source or --component, or count them with --hz",
-            file=sys.stderr,
-        )
 
 
 WINDOW_S: Final = 10.0
@@ -258,50 +223,69 @@ def _rate(key: str, arrivals_s: NDArray[np.float64], now_s: float) -> Rate:
     return Rate(key, rate_hz, *spread, len(arrivals_s), age_s, has_stopped)
 
 
+def _wait_s(end_s: float) -> float:
+    return min(_POLL_S, max(0.0, end_s - time.monotonic()))
+
+
 def print_rates(
     subscribe: Subscribe,
-    request: SubscriptionRequest,
-    limits: Limits,
-    silence: Silence,
+    sources: EchoSources,
     out: TextIO,
     *,
+    count: int | None,
+    seconds: float | None,
     as_json: bool,
 ) -> int:
-    """Print the rates every second until ``limits`` are reached; return how many messages came.
+    """Print the rates every second, with the limits of ``print_messages``; return how many messages came.
 
     On a terminal, the table is refreshed in place. Raises OutputError and QueryError as ``print_messages``.
     """
-    rates = Rates(limits.count)
+    rates = Rates(count)
+    end_s = time.monotonic() + (math.inf if seconds is None else seconds)
     console = Console(file=out)
-    with closing(subscribe(request, rates.receive)), contextlib.ExitStack() as stack:
-        if as_json or not console.is_terminal:
-            show: Callable[[list[Rate]], object] = partial(_print_block, out, as_json=as_json)
+    live = None if as_json or not console.is_terminal else Live(console=console, auto_refresh=False)
+
+    def show() -> None:
+        if live is None:
+            _print_rows(rates.rows(), out, as_json=as_json)
         else:
-            live = stack.enter_context(Live(console=console, auto_refresh=False))
-            show = partial(_refresh, live)
-        stack.callback(_report_beyond, rates)
+            live.update(_table(rates.rows()), refresh=True)
+
+    with closing(subscribe(rates.receive)), live or contextlib.nullcontext():
+        shown_s = time.monotonic()
         try:
-            _run(rates, limits, silence, show)
+            while not rates.is_complete.wait(_wait_s(end_s)):
+                if time.monotonic() >= end_s:
+                    break
+                if not rates.num_messages:
+                    sources.check_silence()
+                elif time.monotonic() - shown_s >= _EACH_S:
+                    shown_s = time.monotonic()
+                    show()
         finally:
             if rates.num_messages:
-                show(rates.rows())
+                show()
+            if rates.num_beyond:
+                beyond = f"because there are more than {MAX_KEYS} keys"
+                print(f"{rates.num_beyond} messages are in no row, {beyond}", file=sys.stderr)
     return rates.num_messages
 
 
-def _run(rates: Rates, limits: Limits, silence: Silence, show: Callable[[list[Rate]], object]) -> None:
-    """Show the rates every second, but for the last time, until ``limits`` are reached."""
-    shown_s = time.monotonic()
-    while not rates.is_complete.wait(limits.wait_s(_EACH_S if rates.num_messages else POLL_S)):
-        if limits.is_over:
-            return
-        if not rates.num_messages:
-            silence.check()
-        elif time.monotonic() - shown_s >= _EACH_S:
-            shown_s = time.monotonic()
-            show(rates.rows())
+def _print_rows(rows: Sequence[Rate], out: TextIO, *, as_json: bool) -> None:
+    utime = now_utime()
+    for row in rows:
+        if as_json:
+            fields = {
+                name: round(value, 6) if isinstance(value, float) else value
+                for name, value in row._asdict().items()
+            }
+            print(safe_json(json.dumps({"utime": utime} | fields, ensure_ascii=False)), file=out)
+        else:
+            write_records(out, [_cells(row)])
+    out.flush()
 
 
-def _refresh(live: Live, rows: Sequence[Rate]) -> None:
+def _table(rows: Sequence[Rate]) -> Table:
     table = list_table()
     table.add_column(_HEADINGS[0], overflow="fold")
     for heading in _HEADINGS[1:]:
@@ -309,39 +293,12 @@ def _refresh(live: Live, rows: Sequence[Rate]) -> None:
     for row in rows:
         key, *cells = _cells(row)
         table.add_row(Text(key), *cells, style="yellow" if row.has_stopped else "")
-    live.update(table, refresh=True)
-
-
-def _print_block(out: TextIO, rows: Sequence[Rate], *, as_json: bool) -> None:
-    if as_json:
-        utime = now_utime()
-        for row in rows:
-            print(safe_json(json.dumps({"utime": utime} | _rounded(row), ensure_ascii=False)), file=out)
-    else:
-        write_records(out, [_cells(row) for row in rows])
-    out.flush()
+    return table
 
 
 def _cells(row: Rate) -> tuple[str, ...]:
     rate = f"none for {row.age_s:.0f} s" if row.has_stopped else f"{row.rate_hz:.1f} Hz"
     if row.window == 1 and not row.has_stopped:
         rate = "-"
-    times = (_milliseconds(time_s) for time_s in (row.min_s, row.max_s, row.std_dev_s))
+    times = ("-" if time_s is None else f"{1e3 * time_s:.1f} ms" for time_s in row[2:5])
     return safe_text(row.key), rate, *times, str(row.window)
-
-
-def _rounded(row: Rate) -> dict[str, Any]:
-    fields = row._asdict()
-    return {name: round(value, 6) if isinstance(value, float) else value for name, value in fields.items()}
-
-
-def _milliseconds(time_s: float | None) -> str:
-    return "-" if time_s is None else f"{1e3 * time_s:.1f} ms"
-
-
-def _report_beyond(rates: Rates) -> None:
-    if rates.num_beyond:
-        print(
-            f"{rates.num_beyond} messages are in no row, because there are more than {MAX_KEYS} keys",
-            file=sys.stderr,
-        )

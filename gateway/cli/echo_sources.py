@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.found_sources import FoundSources
 from gateway.config.words import join_or
 from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError
@@ -39,72 +38,12 @@ OUTPUTS: Final = ("zenoh", "lcm")
 _COMPONENTS: Final = {message_type: component for component, message_type in MESSAGE_TYPES.items()}
 
 
-def gateway_client(output: str, request: SubscriptionRequest) -> GatewayClient:
-    """Return a client on the output where ``echo`` subscribes: zenoh or lcm."""
-    address = GatewayAddress(
-        output == "lcm", request.address, request.config, request.address, request.prefix
-    )
-    return GatewayClient(address, QUERY_S)
-
-
 class _Known(NamedTuple):
     """The parameters of a source with their version, and the units of the items of components."""
 
     version: int
     parameters: Parameters
     units: dict[ComponentType, tuple[str, ...]]
-
-
-class Units:
-    """The units of messages on ``output``. A source is asked once for each version of its parameters."""
-
-    def __init__(self, output: str, request: SubscriptionRequest) -> None:
-        self._output = output
-        self._request = request
-        self._known: dict[str, _Known] = {}
-        self._failed_s: dict[str, float] = {}  # when sources last had no answer, on the monotonic clock
-
-    def of(self, name: str, message: Any) -> Sequence[str]:
-        """Return the unit of each item in a message with this key or channel; () if they are unknown."""
-        component = _COMPONENTS.get(type(message))
-        if component is None or self._output not in OUTPUTS or not message.parameters_version:
-            return ()
-        source = self._source(name, component)
-        known = self._known.get(source)
-        if known is None or known.version != message.parameters_version:
-            known = self._ask(source, message.parameters_version)
-        if known is None:
-            return ()
-        num_items = getattr(message, f"num_{component.item_noun}")
-        units = known.units.get(component)
-        if units is None or len(units) != num_items:
-            units = known.units[component] = describe(component, known.parameters, num_items).units
-        return units
-
-    def _source(self, name: str, component: ComponentType) -> str:
-        """Return the source of a key or channel; LCM's channels do not say which of its letters are small."""
-        if self._output == "zenoh":
-            prefix = self._request.prefix or DEFAULT_ZENOH_PREFIX
-            return name.removeprefix(f"{prefix}/").partition("/")[0]
-        prefix = self._request.prefix or DEFAULT_LCM_PREFIX
-        return name.removeprefix(f"{prefix}_").removesuffix(f"_{component.key.upper()}").lower()
-
-    def _ask(self, source: str, version: int) -> _Known | None:
-        """Return the parameters with this version; None if the source does not have them."""
-        now_s = time.monotonic()
-        if now_s - self._failed_s.get(source, -math.inf) < RETRY_S or len(self._failed_s) >= _MAX_FAILED:
-            return None
-        with (
-            contextlib.suppress(OutputError, ParametersError),
-            gateway_client(self._output, self._request) as client,
-        ):
-            for reply in client.parameters(source).received:
-                if reply.source == source and reply.version == version:
-                    known = _Known(version, parse_parameters(reply.content).parameters, {})
-                    self._known[source] = known
-                    return known
-        self._failed_s[source] = now_s
-        return None
 
 
 LOOK_S: Final = 0.4
@@ -116,19 +55,66 @@ SAY_S: Final = 2.0
 _MAX_NAMED: Final = 20
 
 
-class Silence:
-    """Finds out in a thread of its own why nothing is heard on an output, and says it once."""
+class EchoSources:
+    """Asks the gateways on an output about the sources that ``echo`` subscribes to.
+
+    A source is asked once for each version of its parameters. Why nothing is heard is found out in a thread,
+    and said once.
+    """
 
     def __init__(self, output: str, request: SubscriptionRequest) -> None:
         self._output = output
         self._request = request
+        self._known: dict[str, _Known] = {}
+        self._failed_s: dict[str, float] = {}  # when sources last had no answer, on the monotonic clock
         self._start_s = time.monotonic()
         self._thread: threading.Thread | None = None
         self._error: QueryError | None = None
         self._reason = ""
         self._is_said = False
 
-    def check(self) -> None:
+    def _client(self) -> GatewayClient:
+        where, config = self._request.address, self._request.config
+        is_lcm = self._output == "lcm"
+        return GatewayClient(GatewayAddress(is_lcm, where, config, where, self._request.prefix), QUERY_S)
+
+    def units_of(self, name: str, message: Any) -> Sequence[str]:
+        """Return the unit of each item in a message with this key or channel; () if they are unknown."""
+        component = _COMPONENTS.get(type(message))
+        if component is None or self._output not in OUTPUTS or not message.parameters_version:
+            return ()
+        if self._output == "zenoh":
+            prefix = self._request.prefix or DEFAULT_ZENOH_PREFIX
+            source = name.removeprefix(f"{prefix}/").partition("/")[0]
+        else:  # channels do not say which of its letters are small
+            prefix = self._request.prefix or DEFAULT_LCM_PREFIX
+            source = name.removeprefix(f"{prefix}_").removesuffix(f"_{component.key.upper()}").lower()
+        known = self._known.get(source)
+        if known is None or known.version != message.parameters_version:
+            known = self._ask(source, message.parameters_version)
+        if known is None:
+            return ()
+        num_items = getattr(message, f"num_{component.item_noun}")
+        units = known.units.get(component)
+        if units is None or len(units) != num_items:
+            units = known.units[component] = describe(component, known.parameters, num_items).units
+        return units
+
+    def _ask(self, source: str, version: int) -> _Known | None:
+        """Return the parameters with this version; None if the source does not have them."""
+        now_s = time.monotonic()
+        if now_s - self._failed_s.get(source, -math.inf) < RETRY_S or len(self._failed_s) >= _MAX_FAILED:
+            return None
+        with contextlib.suppress(OutputError, ParametersError), self._client() as client:
+            for reply in client.parameters(source).received:
+                if reply.source == source and reply.version == version:
+                    known = _Known(version, parse_parameters(reply.content).parameters, {})
+                    self._known[source] = known
+                    return known
+        self._failed_s[source] = now_s
+        return None
+
+    def check_silence(self) -> None:
         """Call this again and again while nothing has been heard.
 
         Raises QueryError if there are gateways, and none of them has the source or the component.
@@ -150,12 +136,12 @@ class Silence:
     def _look(self) -> None:
         """Find out what exists, in the thread."""
         try:
-            with gateway_client(self._output, self._request) as client:
+            with self._client() as client:
                 found = client.sources(self._request.source)
                 if found.absence and found.heard:
                     self._error = QueryError(found.absence, code="no-gateway")
                 else:
-                    self._reason = found.absence or self._why_silent(found, client)
+                    self._reason = found.absence or self._why_silent(found.sources, client)
         except QueryError as error:
             self._error = error
         except OutputError as error:
@@ -163,56 +149,41 @@ class Silence:
         except Exception as error:  # noqa: BLE001 - what comes later is printed, whatever this is
             self._reason = f"nothing heard, and the search for gateways failed: {error}"
 
-    def _why_silent(self, found: FoundSources, client: GatewayClient) -> str:
-        """Return what the sources do; raise QueryError if they do not have the component."""
+    def _why_silent(self, sources: Sequence[SourceReport], client: GatewayClient) -> str:
+        """Return what the sources do; raise QueryError if they do not have the component or the tool."""
         component = self._request.component or ""
         key, _, label = component.partition("/")
-        if all(source.streams for source in found.sources):
-            _check_component(key, found.sources)
+        existing = dict.fromkeys(key for source in sources for key in source.components)
+        if key in COMPONENTS_BY_KEY and key not in existing and all(source.streams for source in sources):
+            raise QueryError(
+                f"no {key} from {', '.join(source.name for source in sources[:_MAX_NAMED])}; accepted for "
+                f"--component: {join_or((*existing, 'status', 'clock', 'parameters'))}",
+                code="no-gateway",
+            )
         tool_poses = ""
         if label:
             self._check_tool(label, client)
             tool_poses = f"; poses of single tools need {self._output}.tool_poses: true in the configuration"
         what = f" of {safe_text(component)}" if component else ""
-        shown = ", ".join(f"{source.name}: {_state(source)}" for source in found.sources[:_MAX_NAMED])
+        shown = ", ".join(
+            f"{source.name}: {source.problem or source.text}" for source in sources[:_MAX_NAMED]
+        )
         return f"nothing heard{what} although a gateway runs ({shown}){tool_poses}"
 
     def _check_tool(self, label: str, client: GatewayClient) -> None:
-        labels = self._tool_labels(client)
-        if not labels or label == "*" or any(self._is_same(label, each) for each in labels):
-            return
-        shown = ", ".join(map(safe_text, labels[:_MAX_NAMED])) + (", …" if len(labels) > _MAX_NAMED else "")
-        raise QueryError(f"no gateway has a tool {quoted(label)}; tools found: {shown}", code="no-gateway")
-
-    def _is_same(self, label: str, other: str) -> bool:
-        return label == other or (
-            self._output == "lcm" and lcm_channel("", "", label) == lcm_channel("", "", other)
-        )
-
-    def _tool_labels(self, client: GatewayClient) -> list[str]:
-        """Return the labels of the tools of the sources, each once; [] if they are not known."""
+        """Raise QueryError if the labels of the sources' tools are known, and none is ``label``."""
         labels: dict[str, None] = {}
         for reply in client.parameters(self._request.source, ("6d",)).received:
             try:
                 parameters = parse_parameters(reply.content).parameters
             except ParametersError:
-                return []
+                return
             num_tools = 0 if parameters.tools is None else len(parameters.tools.tools)
             labels |= dict.fromkeys(describe(ComponentType.TOOLS, parameters, num_tools).labels)
-        return list(labels)
-
-
-def _check_component(key: str, sources: Sequence[SourceReport]) -> None:
-    """Raise QueryError if ``key`` is a component of measured data, and no source has it."""
-    existing = list(dict.fromkeys(key for source in sources for key in source.components))
-    if key in COMPONENTS_BY_KEY and key not in existing:
-        names = [source.name for source in sources[:_MAX_NAMED]]
-        raise QueryError(
-            f"no {key} from {', '.join(names)}; accepted for --component: "
-            f"{join_or((*existing, 'status', 'clock', 'parameters'))}",
-            code="no-gateway",
-        )
-
-
-def _state(source: SourceReport) -> str:
-    return source.problem or source.text
+        channels = {lcm_channel("", "", each) for each in labels} if self._output == "lcm" else ()
+        if labels and label not in {"*", *labels} and lcm_channel("", "", label) not in channels:
+            shown = ", ".join(map(safe_text, list(labels)[:_MAX_NAMED]))
+            shown += ", …" if len(labels) > _MAX_NAMED else ""
+            raise QueryError(
+                f"no gateway has a tool {quoted(label)}; tools found: {shown}", code="no-gateway"
+            )

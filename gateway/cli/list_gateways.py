@@ -1,34 +1,31 @@
 """``rtc3d-gateway list``: the gateways and sources that can be heard, as a table, lines or JSON."""
 
-import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from gateway.cli.options import AddressOptions, SourceOption, with_options
-from gateway.logs.safe_text import safe_json
-from gateway.messages.source_report import Level, SourceReport, StreamReport
+from gateway.cli import options
+from gateway.cli.main import exit_with, print_json
+from gateway.errors import QueryError
+from gateway.messages.source_report import Level
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     from gateway.client.found_sources import FoundSources
 
 
-@with_options
+@options.with_options
 def list_gateways(
     *,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Look on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Listen on LCM.")] = False,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
 ) -> None:
     """List the gateways and sources that can be heard: states, rates, servers, hosts, versions.
 
@@ -40,14 +37,12 @@ def list_gateways(
 
     from rich.console import Console
 
-    from gateway.cli.main import exit_with
     from gateway.client.client import GatewayClient
-    from gateway.errors import QueryError
 
     with GatewayClient(where.address(lcm=lcm)) as client:
         found = client.sources(source)
     if as_json:
-        print(sources_json(found))
+        print_json(found_json(found))
     elif found.sources:
         write_sources(found, Console())
     for note in notes(found):
@@ -63,21 +58,59 @@ _NARROW_WIDTHS: Final = {"state": len("streaming 2000.0 Hz"), "components": len(
 
 def write_sources(found: "FoundSources", console: "Console") -> None:
     """Write a table on a terminal; otherwise, a line for each source with tabs between the columns."""
-    from gateway.display.terminal import write_records
+    from rich.text import Text
 
-    if console.is_terminal:
-        console.print(_table(found.sources, is_narrow=console.width in _NARROW))
+    from gateway.display.terminal import list_table, write_records
+
+    if not console.is_terminal:
+        for source in found.sources:
+            components = ", ".join(stream.components for stream in source.streams)
+            texts = ", ".join(filter(None, (source.text, source.problem)))
+            record = (source.name, texts, components, source.server, source.host, source.version)
+            write_records(console.file, [record])
         return
-    write_records(console.file, [_record(source) for source in found.sources])
+    table = list_table()
+    for heading in ("source", "state", "components", "server", "host", "version"):
+        width = _NARROW_WIDTHS.get(heading) if console.width in _NARROW else None
+        table.add_column(heading, overflow="fold", width=width)
+    for source in found.sources:
+        rows = [(Text(each.text, _COLOURS[each.level]), each.components) for each in source.streams]
+        if source.problem or not rows:
+            rows.append((Text(source.problem or "no streams", "red"), ""))
+        name, others = source.name, (source.server, source.host, source.version)
+        for state, components in rows:
+            table.add_row(Text(name, "bold"), state, *map(Text, (components, *others)))
+            name, others = "", ("", "", "")
+    console.print(table)
 
 
-def sources_json(found: "FoundSources") -> str:
+def found_json(found: "FoundSources") -> dict[str, Any]:
     """Return the JSON object that docs/reference/commands.md describes."""
-    content = {
-        "sources": [_source_json(source) for source in found.sources],
-        "num_left_out": found.num_left_out,
-    }
-    return safe_json(json.dumps(content, indent=2, ensure_ascii=False))
+    sources = [
+        {
+            "source": source.name,
+            "gateway": source.gateway or None,
+            "problem": source.problem,
+            "server": source.server or None,
+            "host": source.host or None,
+            "version": source.version or None,
+            "streams": [
+                {
+                    "components": stream.components.split(),
+                    "text": stream.text,
+                    "state": stream.state,
+                    "problem": stream.problem,
+                    "rate_hz": round(stream.frame_rate_hz, 3)
+                    if math.isfinite(stream.frame_rate_hz)
+                    else None,
+                    "tries": stream.tries,
+                }
+                for stream in source.streams
+            ],
+        }
+        for source in found.sources
+    ]
+    return {"sources": sources, "num_left_out": found.num_left_out}
 
 
 def notes(found: "FoundSources") -> list[str]:
@@ -92,59 +125,3 @@ def notes(found: "FoundSources") -> list[str]:
             f"{found.num_left_out} more sources or statuses were left out, because there are too many"
         )
     return texts
-
-
-def _table(sources: Sequence[SourceReport], *, is_narrow: bool) -> "Table":
-    from rich.text import Text
-
-    from gateway.display.terminal import list_table
-
-    table = list_table()
-    for heading in ("source", "state", "components", "server", "host", "version"):
-        width = _NARROW_WIDTHS.get(heading) if is_narrow else None
-        table.add_column(heading, overflow="fold", width=width)
-    for source in sources:
-        rows = [(_state(stream), stream.components) for stream in source.streams]
-        if source.problem or not rows:
-            rows.append((Text(source.problem or "no streams", "red"), ""))
-        for number, (state, components) in enumerate(rows):
-            others = (source.server, source.host, source.version) if number == 0 else ("", "", "")
-            table.add_row(
-                Text(source.name if number == 0 else "", "bold"), state, *map(Text, (components, *others))
-            )
-    return table
-
-
-def _state(stream: StreamReport) -> "Text":
-    from rich.text import Text
-
-    return Text(stream.text, _COLOURS[stream.level])
-
-
-def _record(source: SourceReport) -> tuple[str, ...]:
-    components = ", ".join(stream.components for stream in source.streams)
-    texts = ", ".join(filter(None, (source.text, source.problem)))
-    return source.name, texts, components, source.server, source.host, source.version
-
-
-def _source_json(source: SourceReport) -> dict[str, Any]:
-    return {
-        "source": source.name,
-        "gateway": source.gateway or None,
-        "problem": source.problem,
-        "server": source.server or None,
-        "host": source.host or None,
-        "version": source.version or None,
-        "streams": [_stream_json(stream) for stream in source.streams],
-    }
-
-
-def _stream_json(stream: StreamReport) -> dict[str, Any]:
-    return {
-        "components": stream.components.split(),
-        "text": stream.text,
-        "state": stream.state,
-        "problem": stream.problem,
-        "rate_hz": round(stream.frame_rate_hz, 3) if math.isfinite(stream.frame_rate_hz) else None,
-        "tries": stream.tries,
-    }

@@ -7,11 +7,12 @@ Commands that ask gateways have three more: EXIT_STATUSES.
 import contextlib
 import errno
 import io
+import json
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import FrameType
 from typing import Annotated, Any, Final, NoReturn
@@ -21,14 +22,14 @@ import typer.core
 
 from gateway import version_text
 from gateway.errors import ConfigError, GatewayError, QueryError, SelectionError
-from gateway.logs.safe_text import safe_lines
+from gateway.logs.safe_text import safe_json, safe_lines
 from gateway.service.process_end import end_process
 
 COMMANDS: Final = {
     "run": "gateway.cli.run:run",
-    "doctor": "gateway.cli.doctor:doctor",
-    "simulate": "gateway.cli.simulate:simulate",
-    "demo": "gateway.cli.simulate:demo",
+    "doctor": "gateway.cli.config:doctor",
+    "simulate": "gateway.cli.run:simulate",
+    "demo": "gateway.cli.run:demo",
     "list": "gateway.cli.list_gateways:list_gateways",
     "view": "gateway.cli.view:view",
     "echo": "gateway.cli.echo:echo",
@@ -36,7 +37,7 @@ COMMANDS: Final = {
     "params": "gateway.cli.params:params",
     "record": "gateway.cli.record:record",
     "replay": "gateway.cli.replay:replay",
-    "export": "gateway.cli.export:export",
+    "export": "gateway.cli.take:export",
     "take": "gateway.cli.take:app",
     "config": "gateway.cli.config:app",
 }
@@ -65,43 +66,35 @@ def exit_with(problems: Sequence[QueryError]) -> None:
         raise typer.Exit(EXIT_STATUSES.get(problems[0].code, 1))
 
 
+def print_json(content: object) -> None:
+    """Print a JSON object on several lines."""
+    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
+
+
 class LazyGroup(typer.core.TyperGroup):
-    """The group of all commands."""
+    """The group of all commands, each imported when it is looked up."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        self.commands: Any = _LazyCommands(COMMANDS)
+        self.commands: Any = dict.fromkeys(COMMANDS)  # typer compares misspelt commands with these names
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - overrides
         """Return the names of the commands in the order of the table."""
-        return list(self.commands)
+        return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002 - overrides
         """Return a command by its name or its alias; None if there is none."""
-        return self.commands.get(cmd_name) or _LazyCommands(ALIASES).get(cmd_name)
-
-
-class _LazyCommands(Mapping[str, Any]):
-    """Commands by name, each imported when it is looked up."""
-
-    def __init__(self, table: Mapping[str, str]) -> None:
-        self._table = table
-
-    def __getitem__(self, name: str) -> Any:
-        module, _, attribute = self._table[name].partition(":")
+        path = COMMANDS.get(cmd_name) or ALIASES.get(cmd_name)
+        if path is None:
+            return None
+        module, _, attribute = path.partition(":")
         target = getattr(import_module(module), attribute)
         app = typer.Typer()
         if isinstance(target, typer.Typer):
-            app.add_typer(target, name=name)
+            app.add_typer(target, name=cmd_name)
         else:
-            app.command(name)(target)
-        return typer.main.get_group(app).commands[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._table)
-
-    def __len__(self) -> int:
-        return len(self._table)
+            app.command(cmd_name)(target)
+        return typer.main.get_group(app).commands[cmd_name]
 
 
 _OUTPUT_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
@@ -156,7 +149,9 @@ def _run() -> int:
     except BrokenPipeError:
         return 0
     except OSError as error:
-        _print_os_error(error)
+        is_output = error.errno in _OUTPUT_ERRORS and error.filename is None
+        what = "cannot write the output: " if is_output else ""
+        _print_error(f"{what}{error.strerror or error}" + (f": {error.filename}" if error.filename else ""))
     except Exception as error:  # noqa: BLE001 - a traceback tells the user nothing
         last = traceback.extract_tb(error.__traceback__)[-1]
         _print_error(
@@ -164,11 +159,6 @@ def _run() -> int:
             "report this with the command and its options"
         )
     return 1
-
-
-def _print_os_error(error: OSError) -> None:
-    what = "cannot write the output: " if error.errno in _OUTPUT_ERRORS and error.filename is None else ""
-    _print_error(f"{what}{error.strerror or error}" + (f": {error.filename}" if error.filename else ""))
 
 
 def _print_error(text: str) -> None:

@@ -67,7 +67,8 @@ def man_page() -> str:
 
 def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
     """Yield every command that is not a group, with its name."""
-    for name, command in group.commands.items():
+    for name in group.list_commands(None):
+        command = group.get_command(None, name)
         if isinstance(command, typer.core.TyperGroup):
             yield from _commands(command, f"{prefix}{name} ")
         else:
@@ -93,13 +94,12 @@ def _parameters(parameters: list[Any]) -> list[str]:
         if _is_option(parameter):
             names = ", ".join(f"\\fB{_text(name)}\\fR" for name in sorted(parameter.opts, key=len))
             title = names if parameter.is_flag else f"{names} {title}"
+        text = parameter.help or ""
         default = parameter.default
-        if default is None or isinstance(default, bool):
-            lines += _entry(title, parameter.help or "")
-        else:
+        if default is not None and not isinstance(default, bool):
             shown = default.value if isinstance(default, Enum) else default
-            shown = f"{shown:g}" if isinstance(shown, float) else shown
-            lines += _entry(title, f"{parameter.help or ''} The default is {shown}.")
+            text += f" The default is {shown:g}." if isinstance(shown, float) else f" The default is {shown}."
+        lines += _entry(title, text)
     return lines
 
 

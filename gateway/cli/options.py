@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 import typer
 
-from gateway.config.document import VARIABLE_PREFIX
-from gateway.config.files import DEFAULT_CONFIG
+from gateway.config.document import VARIABLE_PREFIX, apply_overrides, read_yaml
+from gateway.config.files import DEFAULT_CONFIG, read_file
 from gateway.config.words import describe, join_or
 from gateway.errors import QueryError
 from gateway.logs.log_format import LogFormat, LogLevel
@@ -54,15 +54,37 @@ ServerOption = Annotated[
     ),
 ]
 
+FromOption = Annotated[
+    float | None, typer.Option("--from", min=0, help="Where to begin, in s from the take's first message.")
+]
+ToOption = Annotated[
+    float | None,
+    typer.Option("--to", min=0, help="Where to end, in s from the first message; the default is its end."),
+]
 NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress, only problems.")]
 
 
-def _checked(module: str, name: str) -> Callable[[str | None], str | None]:
+_Callback = Callable[[Any], Any]
+"""The callback of an option: it takes None if the option is not given, or a list if it can be repeated."""
+
+
+def _on_each(check: Callable[[str], str | None]) -> _Callback:
+    """Return a callback that checks each value of an option; ``check`` may return another one instead."""
+
+    def check_all(value: Any) -> Any:
+        if isinstance(value, str):
+            return check(value) or value
+        for text in value or ():
+            check(text)
+        return value
+
+    return check_all
+
+
+def _checked(module: str, name: str) -> _Callback:
     """Return a callback for an option whose value must be valid as this type of the configuration."""
 
-    def check(text: str | None) -> str | None:
-        if text is None:
-            return None
+    def check(text: str) -> str:
         from pydantic import TypeAdapter, ValidationError
 
         try:
@@ -70,7 +92,7 @@ def _checked(module: str, name: str) -> Callable[[str | None], str | None]:
         except ValidationError as error:
             raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
 
-    return check
+    return _on_each(check)
 
 
 checked_host = _checked("gateway.config.values", "Host")
@@ -83,58 +105,39 @@ _checked_source = _checked("gateway.config.values", "SourceName")
 _checked_lcm_url = _checked("gateway.outputs.lcm.settings", "LcmUrl")
 
 
-def _one_of(components: Sequence[str]) -> Callable[[str | None], str | None]:
-    def check(text: str | None) -> str | None:
-        if text is not None and text not in components:
-            raise typer.BadParameter(f"found {describe(text)}; expected {join_or(components)}")
-        return text
-
-    return check
+def _check_word(text: str, words: Sequence[str]) -> None:
+    if text not in words:
+        raise typer.BadParameter(f"found {describe(text)}; expected {join_or(words)}")
 
 
-def _checked_component(text: str | None) -> str | None:
-    label = (text or "").removeprefix(_POSE)
-    if label != text and text is not None and 0 < len(label) <= MAX_LABEL_LENGTH and label.isprintable():
-        return text
-    return _one_of(_COMPONENTS)(text)
+@_on_each
+def _checked_component(text: str) -> None:
+    label = text.removeprefix(_POSE)
+    if label == text or not (0 < len(label) <= MAX_LABEL_LENGTH and label.isprintable()):
+        _check_word(text, _COMPONENTS)
 
 
-def _checked_each(
-    check: Callable[[str | None], str | None],
-) -> Callable[[list[str] | None], list[str] | None]:
-    """Return a callback for an option that can be repeated."""
-
-    def check_each(texts: list[str] | None) -> list[str] | None:
-        for text in texts or ():
-            check(text)
-        return texts
-
-    return check_each
-
-
-def check_exists(option: str, path: Path | None) -> None:
-    """Raise BadParameter if there is no file of this name. Not a callback: parsing must not read the disk."""
-    if path is not None and not path.exists():
-        raise typer.BadParameter(f"{option}: {path} does not exist")
-
-
-def checked_take_name(text: str | None) -> str | None:
+@_on_each
+def checked_take_name(text: str) -> None:
     """Check that an argument can be the name of a take."""
-    if text is None:
-        return None
     from gateway.takes.files.new_file import check_name
 
     try:
         check_name(text)
     except QueryError as error:
         raise typer.BadParameter(str(error)) from None
-    return text
 
 
-def _checked_endpoint(text: str | None) -> str | None:
-    if text is not None and not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
+@_on_each
+def _checked_endpoint(text: str) -> None:
+    if not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
         raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")
-    return text
+
+
+def check_exists(option: str, path: Path | None) -> None:
+    """Raise BadParameter if there is no file of this name. Not a callback: parsing must not read the disk."""
+    if path is not None and not path.exists():
+        raise typer.BadParameter(f"{option}: {path} does not exist")
 
 
 # What a shell offers for the values of options when the user presses Tab. It must answer at once and print
@@ -152,37 +155,24 @@ def one_of(words: Iterable[str]) -> Callable[[str], list[str]]:
 
 def source_names(context: typer.Context, incomplete: str) -> list[str]:
     """Complete the name of a source: of the take on the command line, or of the default configuration."""
-    names: list[Any] = []
-    with suppress(Exception):  # whatever it is, the command itself will say it
-        take = _take_on_the_line(context)
-        names = _configured_sources() if take is None else _sources_of_take(take)
-    # The shell may evaluate the text, and a take may come from anywhere.
-    return [name for name in names if re.fullmatch("[A-Za-z0-9_-]+", name) and name.startswith(incomplete)]
-
-
-def _take_on_the_line(context: typer.Context) -> Path | None:
-    """Return the take that the command is to read; None if there is none."""
     # Arguments before an option without a value, which is being completed, are not parsed yet.
     words = (context.params.get("take"), context.params.get("file"), *context.args)
-    return next((Path(word) for word in words if word is not None and Path(word).exists()), None)
+    names: list[str] = []
+    with suppress(Exception):  # whatever it is, the command itself will say it
+        take = next((Path(word) for word in words if word is not None and Path(word).exists()), None)
+        if take is not None:
+            from gateway.takes.files.event_log import EventLogReader
+            from gateway.takes.files.reader import SourceNames, log_paths
 
-
-def _sources_of_take(path: Path) -> list[str]:
-    from gateway.takes.files.event_log import EventLogReader
-    from gateway.takes.files.reader import SourceNames, log_paths
-
-    events = EventLogReader(log_paths(path)[0]).events()
-    return SourceNames(islice(events, _MAX_EVENTS)).names
-
-
-def _configured_sources() -> list[str]:
-    from gateway.config.document import apply_overrides, read_yaml
-    from gateway.config.files import read_file
-
-    text = read_file(DEFAULT_CONFIG).decode() if DEFAULT_CONFIG.exists() else "{}"
-    document = read_yaml(text, str(DEFAULT_CONFIG))
-    apply_overrides(document, os.environ)
-    return [str(source["name"]) for source in document.values["sources"]]
+            events = EventLogReader(log_paths(take)[0]).events()
+            names = SourceNames(islice(events, _MAX_EVENTS)).names
+        else:
+            text = read_file(DEFAULT_CONFIG).decode() if DEFAULT_CONFIG.exists() else "{}"
+            document = read_yaml(text, str(DEFAULT_CONFIG))
+            apply_overrides(document, os.environ)
+            names = [str(source["name"]) for source in document.values["sources"]]
+    # The shell may evaluate the text, and a take may come from anywhere.
+    return [name for name in names if re.fullmatch("[A-Za-z0-9_-]+", name) and name.startswith(incomplete)]
 
 
 SourceOption = Annotated[
@@ -205,7 +195,7 @@ SourcesOption = Annotated[
     list[str] | None,
     typer.Option(
         "--source",
-        callback=_checked_each(_checked_source),
+        callback=_checked_source,
         autocompletion=source_names,
         help="Only this source; can be repeated. The default is all sources.",
     ),
@@ -214,7 +204,7 @@ ComponentsOption = Annotated[
     list[str] | None,
     typer.Option(
         "--component",
-        callback=_checked_each(_one_of(_RECORDED)),
+        callback=_on_each(lambda text: _check_word(text, _RECORDED)),
         autocompletion=one_of(_RECORDED),
         help=f"Only this: {join_or(_RECORDED)}; can be repeated.",
     ),
@@ -229,8 +219,7 @@ ConnectOption = Annotated[
 ListenOption = Annotated[
     str | None,
     typer.Option(
-        callback=_checked_endpoint,
-        help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448.",
+        callback=_checked_endpoint, help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448."
     ),
 ]
 ZenohConfigOption = Annotated[
@@ -249,8 +238,7 @@ UrlOption = Annotated[
 PrefixOption = Annotated[
     str | None,
     typer.Option(
-        callback=checked_key_prefix,
-        help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.",
+        callback=checked_key_prefix, help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM."
     ),
 ]
 

@@ -4,29 +4,17 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.options import (
-    AddressOptions,
-    ComponentsOption,
-    DetailsOptions,
-    NoProgressOption,
-    SourcesOption,
-    with_options,
-)
+from gateway.cli import options
 from gateway.cli.run import StopSignals
-
-if TYPE_CHECKING:
-    from gateway.cli.record_output import RecordProgress
-    from gateway.client.transport import GatewaySubscriber
-    from gateway.takes.recorder import TakeRecording
 
 _TICK_S: Final = 0.1
 
 
-@with_options
+@options.with_options
 def record(
     file: Annotated[
         Path,
@@ -36,18 +24,18 @@ def record(
         ),
     ],
     *,
-    source: SourcesOption = None,
-    component: ComponentsOption = None,
+    source: options.SourcesOption = None,
+    component: options.ComponentsOption = None,
     seconds: Annotated[
         float | None,
         typer.Option(
             min=0, help="Stop after this many seconds of messages; the default is to record until Ctrl-C."
         ),
     ] = None,
-    details: DetailsOptions,
+    details: options.DetailsOptions,
     lcm: Annotated[bool, typer.Option("--lcm", help="Record from LCM; the default is from Zenoh.")] = False,
-    where: AddressOptions,
-    quiet: NoProgressOption = False,
+    where: options.AddressOptions,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Record what gateways publish, until Ctrl-C. The exit status is 0 only if no message is missing.
 
@@ -61,7 +49,12 @@ def record(
     from gateway.client.transport import close_in_time
     from gateway.takes.recorder import FileWriter, TakeRecording, Target
 
-    stop = StopSignals(_end_at_once)
+    def end_at_once(signal_number: int) -> None:
+        if sys.stderr.isatty():
+            os.write(2, b"\x1b[?25h\n")  # the progress line has hidden the cursor
+        os._exit(128 + signal_number)
+
+    stop = StopSignals(end_at_once)
     target = Target(file)
     recording = TakeRecording(
         lambda sources: FileWriter(target.open(sources)), component, START_S if lcm else 0.0, described
@@ -70,9 +63,22 @@ def record(
     try:
         subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(sources, component, recording)
         progress = RecordProgress(recording, subscriber, sources, quiet=quiet)
+        start_s = time.monotonic()
         try:
-            _run(recording, subscriber, progress, stop, seconds)
-            _end(recording, progress)
+            while not stop.wait(_TICK_S):
+                subscriber.tick()
+                recording.tick()
+                progress.tick()
+                # The seconds begin with the first message, or at once while there is none.
+                first_s = recording.first_heard_s or start_s
+                if seconds is not None and time.monotonic() - first_s >= seconds:
+                    break
+            # Write everything that has arrived. A disk that is full loses it; for a slow one, wait.
+            recording.stop()
+            if recording.file is not None:
+                recording.file.give_up()
+            while not recording.close(_TICK_S):
+                progress.tick()
         finally:
             progress.close()
             close_in_time(subscriber)
@@ -81,37 +87,3 @@ def record(
         target.discard_empty()
     if not is_complete:
         raise typer.Exit(1)
-
-
-def _end_at_once(signal_number: int) -> None:
-    if sys.stderr.isatty():
-        os.write(2, b"\x1b[?25h\n")  # the progress line has hidden the cursor
-    os._exit(128 + signal_number)
-
-
-def _run(
-    recording: "TakeRecording",
-    subscriber: "GatewaySubscriber",
-    progress: "RecordProgress",
-    stop: StopSignals,
-    seconds: float | None,
-) -> None:
-    """Record until ``stop``, or for ``seconds`` after the first message, or without any."""
-    start_s = time.monotonic()
-    first_s: float | None = None
-    while not stop.wait(_TICK_S):
-        subscriber.tick()
-        recording.tick()
-        progress.tick()
-        first_s = recording.first_heard_s if first_s is None else first_s
-        if seconds is not None and time.monotonic() - (first_s or start_s) >= seconds:
-            return
-
-
-def _end(recording: "TakeRecording", progress: "RecordProgress") -> None:
-    """Write everything that has arrived. A disk that is full loses it; for a slow one, wait."""
-    recording.stop()
-    if recording.file is not None:
-        recording.file.give_up()
-    while not recording.close(_TICK_S):
-        progress.tick()

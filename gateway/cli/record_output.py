@@ -42,9 +42,7 @@ class RecordProgress:
         self._subscriber = subscriber
         self._wanted = wanted
         self._quiet = quiet
-        self._start_s = self._rate_s = time.monotonic()
-        self._checked_s = self._start_s
-        self._shown_s = self._start_s
+        self._start_s = self._checked_s = self._shown_s = time.monotonic()
         self._former = (0, 0)  # messages and bytes, when the line was shown last
         self._disk_problem = ""
         self._is_slow = False
@@ -67,8 +65,12 @@ class RecordProgress:
             self._check_losses()
             self._check_silence(now_s)
         if not self._quiet and now_s - self._shown_s >= (_LINE_S if self._live is None else _TERMINAL_S):
+            line = self._line(now_s)
             self._shown_s = now_s
-            self._show(now_s)
+            if self._live is None:
+                self._print(line)
+            else:
+                self._live.update(Text(safe_text(line), no_wrap=True, overflow="ellipsis"), refresh=True)
 
     def close(self) -> None:
         """Remove the line."""
@@ -83,17 +85,13 @@ class RecordProgress:
         with contextlib.suppress(OSError, ValueError):  # nobody reads it: the recording goes on
             print(safe_text(text), file=sys.stderr, flush=True)
 
-    # The disk, and losses.
-
     def _check_disk(self) -> None:
         file = self._recording.file
         problem = "" if file is None else file.problem
         if problem != self._disk_problem:
             self._disk_problem = problem
-            if problem:
-                self._print(f"{problem}; up to 64 MB wait in memory until the disk has room again")
-            else:
-                self._print("the disk accepts what is written again")
+            waits = f"{problem}; up to 64 MB wait in memory until the disk has room again"
+            self._print(waits if problem else "the disk accepts what is written again")
         queued_bytes = self._recording.queued_bytes
         if self._is_slow:
             self._is_slow = queued_bytes > _SLOW_BYTES // 2
@@ -125,13 +123,18 @@ class RecordProgress:
         elif self._num_loss_lines == _MAX_LOSS_LINES:
             self._print(f"{text}; further losses are in the table at the end")
 
-    # Silence.
-
     def _check_silence(self, now_s: float) -> None:
         sources = [source for source in self._recording.sources_now if source.heard_s is not None]
         missing = set(self._wanted) - {source.name for source in sources}
-        if now_s - self._start_s >= SILENCE_S and (missing or not sources):
-            self._report_missing()
+        if (
+            now_s - self._start_s >= SILENCE_S
+            and (missing or not sources)
+            and "missing" not in self._reported
+        ):
+            problem = self._subscriber.silence()
+            if problem:
+                self._reported.add("missing")
+                self._print(problem)
         for source in sources:
             assert source.heard_s is not None  # noqa: S101 - see above
             text = f"{source.name}: nothing has arrived for 2 s; is its gateway running?"
@@ -140,13 +143,6 @@ class RecordProgress:
             else:
                 self._reported.discard(text)
                 self._check_streams(source, now_s)
-
-    def _report_missing(self) -> None:
-        if "missing" not in self._reported:
-            problem = self._subscriber.silence()
-            if problem:
-                self._reported.add("missing")
-                self._print(problem)
 
     def _check_streams(self, source: RecordedSource, now_s: float) -> None:
         """Report why there are no frames, if the gateway itself gets none."""
@@ -168,30 +164,17 @@ class RecordProgress:
             self._reported.add(text)
             self._print(text)
 
-    # The line.
-
-    def _show(self, now_s: float) -> None:
-        line = self._line(now_s)
-        if self._live is None:
-            self._print(line)
-        else:
-            self._live.update(Text(safe_text(line), no_wrap=True, overflow="ellipsis"), refresh=True)
-
     def _line(self, now_s: float) -> str:
-        recording = self._recording
-        counts = (recording.num_messages, recording.num_bytes)
-        elapsed_s = max(now_s - self._rate_s, 1e-3)
-        message_rate, byte_rate = (
-            (new - old) / elapsed_s for new, old in zip(counts, self._former, strict=True)
-        )
-        self._former, self._rate_s = counts, now_s
+        recording, file = self._recording, self._recording.file
+        elapsed_s = max(now_s - self._shown_s, 1e-3)
+        former_messages, former_bytes = self._former
+        self._former = (recording.num_messages, recording.num_bytes)
         minutes, seconds = divmod(int(now_s - self._start_s), 60)
-        file = recording.file
         parts = [
             f"{minutes}:{seconds:02}",
             "waiting for messages" if file is None else size_text(file.num_bytes),
-            f"{message_rate:.0f} messages/s",
-            f"{size_text(byte_rate)}/s",
+            f"{(recording.num_messages - former_messages) / elapsed_s:.0f} messages/s",
+            f"{size_text((recording.num_bytes - former_bytes) / elapsed_s)}/s",
             f"{self._num_lost} lost" if self._num_lost else "no gaps",
             f"{size_text(recording.queued_bytes)} to be written",
         ]
@@ -224,10 +207,14 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     for column in _COLUMNS:
         table.add_column(column, justify="right")
     for source in recording.sources_now:
-        for row, series in _rows(source):
-            table.add_row(Text(safe_text(source.name)), row, *_cells(series, file))
+        rows: defaultdict[str, list[RecordedSeries]] = defaultdict(list)
+        for series in source.series:
+            if series.is_recorded and series.num_messages:
+                rows[series.row].append(series)
+        for row in sorted(rows, key=_ORDER.index):
+            table.add_row(Text(safe_text(source.name)), row, *_cells(rows[row], file))
     console.print(table)
-    problems = [*_problems(recording)]
+    problems = [*_problems(recording, file)]
     notes = [*_notes(recording)]
     if len(notes) > _MAX_NOTES:
         notes[_MAX_NOTES:] = [f"… and {len(notes) - _MAX_NOTES} notes on other sources"]
@@ -236,15 +223,6 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     end = "INCOMPLETE" if problems else "complete: no gaps"
     console.print(Text(f"{file.path}: {size_text(file.num_bytes)}, {end}"), soft_wrap=True)
     return not problems
-
-
-def _rows(source: RecordedSource) -> Iterator[tuple[str, list[RecordedSeries]]]:
-    rows: defaultdict[str, list[RecordedSeries]] = defaultdict(list)
-    for series in source.series:
-        if series.is_recorded and series.num_messages:
-            rows[series.row].append(series)
-    for row in sorted(rows, key=_ORDER.index):
-        yield row, rows[row]
 
 
 def _cells(series: Sequence[RecordedSeries], file: FileWriter) -> Iterator[str]:
@@ -265,13 +243,17 @@ def _rate_hz(series: RecordedSeries) -> float:
     return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
 
 
-def _problems(recording: TakeRecording) -> Iterator[str]:
+def _problems(recording: TakeRecording, file: FileWriter) -> Iterator[str]:
     """Yield why the recording is not complete."""
     if not any(source.num_data for source in recording.sources_now):
         yield "no frame was recorded"
     yield from _losses(recording)
-    if recording.file is not None:
-        yield from _disk_problems(recording.file)
+    if file.lost:
+        yield f"{file.lost.total()} messages were not written: {file.problem}"
+    elif file.problem:
+        yield file.problem
+    elif file.is_unsafe:
+        yield "the disk reported errors: the file may be damaged"
     if recording.is_moved:
         yield "the file was moved or deleted while it was recorded"
     if recording.defect is not None:
@@ -300,15 +282,6 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
     num_refused = sum(series.num_refused for series in all_series)
     if num_refused:
         yield f"{num_refused} messages were not written, because too many waited for the disk"
-
-
-def _disk_problems(file: FileWriter) -> Iterator[str]:
-    if file.lost:
-        yield f"{file.lost.total()} messages were not written: {file.problem}"
-    elif file.problem:
-        yield file.problem
-    elif file.is_unsafe:
-        yield "the disk reported errors: the file may be damaged"
 
 
 def _notes(recording: TakeRecording) -> Iterator[str]:

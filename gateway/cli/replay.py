@@ -8,21 +8,10 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.options import (
-    ComponentsOption,
-    ConnectOption,
-    ListenOption,
-    NoProgressOption,
-    SourcesOption,
-    UrlOption,
-    ZenohConfigOption,
-    checked_key_prefix,
-)
+from gateway.cli import options
+from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.logs.log_format import LogLevel, set_up_log
 from gateway.takes.replay.timeline import MAX_GAP_S
-
-_SWITCH_S: Final = 0.0005
-"""How long another thread that runs Python, such as that of the progress, may keep the replay waiting."""
 
 _MAX_RATE: Final = 1000.0
 _MIN_RATE: Final = 0.01
@@ -51,34 +40,27 @@ def replay(
         ),
     ] = "1",
     loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
-    from_s: Annotated[
-        float, typer.Option("--from", min=0, help="Where to begin, in s from the take's first message.")
-    ] = 0.0,
-    to_s: Annotated[
-        float | None,
-        typer.Option(
-            "--to", min=0, help="Where to end, in s from the first message; the default is its end."
-        ),
-    ] = None,
-    source: SourcesOption = None,
-    component: ComponentsOption = None,
+    from_s: options.FromOption = 0.0,
+    to_s: options.ToOption = None,
+    source: options.SourcesOption = None,
+    component: options.ComponentsOption = None,
     prefix: Annotated[
         str,
         typer.Option(
-            callback=checked_key_prefix,
+            callback=options.checked_key_prefix,
             help="The prefix on Zenoh; that on LCM is the same in upper case, with _ for other characters.",
         ),
     ] = "replay",
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Only on Zenoh.")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Only on LCM.")] = False,
-    connect: ConnectOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    url: UrlOption = None,
+    connect: options.ConnectOption = None,
+    listen: options.ListenOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    url: options.UrlOption = None,
     max_gap: Annotated[
         float, typer.Option(min=0, help="Skip longer gaps in which nothing was recorded, in s.")
     ] = MAX_GAP_S,
-    quiet: NoProgressOption = False,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Publish a take again on Zenoh and LCM, under a prefix of its own.
 
@@ -93,17 +75,17 @@ def replay(
         raise typer.BadParameter("--url is for LCM")
     if listen and (connect or zenoh_config):
         raise typer.BadParameter("give either --listen, or --connect and --zenoh-config")
-    if to_s is not None and to_s <= from_s:
+    if to_s is not None and to_s <= (from_s or 0.0):
         raise typer.BadParameter("--to must be greater than --from")
     import uvloop
 
-    from gateway.cli.replay_run import ReplayRun
+    from gateway.cli.replay_run import run_replay
     from gateway.takes.files.reader import TakeReader
     from gateway.takes.replay.play_list import Selection
     from gateway.takes.replay.replay import ZenohAddress, lcm_destination, zenoh_destination
 
     set_up_log(LogLevel.WARNING)
-    sys.setswitchinterval(_SWITCH_S)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.freeze()  # or a full garbage collection looks through all modules, which takes 20 ms
     destinations = []
     if not lcm:
@@ -113,12 +95,20 @@ def replay(
     selection = Selection(
         frozenset(source) if source else None,
         frozenset(component) if component else None,
-        round(from_s * 1e6),
+        round((from_s or 0.0) * 1e6),
         None if to_s is None else round(to_s * 1e6),
     )
-    pace = None if rate == "max" else float(rate)
-    run = ReplayRun(TakeReader(file), selection, pace, is_repeated=loop, max_gap_s=max_gap, quiet=quiet)
-    if not uvloop.run(run.replay(destinations, are_required=zenoh or lcm)):
+    run = run_replay(
+        TakeReader(file),
+        selection,
+        destinations,
+        rate=None if rate == "max" else float(rate),
+        is_repeated=loop,
+        max_gap_s=max_gap,
+        are_required=zenoh or lcm,
+        quiet=quiet,
+    )
+    if not uvloop.run(run):
         raise typer.Exit(1)
 
 

@@ -5,8 +5,9 @@ import contextlib
 import signal
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from functools import partial
 from typing import Final
 
 from rich.console import Console
@@ -60,8 +61,7 @@ class Progress:
         self._console = console
         self._quiet = quiet
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._before = time.monotonic(), player.position_us, 0, 0
-        self._line_s = time.monotonic()
+        self._before = time.monotonic(), player.position_us, 0, 0  # when the line was shown last
         if console.is_terminal and not quiet:
             self._live.start()
 
@@ -71,8 +71,7 @@ class Progress:
             return
         if self._console.is_terminal:
             self._live.update(Text(self._text(), no_wrap=True, overflow="ellipsis"), refresh=True)
-        elif time.monotonic() - self._line_s >= LINE_S:
-            self._line_s = time.monotonic()
+        elif time.monotonic() - self._before[0] >= LINE_S:
             self._console.print(self._text(), soft_wrap=True, highlight=False)
 
     def close(self) -> None:
@@ -111,7 +110,8 @@ def print_report(
     table = Table()
     for heading in ("component", "messages", *(f"refused by {output}" for output in outputs)):
         table.add_column(heading, justify="left" if heading == "component" else "right")
-    for key in sorted(publication.num_messages, key=_place):
+    order = {key: place for place, key in enumerate(_ORDER)}
+    for key in sorted(publication.num_messages, key=lambda key: (order.get(key, len(order)), key)):
         refused: Counter[str] = Counter()
         for refusal, count in publication.refusals.items():
             if refusal.key == key:
@@ -132,47 +132,36 @@ def print_report(
         notes.print(Text(note), soft_wrap=True)
 
 
-def _place(key: str) -> tuple[int, str]:
-    return (_ORDER.index(key) if key in _ORDER else len(_ORDER)), key
-
-
-def _notes(player: Player, publication: Publication, reader: TakeReader) -> list[str]:
-    notes = [
-        f"{refusal.output} did not take {count:,} messages of {refusal.key} ({refusal.cause})"
-        for refusal, count in publication.refusals.items()
-    ]
+def _notes(player: Player, publication: Publication, reader: TakeReader) -> Iterator[str]:
+    for refusal, count in publication.refusals.items():
+        yield f"{refusal.output} did not take {count:,} messages of {refusal.key} ({refusal.cause})"
     if player.stalled_s:
-        notes.append(
+        yield (
             f"the replay stood still for {player.stalled_s:.1f} s, because the process was stopped, or the "
             "disk or an output did not respond; it did not catch up"
         )
-    notes += [
-        f"the take has no parameters of {safe_text(source)} at the beginning, so no labels and units"
-        for source in sorted(publication.without_parameters)
-    ]
-    notes += [
-        f"{count:,} messages of {safe_text(source)} are damaged and were left out"
-        for source, count in publication.num_unreadable.items()
-    ]
+    for source in sorted(publication.without_parameters):
+        yield f"the take has no parameters of {safe_text(source)} at the beginning, so no labels and units"
+    for source, count in publication.num_unreadable.items():
+        yield f"{count:,} messages of {safe_text(source)} are damaged and were left out"
     if publication.num_surplus:
-        notes.append(
+        yield (
             f"{publication.num_surplus:,} messages were left out, because the take has more than "
             f"{MAX_SOURCES} sources or {MAX_TOPICS} keys"
         )
     if reader.unknown:
         channels = [safe_text(channel) for channel, _ in reader.unknown.most_common(_MAX_LISTED)]
         more = ", …" if len(reader.unknown) > _MAX_LISTED else ""
-        notes.append(
+        yield (
             f"{reader.unknown.total():,} messages of other programs or versions were left out, on "
             f"{', '.join(channels)}{more}"
         )
-    notes += [
-        f"{log.path} is damaged: {log.damaged_bytes:,} bytes in {log.num_damaged:,} places were left out"
-        for log in reader.logs
-        if log.damaged_bytes
-    ]
-    notes += [f"left out: {safe_text(problem)}" for problem in reader.empty_files.values()]
-    return notes
+    for log in reader.logs:
+        if log.damaged_bytes:
+            places = f"{log.num_damaged:,} places"
+            yield f"{log.path} is damaged: {log.damaged_bytes:,} bytes in {places} were left out"
+    for problem in reader.empty_files.values():
+        yield f"left out: {safe_text(problem)}"
 
 
 _SEEK_US: Final = 10_000_000
@@ -180,82 +169,75 @@ _SHOW_S: Final = 0.25
 _STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
-class ReplayRun:
-    """One run of the command."""
+async def run_replay(
+    reader: TakeReader,
+    selection: Selection,
+    destinations: Sequence[Destination],
+    *,
+    rate: float | None,
+    is_repeated: bool,
+    max_gap_s: float,
+    are_required: bool,
+    quiet: bool,
+) -> bool:
+    """Replay until the end, q or a signal; return whether the outputs took everything."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in _STOP_SIGNALS:
+        loop.add_signal_handler(number, stop.set)
+    notes = Console(stderr=True)
 
-    def __init__(
-        self,
-        reader: TakeReader,
-        selection: Selection,
-        rate: float | None,
-        *,
-        is_repeated: bool,
-        max_gap_s: float,
-        quiet: bool,
-    ) -> None:
-        self._reader = reader
-        self._selection = selection
-        self._rate = rate
-        self._is_repeated = is_repeated
-        self._max_gap_s = max_gap_s
-        self._quiet = quiet
-        self._out = Console()
-        self._notes = Console(stderr=True)
+    def note(text: str) -> None:
+        notes.print(Text(text), soft_wrap=True)
 
-    async def replay(self, destinations: Sequence[Destination], *, are_required: bool) -> bool:
-        """Replay until the end, q or a signal; return whether the outputs took everything."""
-        stop = asyncio.Event()
-        for number in _STOP_SIGNALS:
-            asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        async with open_publication(destinations, are_required=are_required, warn=self._note) as publication:
-            opened = [each for each in destinations if each.output.health().connected]
-            places = [f"on {each.kind.name} under {each.request.prefix}" for each in opened]
-            self._note(f"publishing {' and '.join(places)}")
-            if not stop.is_set():
-                await self._play(publication, stop)
-        if not publication.num_messages:
-            self._note("nothing was replayed")
-        return not publication.refusals
+    def on_jump(jump: Jump) -> None:
+        loop.call_soon_threadsafe(note, jump_text(jump))
 
-    async def _play(self, publication: Publication, stop: asyncio.Event) -> None:
-        loop = asyncio.get_running_loop()
+    async with open_publication(destinations, are_required=are_required, warn=note) as publication:
+        opened = [each for each in destinations if each.output.health().connected]
+        places = [f"on {each.kind.name} under {each.request.prefix}" for each in opened]
+        note(f"publishing {' and '.join(places)}")
+        if not stop.is_set():
+            player = Player(
+                reader,
+                selection,
+                publication,
+                rate=rate,
+                is_repeated=is_repeated,
+                max_gap_s=max_gap_s,
+                on_jump=on_jump,
+            )
+            length_us = take_length_us(reader, selection.stop_us)
+            try:
+                await _play(
+                    player, publication, stop, partial(Progress, notes, player, length_us, quiet=quiet)
+                )
+            finally:
+                if player.num_messages:
+                    print_report(Console(), notes, player, publication, reader)
+    if not publication.num_messages:
+        note("nothing was replayed")
+    return not publication.refusals
 
-        def on_jump(jump: Jump) -> None:
-            loop.call_soon_threadsafe(self._note, jump_text(jump))
 
-        player = Player(
-            self._reader,
-            self._selection,
-            publication,
-            rate=self._rate,
-            is_repeated=self._is_repeated,
-            max_gap_s=self._max_gap_s,
-            on_jump=on_jump,
-        )
+async def _play(
+    player: Player, publication: Publication, stop: asyncio.Event, progress_with: Callable[[str], Progress]
+) -> None:
+    def toggle_pause() -> None:
+        player.pause(not player.is_paused)
+        publication.show_streaming(not player.is_paused)
 
-        def toggle_pause() -> None:
-            player.pause(not player.is_paused)
-            publication.show_streaming(not player.is_paused)
-
-        actions = {
-            "space": toggle_pause,
-            "q": stop.set,
-            "left": lambda: player.seek(-_SEEK_US),
-            "right": lambda: player.seek(_SEEK_US),
-        }
-        try:
-            with keys(actions) as has_keys:
-                hints = "space: pause, ←/→: 10 s, q: quit" if has_keys else ""
-                length_us = take_length_us(self._reader, self._selection.stop_us)
-                with closing(Progress(self._notes, player, length_us, hints, quiet=self._quiet)) as progress:
-                    async with playing(player):
-                        while player.is_alive and not stop.is_set():
-                            progress.show()
-                            with contextlib.suppress(TimeoutError):
-                                await asyncio.wait_for(stop.wait(), _SHOW_S)
-        finally:
-            if player.num_messages:
-                print_report(self._out, self._notes, player, publication, self._reader)
-
-    def _note(self, text: str) -> None:
-        self._notes.print(Text(text), soft_wrap=True)
+    actions = {
+        "space": toggle_pause,
+        "q": stop.set,
+        "left": lambda: player.seek(-_SEEK_US),
+        "right": lambda: player.seek(_SEEK_US),
+    }
+    with keys(actions) as has_keys:
+        hints = "space: pause, ←/→: 10 s, q: quit" if has_keys else ""
+        with closing(progress_with(hints)) as progress:
+            async with playing(player):
+                while player.is_alive and not stop.is_set():
+                    progress.show()
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(stop.wait(), _SHOW_S)

@@ -1,28 +1,23 @@
-"""``rtc3d-gateway take``: what recordings contain, and recording in a gateway."""
+"""``rtc3d-gateway take`` and ``export``: what recordings contain, and recording in a gateway."""
 
-import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gateway.cli.options import (
-    ConnectOption,
-    DetailsOptions,
-    NoProgressOption,
-    PrefixOption,
-    QueryOptions,
-    SourceOption,
-    ZenohConfigOption,
-    checked_take_name,
-    with_options,
-)
-from gateway.logs.safe_text import safe_json, safe_text
+from gateway.cli import options
+from gateway.cli.main import exit_with, print_json
+from gateway.config.words import join_or
+from gateway.errors import QueryError
+from gateway.logs.safe_text import safe_text
+from gateway.takes.export.job import FORMATS, ExportJob, export_take
 
 if TYPE_CHECKING:
-    from gateway.cli.take_list import ListedTake
+    from gateway.cli.take_report import ListedTake
     from gateway.client.client import TakeReplies
 
 app = typer.Typer(
@@ -33,7 +28,7 @@ _NameArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="NAME",
-        callback=checked_take_name,
+        callback=options.checked_take_name,
         help="The name of the take; the default is SOURCE-DATE-TIME.",
     ),
 ]
@@ -42,15 +37,15 @@ _JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object
 
 
 @app.command()
-@with_options
+@options.with_options
 def start(
     name: _NameArgument = None,
     *,
-    details: DetailsOptions,
-    source: SourceOption = None,
+    details: options.DetailsOptions,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Start a take in a running gateway. Needs takes.enabled and, for the source, remote_control.
 
@@ -63,13 +58,13 @@ def start(
 
 
 @app.command()
-@with_options
+@options.with_options
 def stop(
     *,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Stop the running take.
 
@@ -81,7 +76,7 @@ def stop(
 
 
 @app.command()
-@with_options
+@options.with_options
 def save(
     name: _NameArgument = None,
     *,
@@ -92,11 +87,11 @@ def save(
         ),
     ] = None,
     after: Annotated[float, typer.Option(min=0.0, max=3600.0, help="For how many seconds to go on.")] = 0.0,
-    details: DetailsOptions,
-    source: SourceOption = None,
+    details: options.DetailsOptions,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """Keep the last seconds as a take. Needs takes.keep_last_s and, for the source, remote_control.
 
@@ -114,28 +109,25 @@ def save(
 @app.command()
 def fetch(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", callback=checked_take_name, help="The name of the take.")
+        str, typer.Argument(metavar="NAME", callback=options.checked_take_name, help="The name of the take.")
     ],
     file: Annotated[
         Path | None,
         typer.Argument(metavar="FILE", help="A new file, or a folder; the default is NAME.lcmlog here."),
     ] = None,
-    source: SourceOption = None,
-    connect: ConnectOption = None,
-    zenoh_config: ZenohConfigOption = None,
-    prefix: PrefixOption = None,
+    source: options.SourceOption = None,
+    connect: options.ConnectOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    prefix: options.PrefixOption = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for each piece.")] = 10.0,
-    quiet: NoProgressOption = False,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Copy a take from a running gateway, over Zenoh. Of one that is running, copy what there is.
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    from gateway.cli.export_progress import file_progress
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_list import size_text
+    from gateway.cli.take_report import size_text
     from gateway.client.client import GatewayAddress, GatewayClient
-    from gateway.errors import QueryError
     from gateway.takes.files.new_file import NewFiles
     from gateway.takes.files.reader import SUFFIX
 
@@ -145,10 +137,9 @@ def fetch(
     try:
         with NewFiles() as files:
             copy = files.create(path)  # before a long transfer: the file may exist already
-            with (
-                GatewayClient(address, timeout) as client,
-                file_progress(f"fetching {name}", quiet=quiet) as progress,
-            ):
+            with GatewayClient(address, timeout) as client, progress_bar(quiet=quiet) as show:
+                progress = partial(show, f"fetching {name}")
+                progress(0, 0)  # until the first piece
                 fetched = client.fetch_take(name, copy, source=source, progress=progress)
     except QueryError as error:
         exit_with([error])
@@ -159,13 +150,13 @@ def fetch(
 
 
 @app.command("list")
-@with_options
+@options.with_options
 def list_(
     *,
-    source: SourceOption = None,
+    source: options.SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
-    query: QueryOptions,
+    query: options.QueryOptions,
 ) -> None:
     """List the takes of running gateways.
 
@@ -173,13 +164,12 @@ def list_(
     """
     from rich.console import Console
 
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_list import write_list
+    from gateway.cli.take_report import write_list
 
     with query.client(lcm=lcm) as client:
         replies = client.takes(source)
     if as_json:
-        _print_json(replies.received)
+        print_json(replies.received)
     else:
         write_list(replies.received, Console(file=sys.stdout))
     exit_with(replies.problems)
@@ -189,7 +179,7 @@ def list_(
 def info(
     file: Annotated[Path, typer.Argument(help="A recording (.lcmlog), or the folder of a saved one.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    quiet: NoProgressOption = False,
+    quiet: options.NoProgressOption = False,
 ) -> None:
     """Show what a recording contains, and what is missing: gaps, restarts, damage.
 
@@ -198,14 +188,13 @@ def info(
     """
     from rich.console import Console
 
-    from gateway.cli.export_progress import file_progress
     from gateway.cli.take_report import statistics_json, write_report
     from gateway.takes.files.statistics import take_statistics
 
-    with file_progress(f"reading {file.name}", quiet=quiet) as progress:
-        statistics = take_statistics(file, progress)
+    with progress_bar(quiet=quiet) as show:
+        statistics = take_statistics(file, partial(show, f"reading {file.name}"))
     if as_json:
-        _print_json(statistics_json(statistics))
+        print_json(statistics_json(statistics))
     else:
         write_report(statistics, Console(file=sys.stdout))
     if statistics.was_cut_short:
@@ -214,12 +203,11 @@ def info(
 
 def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], *, as_json: bool) -> None:
     """Print what gateways replied to a command. The exit status is 1 if one of the takes has a problem."""
-    from gateway.cli.main import exit_with
-    from gateway.cli.take_list import ListedTake
+    from gateway.cli.take_report import ListedTake
 
     takes = {source: ListedTake(content) for source, content in replies.received.items()}
     if as_json:
-        _print_json(replies.received)
+        print_json(replies.received)
     else:
         for source, take in takes.items():
             print(safe_text(f"{source}: {text(take)}"))
@@ -228,5 +216,50 @@ def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], 
         raise typer.Exit(1)
 
 
-def _print_json(content: Any) -> None:
-    print(safe_json(json.dumps(content, indent=2, ensure_ascii=False)))
+def export(
+    file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
+    out: Annotated[
+        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
+    ],
+    source: options.SourceOption = None,
+    from_s: options.FromOption = None,
+    to_s: options.ToOption = None,
+    quiet: options.NoProgressOption = False,
+) -> None:
+    """Convert a take to a file of another program, such as C3D; never overwrite a file."""
+    if from_s is not None and to_s is not None and from_s >= to_s:
+        raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
+    job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
+    with progress_bar(quiet=quiet, counts_bytes=False) as job.progress:
+        paths = export_take(job)
+    for note in job.notes:
+        print(f"note: {safe_text(note)}", file=sys.stderr)
+    for path in paths:
+        size = path.stat().st_size
+        print(f"{path} ({size / 1e6:.1f} MB)" if size >= 100_000 else f"{path} ({size / 1e3:.1f} kB)")
+
+
+@contextmanager
+def progress_bar(*, quiet: bool, counts_bytes: bool = True) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar on a terminal, unless ``quiet``, until the context ends; yield a function that moves it.
+
+    It takes what is done, how much of it, and how much there is; 0 is unknown. Each step has its own bar.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(file=sys.stderr)
+    amount = [DownloadColumn()] if counts_bytes else []
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), *amount, TimeRemainingColumn())
+    is_hidden = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=is_hidden) as bar:
+
+        def show(what: str, done: int, total: int) -> None:
+            text = safe_text(what)
+            if [task.description for task in bar.tasks] != [text]:
+                for former in bar.task_ids:
+                    bar.remove_task(former)
+                bar.add_task(text, total=total or None)
+            bar.update(bar.task_ids[0], completed=done, total=total or None)
+
+        yield show

@@ -1,20 +1,108 @@
-"""The report of ``take info``: as JSON, and as tables for people."""
+"""What ``take list`` and ``take info`` print: as JSON, and as tables for people."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from rich.columns import Columns
 from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from gateway.display.terminal import list_table, print_list
 from gateway.logs.safe_text import safe_text
-from gateway.messages.sequence import Gap
+from gateway.outputs.findings import counted
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.component_statistics import ComponentStatistics, MessageStatistics
+from gateway.takes.files.description import TakeDetails
 from gateway.takes.files.reader import DESCRIPTIONS, is_gateways_channel
 from gateway.takes.files.statistics import SourceStatistics, TakeStatistics
+
+
+class ListedTake:
+    """A take as a gateway describes it. A gateway of another version may describe it in another way."""
+
+    def __init__(self, fields: Mapping[str, Any]) -> None:
+        self.name = str(fields.get("name", ""))
+        self.num_bytes = _number(fields, "bytes")
+        self.begin_utime = _number(fields, "begin_utime")
+        self.seconds = _number(fields, "seconds")
+        self.num_lost = round(_number(fields, "lost"))
+        self.is_running = fields.get("is_running") is True
+        self.is_cut_off = fields.get("is_cut_off") is True
+        self.details = TakeDetails(*(str(fields.get(name, "")) for name in TakeDetails._fields))
+
+    @property
+    def facts(self) -> str:
+        """The duration, the size and the problem."""
+        return ", ".join(filter(None, (self.duration_text, size_text(self.num_bytes), self.problem)))
+
+    @property
+    def duration_text(self) -> str:
+        """The duration, such as "12.3 s", "4 min 12.3 s" or "1 h 2 min 3.4 s"."""
+        minutes, seconds = divmod(round(self.seconds, 1), 60)
+        hours, minutes = divmod(int(minutes), 60)
+        text = f"{seconds:.1f} s"
+        if hours or minutes:
+            text = f"{minutes} min {text}"
+        return f"{hours} h {text}" if hours else text
+
+    @property
+    def begin_text(self) -> str:
+        """The beginning, in local time."""
+        try:
+            begin = datetime.fromtimestamp(self.begin_utime / 1e6).astimezone()
+        except (OverflowError, OSError, ValueError):
+            return "?"
+        return begin.strftime("%Y-%m-%d %H:%M:%S") if self.begin_utime else "?"
+
+    @property
+    def problem(self) -> str:
+        """What is missing; "" if nothing."""
+        lost = f"{self.num_lost} messages lost" if self.num_lost else ""
+        return ", ".join(filter(None, ("cut off" if self.is_cut_off else "", lost)))
+
+
+def size_text(num_bytes: float) -> str:
+    """Return a size, such as "3.4 MB"."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if num_bytes >= factor:
+            return f"{num_bytes / factor:.1f} {unit}"
+    return f"{num_bytes:.0f} bytes"
+
+
+def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> None:
+    """Write the list of the takes of all sources, and below it or on stderr what is not in it."""
+    headings = ["source", "name", "begin", "duration", "size", "state", "about"]
+    records: list[list[str]] = []
+    notes: list[str] = []
+    for source, content in replies.items():
+        contents = content.get("takes")
+        contents = contents if isinstance(contents, list) else []
+        takes = [ListedTake(fields) for fields in contents if isinstance(fields, dict)]
+        for take in takes:
+            states = ", ".join(filter(None, ("running" if take.is_running else "", take.problem)))
+            size = size_text(take.num_bytes)
+            facts = [source, take.name, take.begin_text, take.duration_text, size, states]
+            records.append([*facts, take.details.text])
+        num_takes, kept_s = round(_number(content, "num_takes")), _number(content, "kept_s")
+        if not num_takes:
+            notes.append(f"{source}: no takes")
+        if num_takes > len(takes):
+            notes.append(f"{source}: the newest {len(takes)} of {num_takes} takes")
+        if kept_s >= 1:
+            notes.append(f"{source}: the last {kept_s:.0f} s are kept, to be saved with: take save")
+    if not any(record[-1] for record in records):
+        headings, records = headings[:-1], [record[:-1] for record in records]
+    print_list(console, headings, records, numbers=("duration", "size"))
+    console = console if console.is_terminal else Console(stderr=True)
+    for note in notes:
+        console.print(Text(safe_text(note)), soft_wrap=True)
+
+
+def _number(fields: Mapping[str, Any], name: str) -> float:
+    value = fields.get(name)
+    return value if isinstance(value, int | float) and abs(value) < 1e300 else 0
 
 
 def statistics_json(statistics: TakeStatistics) -> dict[str, Any]:
@@ -43,6 +131,16 @@ def statistics_json(statistics: TakeStatistics) -> dict[str, Any]:
 
 def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[str, Any]:
     events = source.components.get("event")
+    components = {
+        key: _messages_json(statistics, part)
+        | {
+            "items": [part.min_items, part.max_items],
+            "rate_hz": part.rate_hz,
+            "announced_hz": source.announced_hz(part.component.key),
+            "visible": part.visibility,
+        }
+        for key, part in source.components.items()
+    }
     return {
         "take": source.take_name,
         "recorder": source.recorder,
@@ -54,9 +152,7 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
         "server_restarts": source.server_restarts,
         "measurements": source.measurements,
         "gateway_restarts": source.gateway_restarts,
-        "components": {
-            key: _component_json(statistics, source, part) for key, part in source.components.items()
-        },
+        "components": components,
         "other": {key: _messages_json(statistics, part) for key, part in source.others.items()},
         "events": [
             {"id": number, "label": source.event_labels.get(number, ""), "count": count}
@@ -80,19 +176,10 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
     }
 
 
-def _component_json(
-    statistics: TakeStatistics, source: SourceStatistics, part: ComponentStatistics
-) -> dict[str, Any]:
-    return _messages_json(statistics, part) | {
-        "items": [part.min_items, part.max_items],
-        "rate_hz": part.rate_hz,
-        "announced_hz": source.announced_hz(part.component.key),
-        "visible": part.visibility,
-    }
-
-
 def _messages_json(statistics: TakeStatistics, part: MessageStatistics) -> dict[str, Any]:
     gaps = part.gaps
+    gap_list = [{"at_s": statistics.seconds_at(gap.utime), "missing": gap.missing} for gap in gaps.gaps]
+    largest = gaps.largest
     return {
         "messages": part.num_messages,
         "bytes": part.num_bytes,
@@ -101,64 +188,63 @@ def _messages_json(statistics: TakeStatistics, part: MessageStatistics) -> dict[
         "last_s": statistics.seconds_at(part.last_utime) if part.last_utime else None,
         "missing": gaps.num_lost,
         "gaps": gaps.num_gaps,
-        "largest_gap": None if gaps.largest is None else _gap_json(statistics, gaps.largest),
-        "gap_list": [_gap_json(statistics, gap) for gap in gaps.gaps],
+        "largest_gap": largest and {"at_s": statistics.seconds_at(largest.utime), "missing": largest.missing},
+        "gap_list": gap_list,
         "late": gaps.num_late,
         "repeated": gaps.num_repeated,
         "implausible": gaps.num_implausible,
     }
 
 
-def _gap_json(statistics: TakeStatistics, gap: Gap) -> dict[str, Any]:
-    return {"at_s": statistics.seconds_at(gap.utime), "missing": gap.missing}
-
-
 _MAX_SHOWN: Final = 10
 """How many changes, clock steps, channels and places of damage are shown."""
 
 _MAX_LABELS: Final = 200
+_MAX_LINE: Final = 1000
 
 
 def write_report(statistics: TakeStatistics, console: Console) -> None:
     """Write the report to ``console``."""
-    _print(console, *_head(statistics))
-    for source in statistics.sources.values():
-        console.print()
-        _print(console, *_source_lines(statistics, source))
-        console.print(_components_table(statistics, source))
-        for part in _item_lists(source):
+    for part in _report(statistics):
+        if isinstance(part, str):
+            console.print(Text(safe_text(part, _MAX_LINE)), soft_wrap=True)
+        else:
             console.print(part)
-        _print(console, *_details(statistics, source))
+
+
+def _report(statistics: TakeStatistics) -> Iterator[RenderableType]:
+    num_bytes, num_files = statistics.num_bytes, len(statistics.files)
+    size = f"{num_bytes / 1e6:.1f} MB" if num_bytes >= 100_000 else f"{num_bytes} bytes"
+    yield f"{statistics.path}: {size}" + (f", {num_files} files" if num_files > 1 else "")
+    try:
+        begin = datetime.fromtimestamp(statistics.start_utime / 1e6).astimezone()
+        begin_text = begin.strftime("%Y-%m-%d %H:%M:%S %Z")
+    except (OverflowError, OSError, ValueError):
+        begin_text = f"{statistics.start_utime} µs after 1970"
+    messages = counted(statistics.num_messages, "message")
+    yield f"{begin_text}, {_duration(statistics.seconds)}, {messages}"
+    for source in statistics.sources.values():
+        yield ""
+        yield from _source_lines(statistics, source)
+        yield _components_table(statistics, source)
+        yield from _item_lists(source)
+        yield from _changes(statistics, source)
     problems = list(_problems(statistics))
     if problems:
-        console.print()
-        _print(console, *problems)
-
-
-def _print(console: Console, *lines: str) -> None:
-    for line in lines:
-        console.print(Text(line), soft_wrap=True)
-
-
-def _head(statistics: TakeStatistics) -> Iterator[str]:
-    files = f", {len(statistics.files)} files" if len(statistics.files) > 1 else ""
-    yield f"{safe_text(str(statistics.path))}: {_bytes(statistics.num_bytes)}{files}"
-    yield (
-        f"{_local_time(statistics.start_utime)}, {_duration(statistics.seconds)}, "
-        f"{_count(statistics.num_messages, 'message')}"
-    )
+        yield ""
+        yield from problems
 
 
 def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
     servers = ", ".join(source.servers) or "unknown server"
     versions = ", ".join(source.gateway_versions)
-    yield safe_text(f"Source {source.name}: {servers}" + (f", gateway {versions}" if versions else ""))
+    yield f"Source {source.name}: {servers}" + (f", gateway {versions}" if versions else "")
     if source.take_name:
         host = f" on {source.host}" if source.host else ""
-        yield safe_text(f"Take {source.take_name!r}, recorded by {source.recorder}{host}")
+        yield f"Take {source.take_name!r}, recorded by {source.recorder}{host}"
     if source.details.text:
-        yield safe_text(f"About {source.details.text}")
-    texts = [_count(source.sessions, "connection")]
+        yield f"About {source.details.text}"
+    texts = [counted(source.sessions, "connection")]
     if source.server_restarts:
         times = _times(source.server_restarts)
         texts.append(f"{source.measurements} measurements: the server's time started again {times}")
@@ -171,33 +257,43 @@ def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Itera
     yield "; ".join(texts)
 
 
+_HEADINGS: Final = ("", "messages", "items", "Hz", "seconds", "missing", "gaps, largest")
+
+
 def _components_table(statistics: TakeStatistics, source: SourceStatistics) -> Table:
-    headings = ("", "messages", "items", "Hz", "seconds", "missing", "gaps, largest")
     poses = [part for key, part in source.others.items() if "/" in key]
-    components = {key: source.components[key] for key in COMPONENTS_BY_KEY if key in source.components}
-    parts: dict[str, MessageStatistics] = {**components, **source.others}
-    rows = [
-        _row(statistics, source, key, [part])
-        for key, part in parts.items()
-        if "/" not in key and key not in DESCRIPTIONS
-    ]
+    parts: dict[str, list[MessageStatistics]] = {
+        key: [source.components[key]] for key in COMPONENTS_BY_KEY if key in source.components
+    }
     if poses:
-        rows.insert(len(source.components), _row(statistics, source, _count(len(poses), "pose"), poses))
-    return _table(headings, rows)
+        parts[counted(len(poses), "pose")] = poses
+    parts |= {
+        key: [part] for key, part in source.others.items() if "/" not in key and key not in DESCRIPTIONS
+    }
+    table = list_table()
+    for column, heading in enumerate(_HEADINGS):
+        justify: Literal["left", "right"] = "right" if 0 < column < len(_HEADINGS) - 1 else "left"
+        table.add_column(heading, justify=justify, overflow="fold")
+    for key, some in parts.items():
+        # Text objects, because rich would read square brackets in a string as markup.
+        table.add_row(*(Text(safe_text(str(value))) for value in _cells(statistics, source, key, some)))
+    return table
 
 
-def _row(
+def _cells(
     statistics: TakeStatistics, source: SourceStatistics, name: str, parts: Sequence[MessageStatistics]
 ) -> tuple[object, ...]:
-    """Return the row of a component, or of all poses together."""
+    """Return the cells of a component, or of all poses together."""
     part = parts[0]
-    items = rate = ""
+    items = rate = gap_text = ""
     if isinstance(part, ComponentStatistics):
-        items = _items(part)
-        rate = "" if name == "event" else _rate(part.rate_hz, source.announced_hz(name))
+        items = f"{part.min_items} to {part.max_items}"
+        if part.min_items == part.max_items:
+            items = "" if part.min_items is None else str(part.min_items)
+        rates_hz = () if name == "event" else (part.rate_hz, source.announced_hz(name))
+        rate = " of ".join(f"{rate_hz:.5g}" for rate_hz in rates_hz if rate_hz is not None)
     gaps = [part.gaps for part in parts]
     largest = max((gap.largest for gap in gaps if gap.largest), key=lambda gap: gap.missing, default=None)
-    gap_text = ""
     if largest is not None:
         number = sum(gap.num_gaps for gap in gaps)
         gap_text = f"{number}, {largest.missing} at {_at(statistics, largest.utime)}"
@@ -217,7 +313,7 @@ def _item_lists(source: SourceStatistics) -> Iterator[RenderableType]:
         part = source.components.get(key)
         if part is not None and part.visibility:
             texts = [f"{label}  {100 * share:.1f} %" for label, share in part.visibility.items()]
-            yield Text(f"{_count(len(texts), noun)}, visible in % of the frames:")
+            yield f"{counted(len(texts), noun)}, visible in % of the frames:"
             yield _columns(texts)
     events = source.components.get("event")
     if events is not None and events.event_counts:
@@ -226,7 +322,7 @@ def _item_lists(source: SourceStatistics) -> Iterator[RenderableType]:
             f"{labels.get(number, '')} ({number:#x})  {count}".lstrip()
             for number, count in sorted(events.event_counts.items())
         ]
-        yield Text(f"{_count(sum(events.event_counts.values()), 'event')}:")
+        yield f"{counted(sum(events.event_counts.values()), 'event')}:"
         yield _columns(texts)
 
 
@@ -237,42 +333,42 @@ def _columns(texts: Sequence[str]) -> Columns:
     return Columns(shown, equal=True, column_first=True)
 
 
-def _details(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
-    changes = source.parameters_changes
+def _changes(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
+    changes = source.parameters_changes[:_MAX_SHOWN]
     if not changes:
         yield "No parameters: labels, units and rates are not known"
-    for change in changes[:_MAX_SHOWN]:
-        yield safe_text(f"Parameters {change.version} at {_at(statistics, change.utime)}: {change.text}")
-    if source.num_parameters_changes > len(changes[:_MAX_SHOWN]):
-        yield f"… and {source.num_parameters_changes - len(changes[:_MAX_SHOWN])} more changes of parameters"
+    for change in changes:
+        yield f"Parameters {change.version} at {_at(statistics, change.utime)}: {change.text}"
+    if source.num_parameters_changes > len(changes):
+        yield f"… and {source.num_parameters_changes - len(changes)} more changes of parameters"
 
 
 def _problems(statistics: TakeStatistics) -> Iterator[str]:
     """Yield what is missing, and what could not be read."""
     for source in statistics.sources.values():
         for text in _source_problems(source):
-            yield safe_text(f"{source.name}: {text}")
+            yield f"{source.name}: {text}"
     if statistics.num_damaged:
-        places = _count(statistics.num_damaged, "place")
+        places = counted(statistics.num_damaged, "place")
         yield f"Damage: {statistics.damaged_bytes} bytes at {places} could not be read"
         for damage in statistics.damage[:_MAX_SHOWN]:
-            yield safe_text(f"  {damage.file.name}: {damage.num_bytes} bytes from {damage.offset} on")
+            yield f"  {damage.file.name}: {damage.num_bytes} bytes from {damage.offset} on"
         for text in statistics.empty_files.values():
             yield f"  {text}"
     if statistics.unknown:
-        yield f"{_count(sum(statistics.unknown.values()), 'message')} of other programs or other versions:"
+        yield f"{counted(sum(statistics.unknown.values()), 'message')} of other programs or other versions:"
         for channel, number in sorted(statistics.unknown.items(), key=lambda item: -item[1])[:_MAX_SHOWN]:
             version = " (another version of the gateway?)" if is_gateways_channel(channel) else ""
-            yield safe_text(f"  {channel}: {number}{version}")
+            yield f"  {channel}: {number}{version}"
 
 
 def _source_problems(source: SourceStatistics) -> Iterator[str]:
     if source.is_cut_off:
         yield "the recording was cut off: its end is missing"
     if source.num_lost:
-        yield f"the recording lacks {_count(source.num_lost, 'message')} that found no room on the disk"
+        yield f"the recording lacks {counted(source.num_lost, 'message')} that found no room on the disk"
     for (place, cause), number in source.drops.items():
-        yield f"the gateway lost {_count(number, 'message')} ({place}: {cause})"
+        yield f"the gateway lost {counted(number, 'message')} ({place}: {cause})"
     parts: dict[str, MessageStatistics] = {**source.components, **source.others}
     for key, part in parts.items():
         for number, what in (
@@ -282,30 +378,7 @@ def _source_problems(source: SourceStatistics) -> Iterator[str]:
             (part.gaps.num_repeated, "arrived again"),
         ):
             if number:
-                yield f"{_count(number, f'{key} message')} {what}"
-
-
-def _table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    for column, heading in enumerate(headings):
-        table.add_column(
-            heading, justify="right" if 0 < column < len(headings) - 1 else "left", overflow="fold"
-        )
-    for row in rows:
-        # Text objects, because rich would read square brackets in a string as markup.
-        table.add_row(*(Text(safe_text(str(value))) for value in row))
-    return table
-
-
-def _items(part: ComponentStatistics) -> str:
-    if part.min_items == part.max_items:
-        return str(part.min_items if part.min_items is not None else "")
-    return f"{part.min_items} to {part.max_items}"
-
-
-def _rate(rate_hz: float | None, announced_hz: float | None) -> str:
-    texts = [f"{hz:.5g}" for hz in (rate_hz, announced_hz) if hz is not None]
-    return " of ".join(texts)
+                yield f"{counted(number, f'{key} message')} {what}"
 
 
 def _at(statistics: TakeStatistics, utime: int) -> str:
@@ -316,24 +389,9 @@ def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
 
 
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def _bytes(number: int) -> str:
-    return f"{number / 1e6:.1f} MB" if number >= 100_000 else f"{number} bytes"
-
-
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(seconds, 60)
     hours, minutes = divmod(int(minutes), 60)
     if hours:
         return f"{hours} h {minutes} min {rest:.0f} s"
     return f"{minutes} min {rest:.1f} s" if minutes else f"{rest:.3f} s"
-
-
-def _local_time(utime: int) -> str:
-    try:
-        return datetime.fromtimestamp(utime / 1e6).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
-    except (OverflowError, OSError, ValueError):
-        return f"{utime} µs after 1970"

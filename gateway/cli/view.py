@@ -4,23 +4,23 @@ import os
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from gateway.cli.options import AddressOptions, SourcesOption, checked_host, with_options
+from gateway.cli import options
 from gateway.cli.run import StopSignals
+from gateway.errors import ViewError
 from gateway.logs.safe_text import safe_text
 from gateway.outputs.listen_address import is_loopback
 
 if TYPE_CHECKING:
-    from gateway.client.client import GatewayAddress
     from gateway.client.transport import GatewaySubscriber
     from gateway.display.live import LiveData
-    from gateway.display.view.viewer import Viewer, ViewServer
+    from gateway.display.view.viewer import ViewServer
 
 VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
@@ -29,7 +29,7 @@ _SILENCE_S: Final = 2.0
 _INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
 
 
-@with_options
+@options.with_options
 def view(
     take: Annotated[
         Path | None,
@@ -38,11 +38,11 @@ def view(
         ),
     ] = None,
     *,
-    source: SourcesOption = None,
+    source: options.SourcesOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
-    where: AddressOptions,
+    where: options.AddressOptions,
     host: Annotated[
-        str, typer.Option(callback=checked_host, help="The address where the page is served.")
+        str, typer.Option(callback=options.checked_host, help="The address where the page is served.")
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port of the page; 0 picks a free one.")
@@ -51,77 +51,45 @@ def view(
 ) -> None:
     """Show markers, tools and forces in the browser as they arrive, or from a take, until Ctrl-C."""
     where.check(lcm=lcm)
-    if take is not None and (lcm or where != AddressOptions()):
+    if take is not None and (lcm or where != options.AddressOptions()):
         raise typer.BadParameter(
             "a take is read from its file; --lcm, --connect and --prefix are for live data"
         )
     stop = StopSignals(lambda _: os._exit(0))
-    server = _open_server(host, port)
-    try:
+    with ExitStack() as stack:
+        server = _open_server(host, port)
+        stack.callback(server.stop)
+
+        from gateway.client.client import GatewayClient
+        from gateway.client.transport import close_in_time
+        from gateway.display.live import LiveData
+        from gateway.display.view.viewer import Playback, RunningTakes, Viewer
+
+        live = LiveData()
+        ticks: list[Callable[[], object]] = []
         if take is None:
-            show = _live_data(where.address(lcm=lcm), source or (), server)
+            subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(source or (), None, live)
+            stack.callback(close_in_time, subscriber)
+            ticks += [subscriber.tick, RunningTakes(live, subscriber, server.get_clients).tick]
+            silence = threading.Timer(_SILENCE_S, _explain_silence, (live, subscriber))
+            silence.daemon = True
+            silence.start()
+            viewer = Viewer(server, live)
         else:
-            show = _take(take, source or (), server)
-        with show as (viewer, tick):
-            _announce(host, server.get_port(), opens_browser=not no_browser)
-            viewer.run(stop.wait, tick)
-    finally:
-        server.stop()
-
-
-@contextmanager
-def _live_data(
-    address: "GatewayAddress", sources: Sequence[str], server: "ViewServer"
-) -> Iterator[tuple["Viewer", Callable[[], object]]]:
-    """Subscribe, and provide a viewer of what arrives."""
-    from gateway.client.client import GatewayClient
-    from gateway.client.transport import close_in_time
-    from gateway.display.live import LiveData
-    from gateway.display.view.viewer import RunningTakes, Viewer
-
-    live = LiveData()
-    subscriber = GatewayClient(address).subscribe(sources, None, live)
-    takes = RunningTakes(live, subscriber, server.get_clients)
-
-    def tick() -> None:
-        subscriber.tick()
-        takes.tick()
-
-    silence = threading.Timer(_SILENCE_S, _explain_silence, (live, subscriber))
-    silence.daemon = True
-    silence.start()
-    try:
-        yield Viewer(server, live), tick
-    finally:
-        close_in_time(subscriber)
-
-
-@contextmanager
-def _take(
-    path: Path, sources: Sequence[str], server: "ViewServer"
-) -> Iterator[tuple["Viewer", Callable[[], object]]]:
-    """Open a take, and provide a viewer that plays it."""
-    from gateway.display.live import LiveData
-    from gateway.display.view.viewer import Playback, Viewer
-
-    live = LiveData()
-    playback = Playback(path, sources, live)
-    viewer = Viewer(server, live, playback)
-    try:
-        yield viewer, lambda: None
-    finally:
-        playback.close()
+            playback = Playback(take, source or (), live)
+            stack.callback(playback.close)
+            viewer = Viewer(server, live, playback)
+        _announce(host, server.get_port(), opens_browser=not no_browser)
+        viewer.run(stop.wait, lambda: [tick() for tick in ticks])
 
 
 def _open_server(host: str, port: int) -> "ViewServer":
     """Return the server of the page. Raises ViewError."""
     try:
-        from gateway.display.view.viewer import open_server
+        from gateway.display.view.server import open_server
     except ImportError as error:
         if not (error.name or "").startswith("viser"):
             raise
-        from gateway.errors import ViewError
-
         raise ViewError(
             f"the view needs viser, which is not installed; install it: {_INSTALL}, "
             f"or only viser for this program: {sys.executable} -m pip install '{VISER}'"
@@ -131,7 +99,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
 
 def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     """Print where the page is, and open it. A computer without a browser is no error."""
-    from gateway.display.view.viewer import address_of
+    from gateway.display.view.server import address_of
 
     address = address_of(host, port)
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)

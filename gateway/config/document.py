@@ -12,6 +12,7 @@ service has the name rtc3d-gateway.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, Final, NamedTuple
 
 import yaml
@@ -70,13 +71,11 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         self._depth += 1
-        if self._depth > MAX_DEPTH:
-            mark = parent.start_mark if parent else None
-            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_DEPTH} levels", mark)
         self._nodes += 1
-        if self._nodes > 2 * MAX_VALUES:
+        if self._depth > MAX_DEPTH or self._nodes > 2 * MAX_VALUES:
+            limit = f"{MAX_DEPTH} levels" if self._depth > MAX_DEPTH else f"{MAX_VALUES} values"
             mark = parent.start_mark if parent else None
-            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_VALUES} values", mark)
+            raise yaml.composer.ComposerError(None, None, f"found more than {limit}", mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -103,48 +102,51 @@ def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
     Raises ConfigError with the position of the first mistake. Positions consist of ``origin``, line and
     column, or of ``origin`` alone if ``has_lines`` is false.
     """
-    return _Reader(origin, has_lines).read(text)
+    reader = _Reader(origin, has_lines)
+    try:
+        loader = _Loader(text)
+    except yaml.reader.ReaderError as error:
+        position = reader.position(*line_and_column_after(text[: error.position]))
+        found = f"the character U+{ord(text[error.position]):04X}"
+        raise position.error((), f"found {found}, which YAML does not allow") from None
+    try:
+        root = loader.get_single_node()
+    except yaml.MarkedYAMLError as error:
+        problem = f"not YAML: {error.problem}"
+        if error.context and error.context_mark:
+            problem = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
+        if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
+            problem += "; check indentation, colons, quotes and brackets here"
+        raise reader.position_of(error.problem_mark or loader.get_mark()).error((), problem) from None
+    except (ValueError, OverflowError):  # raised by chr() and int() in PyYAML
+        position = reader.position_of(loader.get_mark())
+        raise position.error((), "not YAML: a number here is out of range") from None
+    values = None if root is None else reader.value(root, ())
+    return Document(values, reader.positions, reader.key_positions)
 
 
 class _Reader:
-    """Reads one document: mappings, lists, text, numbers, booleans and None."""
+    """Makes values of nodes: mappings, lists, text, numbers, booleans and None."""
 
     def __init__(self, origin: str, has_lines: bool) -> None:
         self._origin = origin
         self._has_lines = has_lines
-        self._positions: dict[Location, Position] = {}
-        self._key_positions: dict[Location, Position] = {}
+        self.positions: dict[Location, Position] = {}
+        self.key_positions: dict[Location, Position] = {}
         self._values_left = MAX_VALUES
 
-    def read(self, text: str) -> Document:
-        try:
-            loader = _Loader(text)
-        except yaml.reader.ReaderError as error:
-            position = self._position(*line_and_column_after(text[: error.position]))
-            found = f"the character U+{ord(text[error.position]):04X}"
-            raise position.error((), f"found {found}, which YAML does not allow") from None
-        try:
-            root = loader.get_single_node()
-        except yaml.MarkedYAMLError as error:
-            raise self._not_yaml(error, loader.get_mark()) from None
-        except (ValueError, OverflowError):  # raised by chr() and int() in PyYAML
-            position = self._position_of(loader.get_mark())
-            raise position.error((), "not YAML: a number here is out of range") from None
-        values = None if root is None else self._value(root, ())
-        return Document(values, self._positions, self._key_positions)
-
-    def _value(self, node: yaml.Node, location: Location) -> object:
-        position = self._position_of(node.start_mark)
+    def value(self, node: yaml.Node, location: Location) -> object:
+        position = self.position_of(node.start_mark)
         self._values_left -= 1
         if self._values_left < 0 or len(location) >= MAX_DEPTH:  # only aliases reach this depth
             limits = f"more than {MAX_VALUES} values or {MAX_DEPTH} levels"
             raise position.error((), f"{limits}, counting those that aliases repeat")
-        self._positions[location] = position
+        self.positions[location] = position
         match node, node.tag.removeprefix(_YAML):
             case yaml.MappingNode(), "map":
                 return self._mapping(node, location)
             case yaml.SequenceNode(), "seq":
-                return [self._value(item, (*location, index)) for index, item in enumerate(node.value)]
+                return [self.value(item, (*location, index)) for index, item in enumerate(node.value)]
             # A timestamp is text, because a source may be named 2026-06-01.
             case yaml.ScalarNode(), "str" | "timestamp" | "value" | "merge":
                 return self._text(node, location)
@@ -157,17 +159,17 @@ class _Reader:
     def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, object]:
         values: dict[str, object] = {}
         for key_node, value_node in node.value:
-            position = self._position_of(key_node.start_mark)
+            position = self.position_of(key_node.start_mark)
             if not isinstance(key_node, yaml.ScalarNode):
                 raise position.error(location, "found a list or mapping as a key")
             key = self._text(key_node, location)
             here = (*location, key)
             if key in values:
-                raise position.error(here, f"the same key as in line {self._key_positions[here].line}")
+                raise position.error(here, f"the same key as in line {self.key_positions[here].line}")
             if key_node.tag == f"{_YAML}merge":
                 raise position.error(here, "merge keys are not supported; use an alias as the value of a key")
-            self._key_positions[here] = position
-            values[key] = self._value(value_node, here)
+            self.key_positions[here] = position
+            values[key] = self.value(value_node, here)
         return values
 
     def _number(self, node: yaml.ScalarNode, location: Location) -> object:
@@ -177,28 +179,20 @@ class _Reader:
             except (ValueError, LookupError):  # such as 0x_, or text with the tag !!int or !!bool
                 pass
         text = f"found {describe(node.value)}; expected a number of at most {MAX_NUMBER_LENGTH} characters"
-        raise self._position_of(node.start_mark).error(location, text)
+        raise self.position_of(node.start_mark).error(location, text)
 
     def _text(self, node: yaml.ScalarNode, location: Location) -> str:
         """Return a key or text. Raises ConfigError for half a surrogate pair, which an escape can produce."""
         text: str = node.value
         if not is_encodable(text):
             found = f"found {describe(text)}; expected text that UTF-8 can encode"
-            raise self._position_of(node.start_mark).error(location, found)
+            raise self.position_of(node.start_mark).error(location, found)
         return text
 
-    def _not_yaml(self, error: yaml.MarkedYAMLError, end: yaml.Mark) -> ConfigError:
-        text = f"not YAML: {error.problem}"
-        if error.context and error.context_mark:
-            text = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
-        if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
-            text += "; check indentation, colons, quotes and brackets here"
-        return self._position_of(error.problem_mark or end).error((), text)
+    def position_of(self, mark: yaml.Mark) -> Position:
+        return self.position(mark.line + 1, mark.column + 1)
 
-    def _position_of(self, mark: yaml.Mark) -> Position:
-        return self._position(mark.line + 1, mark.column + 1)
-
-    def _position(self, line: int, column: int) -> Position:
+    def position(self, line: int, column: int) -> Position:
         return Position(self._origin, line, column) if self._has_lines else Position(self._origin)
 
 
@@ -244,83 +238,66 @@ def apply_overrides(document: Document, environ: Mapping[str, str]) -> None:
     """
     if not isinstance(document.values, dict):
         return  # validation reports that the file does not hold a mapping
-    names = [name for name in environ if name.startswith(VARIABLE_PREFIX)]
+    steps = {
+        name: name.removeprefix(VARIABLE_PREFIX).lower().split("__")
+        for name in environ
+        if name.startswith(VARIABLE_PREFIX)
+    }
     # Sort mappings before their keys, and list items by index, because a variable may append an item.
-    for name in sorted(names, key=lambda name: [step.zfill(9) for step in _steps(name)]):
-        _Override(document, name).set(environ[name])
+    for name in sorted(steps, key=lambda name: [step.zfill(9) for step in steps[name]]):
+        _override(document, Position(name), steps[name], environ[name])
 
 
-def _steps(name: str) -> list[str]:
-    return name.removeprefix(VARIABLE_PREFIX).lower().split("__")
-
-
-def _holds(container: Any, key: Any) -> bool:
-    return key in container if isinstance(container, dict) else key < len(container)
-
-
-class _Override:
-    """One variable, to be set in the document."""
-
-    def __init__(self, document: Document, name: str) -> None:
-        self._document = document
-        self._position = Position(name)
-        self._steps = _steps(name)
-
-    def set(self, text: str) -> None:
-        if not all(self._steps):
-            raise self._position.error(
-                (), f"does not name a key; expected a name such as {variable_name(('lcm', 'url'))}"
+def _override(document: Document, variable: Position, steps: list[str], text: str) -> None:
+    """Set the value at the end of ``steps``, and the mappings and lists on the way that do not exist."""
+    if not all(steps):
+        example = variable_name(("lcm", "url"))
+        raise variable.error((), f"does not name a key; expected a name such as {example}")
+    container = document.values
+    location: Location = ()
+    for step, following in zip_longest(steps, steps[1:]):
+        key: Any = step
+        if isinstance(container, list):
+            if not re.fullmatch("[0-9]{1,9}", step) or int(step) > len(container):
+                found = f"found the index {describe(step)}; expected a number from 0 to {len(container)}"
+                raise variable.error(location, found)
+            key = int(step)
+        elif not isinstance(container, dict):
+            raise variable.error(
+                location,
+                f"this value is {describe(container)} ({document.nearest_position(location)}), which has no "
+                f"keys; set the whole value with {variable_name(location)}",
             )
-        container = self._document.values
-        location: Location = ()
-        for number, step in enumerate(self._steps):
-            key = self._key(container, location, step)
-            location = (*location, key)
-            following = self._steps[number + 1 : number + 2]
-            if not following:
-                self._put(container, key, self._read(text, location), location)
-            elif not _holds(container, key):
-                new: Any = [] if re.fullmatch("[0-9]+", following[0]) else {}
-                self._put(container, key, Document(new, {(): self._position}, {}), location)
-            container = container[key]
+        location = (*location, key)
+        if following is None:
+            _put(document, container, location, _read_variable(text, location, variable))
+        elif key not in container if isinstance(container, dict) else key == len(container):
+            new: Any = [] if re.fullmatch("[0-9]+", following) else {}
+            _put(document, container, location, Document(new, {(): variable}, {}))
+        container = container[key]
 
-    def _key(self, container: object, location: Location, step: str) -> Any:
-        """Return ``step`` as a key or index of ``container``, the value at ``location``."""
-        match container:
-            case dict():
-                return step
-            case list():
-                if re.fullmatch("[0-9]{1,9}", step) and int(step) <= len(container):
-                    return int(step)
-                raise self._position.error(
-                    location,
-                    f"found the index {describe(step)}; expected a number from 0 to {len(container)}",
-                )
-        position = self._document.nearest_position(location)
-        raise self._position.error(
-            location,
-            f"this value is {describe(container)} ({position}), which has no keys; "
-            f"set the whole value with {variable_name(location)}",
-        )
 
-    def _put(self, container: Any, key: Any, read: Document, location: Location) -> None:
-        if isinstance(container, list) and not _holds(container, key):
-            container.append(read.values)
-        else:
-            container[key] = read.values
-        for all_positions, new_positions in (
-            (self._document.positions, read.positions),
-            (self._document.key_positions, {(): self._position, **read.key_positions}),
-        ):
-            for other in [other for other in all_positions if other[: len(location)] == location]:
-                del all_positions[other]
-            all_positions.update({(*location, *inner): position for inner, position in new_positions.items()})
+def _put(document: Document, container: Any, location: Location, read: Document) -> None:
+    """Set or append what was read of a variable, with its positions."""
+    key: Any = location[-1]
+    if isinstance(container, list) and key == len(container):
+        container.append(read.values)
+    else:
+        container[key] = read.values
+    for all_positions, new_positions in (
+        (document.positions, read.positions),
+        (document.key_positions, {(): read.positions[()], **read.key_positions}),
+    ):
+        for other in [other for other in all_positions if other[: len(location)] == location]:
+            del all_positions[other]
+        all_positions.update({(*location, *inner): position for inner, position in new_positions.items()})
 
-    def _read(self, text: str, location: Location) -> Document:
-        """Return the value of the variable. A secret is taken literally, not as YAML."""
-        if not is_secret_key(location[-1]):
-            read = read_yaml(text, self._position.origin, has_lines=False)
-            return Document(read.values, {(): self._position, **read.positions}, read.key_positions)
-        if not is_encodable(text):
-            raise self._position.error(location, "found bytes that are not UTF-8; expected text")
-        return Document(text, {(): self._position}, {})
+
+def _read_variable(text: str, location: Location, variable: Position) -> Document:
+    """Return the value of the variable. A secret is taken literally, not as YAML."""
+    if not is_secret_key(location[-1]):
+        read = read_yaml(text, variable.origin, has_lines=False)
+        return Document(read.values, {(): variable, **read.positions}, read.key_positions)
+    if not is_encodable(text):
+        raise variable.error(location, "found bytes that are not UTF-8; expected text")
+    return Document(text, {(): variable}, {})

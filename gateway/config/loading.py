@@ -1,13 +1,19 @@
-"""Read settings from YAML files and environment variables. Every mistake is reported with its position."""
+"""Read settings from YAML files and environment variables, and show what is in effect and what is possible.
+
+Every mistake is reported with its position.
+"""
 
 import json
 import logging
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
+import yaml
 from pydantic import ValidationError
+from pydantic.json_schema import GenerateJsonSchema
 
 from gateway.config.document import (
     VARIABLE_PREFIX,
@@ -22,7 +28,7 @@ from gateway.config.document import (
 from gateway.config.files import read_file
 from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import OutputSettings, Settings
-from gateway.config.words import MASK, file_key_for, find_secrets, is_secret_key, mask_secrets_in_text
+from gateway.config.words import find_secrets, replace_item
 from gateway.errors import ConfigError
 
 logger = logging.getLogger(__name__)
@@ -117,26 +123,21 @@ def _rename(document: Document, section: str, old: str, new: str) -> None:
 
 
 def _read_file(path: Path, section: type[Section], example: str) -> Document:
-    document = read_yaml(_text_of(path, example), str(path))
-    if not document.positions:
-        needed = next(name for name, field in section.model_fields.items() if field.is_required())
-        raise ConfigError(f"{path}: empty; expected a mapping with at least the key {needed}")
-    return document
-
-
-def _text_of(path: Path, example: str) -> str:
     try:
-        data = read_file(path)
+        text = read_file(path).decode("utf-8-sig")  # some editors begin a file with a byte order mark
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read: {error.strerror}; name a YAML file such as {example}"
         ) from error
-    try:
-        return data.decode("utf-8-sig")  # some editors begin a file with a byte order mark
     except UnicodeDecodeError as error:
         position = Position(str(path), *line_and_column_after(error.object[: error.start].decode()))
         found = f"0x{error.object[error.start]:02X}"
         raise position.error((), f"found the byte {found}; expected text in UTF-8") from None
+    document = read_yaml(text, str(path))
+    if not document.positions:
+        needed = next(name for name, field in section.model_fields.items() if field.is_required())
+        raise ConfigError(f"{path}: empty; expected a mapping with at least the key {needed}")
+    return document
 
 
 _Mistake = tuple[Position, ConfigError]
@@ -166,16 +167,11 @@ def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
         location, text = details["loc"], details["msg"]
         position = document.key_positions.get(location) if details["type"] == UNKNOWN_KEY else None
         position = position or document.nearest_position(location)
-        if position.line:
-            text += _those_in(variables, location)
+        names = {name for place, name in variables if place[: len(location)] == location}
+        if names and position.line:  # one of the variables may have the mistake
+            text += f" (a part of it is from {', '.join(sorted(names))})"
         mistakes.append((position, position.error(location, text)))
     return mistakes
-
-
-def _those_in(variables: list[tuple[Location, str]], location: Location) -> str:
-    """Return a hint that names the variables that set parts of the value; one may have the mistake."""
-    names = {name for place, name in variables if place[: len(location)] == location}
-    return f" (a part of it is from {', '.join(sorted(names))})" if names else ""
 
 
 def _mask_secrets(document: Document, foreign: Location, safe_place: str) -> list[_Mistake]:
@@ -188,14 +184,14 @@ def _mask_secrets(document: Document, foreign: Location, safe_place: str) -> lis
     for key in foreign:
         config = config.get(key) if isinstance(config, dict) else None
     mistakes = []
-    for steps, secret in list(find_secrets(config)):
-        location = (*foreign, *steps)
+    for location, masked in list(find_secrets(config, foreign)):
         position = document.nearest_position(location)
         if not position.line:
             continue
-        _replace(config, steps, MASK if is_secret_key(steps[-1]) else mask_secrets_in_text(secret))
-        path_key = file_key_for(steps[-1])
-        others = f"{path_key} with the path of the key's file, " if path_key else ""
+        replace_item(document.values, location, masked)
+        stem, _, form = str(location[-1]).rpartition("_")
+        path_key = {"base64": stem, "pem": f"{stem}_file"}.get(form)  # such as connect_private_key
+        others = f"{path_key} with the path of the key's file, " if stem and path_key else ""
         text = (
             f"found a secret, which does not belong in this file; use {others}"
             f"the environment variable {variable_name(location)}, or {safe_place}"
@@ -204,8 +200,96 @@ def _mask_secrets(document: Document, foreign: Location, safe_place: str) -> lis
     return mistakes
 
 
-def _replace(config: Any, steps: Location, value: object) -> None:
-    *parents, last = steps
-    for step in parents:
-        config = config[step]
-    config[last] = value
+# The effective configuration as YAML with the origin of each value, and the JSON schema for editors.
+
+_DEFAULT: Final = "default"
+_MAX_COLUMN: Final = 48
+"""The comments start here or earlier. After a longer line, the comment follows directly."""
+
+
+def shown_configuration(configuration: Configuration) -> str:
+    """Return the effective configuration as YAML, with the origin of each value as a comment.
+
+    Secrets are replaced by MASK. Values that depend on the environment (``lcm.url``, ``spool.directory``) are
+    shown as they are in this one.
+    """
+    settings = configuration.settings
+    values = settings.model_dump(mode="json")
+    for location, masked in list(find_secrets(values)):
+        replace_item(values, location, masked)
+    used: dict[Location, str] = {}  # the origins of values that are used because a key is not set
+    sections: dict[Location, object] = {
+        (name,): getattr(settings, name) for name in type(settings).model_fields
+    }
+    sections |= {("sources", index): source for index, source in enumerate(settings.sources)}
+    for place, section in sections.items():
+        for key, effective in section.effective.items() if isinstance(section, Section) else ():
+            replace_item(values, (*place, key), effective.value)
+            if effective.variables:
+                set_by = (name for name in effective.variables if os.environ.get(name))
+                used[(*place, key)] = next(set_by, _DEFAULT)
+
+    def origin_of(location: Location) -> str:
+        if location in used:
+            return used[location]
+        # The items of a list on one line may come from several positions.
+        positions = [
+            position
+            for other, position in configuration.positions.items()
+            if other[: len(location)] == location
+        ]
+        return ", ".join(dict.fromkeys(position.without_column for position in positions)) or _DEFAULT
+
+    lines = [line for key, value in values.items() for line in _lines(key, value, (key,), "", origin_of)]
+    column = min(max(len(text) for text, _ in lines), _MAX_COLUMN)
+    return "".join((f"{text:{column}}  # {origin}" if origin else text) + "\n" for text, origin in lines)
+
+
+def _lines(
+    key: str, value: Any, location: Location, indent: str, origin_of: Callable[[Location], str]
+) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a key and their origins. Mappings, and lists that hold any, get a line per item."""
+    start = f"{indent}{_flow(key)}:"
+    match value:
+        case Mapping() if value:
+            yield start, ""
+            for inner, item in value.items():
+                yield from _lines(inner, item, (*location, inner), indent + "  ", origin_of)
+        case [*items] if any(isinstance(item, Mapping) and item for item in items):
+            yield start, ""
+            for index, item in enumerate(items):
+                here = (*location, index)
+                begin = f"{indent}  - "
+                if not isinstance(item, Mapping) or not item:
+                    yield f"{begin}{_flow(item)}", origin_of(here)
+                    continue
+                for inner, field in item.items():
+                    for text, origin in _lines(inner, field, (*here, inner), indent + "    ", origin_of):
+                        yield begin + text[len(begin) :], origin
+                        begin = indent + "    "
+        case _:
+            yield f"{start} {_flow(value)}", origin_of(location)
+
+
+def _flow(value: Any) -> str:
+    """Return ``value`` as YAML on one line."""
+    if isinstance(value, str) and not value.isprintable():
+        return json.dumps(value)
+    text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=math.inf)
+    return text.removesuffix("...\n").strip()
+
+
+_DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+
+
+class _WithoutTitles(GenerateJsonSchema):
+    """Omits the titles of keys, which only repeat the key."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002 - no key has one
+        return False
+
+
+def schema_text(model: type[Settings]) -> str:
+    """Return the JSON schema of ``model``, the content of ``config/gateway.schema.json``."""
+    schema = model.model_json_schema(schema_generator=_WithoutTitles)
+    return json.dumps({"$schema": _DIALECT, **schema, "title": "RTC3D gateway"}, indent=2) + "\n"

@@ -81,21 +81,16 @@ def expects(what: str) -> WrapValidator:
             first = error.errors(include_url=False)[0]
             if first["loc"]:
                 raise  # the error is in an item of the value, and already has its own text
-            hint = _quoting_hint(value, first["type"])
+            hint = ""
+            if first["type"] == "string_type" and isinstance(value, bool | int | float):
+                hint = " (use quotes to make it text)"
+            elif first["type"] == "float_type" and isinstance(value, str) and _EXPONENT.fullmatch(value):
+                hint = f" (write it as {format(Decimal(value), 'f')})"  # 1e-3 is text in YAML
             raise validation_error(
                 f"found {describe(value, show_items=True)}{hint}; expected {what}"
             ) from None
 
     return WrapValidator(check)
-
-
-def _quoting_hint(value: object, error_type: str) -> str:
-    """Return how to write a number that has to be text, or one such as 1e-3, which YAML takes for text."""
-    if error_type == "string_type" and isinstance(value, bool | int | float):
-        return " (use quotes to make it text)"
-    if error_type == "float_type" and isinstance(value, str) and _EXPONENT.fullmatch(value):
-        return f" (write it as {format(Decimal(value), 'f')})"
-    return ""
 
 
 def _line_error(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:

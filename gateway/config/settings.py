@@ -13,38 +13,18 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import (
-    AfterValidator,
     Field,
-    PlainSerializer,
     PlainValidator,
     TypeAdapter,
+    WrapValidator,
     create_model,
     field_validator,
     model_validator,
 )
 from pydantic.json_schema import SkipJsonSchema
 
+from gateway.config import values
 from gateway.config.section import Effective, Section, expects, validation_error
-from gateway.config.values import (
-    AbsoluteDirectory,
-    Backlog,
-    ByteLimit,
-    Components,
-    FileLimit,
-    FrameId,
-    Host,
-    IntervalSeconds,
-    Milliseconds,
-    Port,
-    Seconds,
-    ServerByteOrder,
-    SourceName,
-    Speed,
-    StreamRate,
-    Switch,
-    TransformSettings,
-    not_empty,
-)
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES, FIRST_PRINCIPLES_PORT
@@ -53,25 +33,25 @@ from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTE
 class StreamSettings(Section):
     """One TCP session with the server of a source: its components and their rate."""
 
-    components: Components = WIRE_ORDER
+    components: values.Components = WIRE_ORDER
     """The components to request: [all], or a list of 3d, 6d, analog, force, event in any order."""
 
-    rate: StreamRate = AllFrames()
+    rate: values.StreamRate = AllFrames()
     """The rate to request: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
-    backlog: Backlog = "all"
+    backlog: values.Backlog = "all"
     """While frames are late: publish all frames, or only the newest one. Events are never skipped."""
 
-    backlog_speed: Speed = 2.0
+    backlog_speed: values.Speed = 2.0
     """How fast a backlog is published with `backlog: all`, as a multiple of the stream's own rate."""
 
-    adapt_rate: Switch = False
+    adapt_rate: values.Switch = False
     """Whether to request a lower rate from the server while frames are late."""
 
-    on_demand: Switch = False
+    on_demand: values.Switch = False
     """Whether to stream only while someone subscribes. No effect while LCM is enabled."""
 
-    idle_after_s: Seconds = 5.0
+    idle_after_s: values.Seconds = 5.0
     """How long an on-demand stream continues without subscribers before it stops."""
 
     @property
@@ -82,25 +62,17 @@ class StreamSettings(Section):
 
 _StreamList = Annotated[
     tuple[StreamSettings, ...],
-    AfterValidator(not_empty),
+    values.not_empty,
     expects("auto, or a list of streams, one or more"),
     Field(json_schema_extra={"minItems": 1}),
 ]
 _STREAM_LIST: Final[TypeAdapter[tuple[StreamSettings, ...]]] = TypeAdapter(_StreamList)
 
 
-def _streams(value: object) -> Literal["auto"] | tuple[StreamSettings, ...]:
-    return "auto" if value == "auto" else _STREAM_LIST.validate_python(value)
-
-
-def _streams_to_yaml(streams: Literal["auto"] | tuple[StreamSettings, ...]) -> str | list[dict[str, Any]]:
-    return "auto" if streams == "auto" else [stream.model_dump(mode="json") for stream in streams]
-
-
+# As a mere union, a mistake in a list would also be reported as not being the word auto.
 Streams = Annotated[
-    Literal["auto"] | tuple[StreamSettings, ...],
-    PlainValidator(_streams, json_schema_input_type=Literal["auto"] | _StreamList),
-    PlainSerializer(_streams_to_yaml),
+    Literal["auto"] | _StreamList,
+    WrapValidator(lambda value, _: value if value == "auto" else _STREAM_LIST.validate_python(value)),
 ]
 """In YAML: auto, or a list of streams."""
 
@@ -108,10 +80,10 @@ Streams = Annotated[
 class ReconnectSettings(Section):
     """The delays between connection attempts: each about twice the previous one, up to a maximum."""
 
-    first_delay_s: Seconds = 0.2
+    first_delay_s: values.Seconds = 0.2
     """The first delay."""
 
-    max_delay_s: Seconds = 10.0
+    max_delay_s: values.Seconds = 10.0
     """The longest delay."""
 
     @model_validator(mode="after")
@@ -127,22 +99,22 @@ class ReconnectSettings(Section):
 class SourceSettings(Section):
     """One RTC3D server and how to stream from it."""
 
-    name: SourceName
+    name: values.SourceName
     """The name of this source in keys and channels. In channels, it is in upper case, and '-' becomes '_'."""
 
-    host: Host
+    host: values.Host
     """The host name or IP address of the server."""
 
-    port: Port = FIRST_PRINCIPLES_PORT
+    port: values.Port = FIRST_PRINCIPLES_PORT
     """The TCP port of the server: 3020 for First Principles, 3030 for WaveFront."""
 
-    byte_order: ServerByteOrder = "big"
+    byte_order: values.ServerByteOrder = "big"
     """The byte order to request. The published messages are the same in both."""
 
-    frame_id: FrameId | None = None
+    frame_id: values.FrameId | None = None
     """The name of the coordinate frame of poses, which sources can share. null means the source's name."""
 
-    transform: TransformSettings = TransformSettings()
+    transform: values.TransformSettings = values.TransformSettings()
     """From the server's units and axes to the frame of poses. Component messages are never transformed."""
 
     streams: Streams = "auto"
@@ -151,39 +123,39 @@ class SourceSettings(Section):
     reconnect: ReconnectSettings = ReconnectSettings()
     """The delays between connection attempts."""
 
-    connect_timeout_s: Seconds = 5.0
+    connect_timeout_s: values.Seconds = 5.0
     """How long a connection attempt may take, the look-up of the name included."""
 
-    reply_timeout_s: Seconds = 2.0
+    reply_timeout_s: values.Seconds = 2.0
     """How long the server may take to answer a command."""
 
-    stall_timeout_s: Seconds = 3.0
+    stall_timeout_s: values.Seconds = 3.0
     """How long a stream may be silent while a measurement runs."""
 
-    max_lag_ms: Milliseconds = 50.0
+    max_lag_ms: values.Milliseconds = 50.0
     """How late frames may be: see `backlog` and `adapt_rate` of the streams."""
 
-    max_packet_bytes: ByteLimit = DEFAULT_MAX_PACKET_BYTES
+    max_packet_bytes: values.ByteLimit = DEFAULT_MAX_PACKET_BYTES
     """The largest accepted packet, except for C3D files."""
 
-    max_c3d_bytes: ByteLimit = DEFAULT_MAX_C3D_BYTES
+    max_c3d_bytes: values.ByteLimit = DEFAULT_MAX_C3D_BYTES
     """The largest accepted C3D file."""
 
-    query_timeout_s: Seconds = 4.0
+    query_timeout_s: values.Seconds = 4.0
     """How long a query may wait for the server, including the time for queries before it."""
 
-    fresh_interval_s: Seconds = 1.0
+    fresh_interval_s: values.Seconds = 1.0
     """How long a reply of the server counts as fresh. It limits how often peers can query the server."""
 
-    parameters_interval_s: IntervalSeconds = 10.0
+    parameters_interval_s: values.IntervalSeconds = 10.0
     """How often to read the server's parameters again, for example for renamed markers. 0 means never."""
 
-    remote_control: Switch = False
+    remote_control: values.Switch = False
     """Whether peers may start and stop recordings on the server, and takes."""
 
     @property
     def effective(self) -> dict[str, Effective]:
-        """See Section."""
+        """The source's name as ``frame_id``."""
         return {} if self.frame_id is not None else {"frame_id": Effective(self.name)}
 
     @property
@@ -237,11 +209,6 @@ class ListenAddress(NamedTuple):
     host: str
     port: int
 
-    def collides_with(self, other: "ListenAddress") -> bool:
-        """Return whether only one of the two can be opened."""
-        hosts = {self.host, other.host}
-        return self.port == other.port and (len(hosts) == 1 or not hosts.isdisjoint(_ALL_ADDRESSES))
-
 
 _ALL_ADDRESSES: Final = {"0.0.0.0", "::"}  # noqa: S104 - not bound here
 
@@ -252,7 +219,7 @@ class OutputSettings(Section):
     foreign_keys: ClassVar[Mapping[str, str]] = {}
     """The keys that hold the configuration of another program, each with a safe place for its secrets."""
 
-    enabled: Switch = False
+    enabled: values.Switch = False
     """Whether to publish on this output."""
 
     @property
@@ -291,13 +258,13 @@ def default_folder(configured: str | None, name: str) -> dict[str, Effective]:
 class SpoolSettings(Section):
     """Storage for complete C3D files from the servers."""
 
-    directory: AbsoluteDirectory | None = None
+    directory: values.AbsoluteDirectory | None = None
     """The folder. null means c3d in the state directory of the service, or of the user without systemd."""
 
-    max_files: FileLimit = 100
+    max_files: values.FileLimit = 100
     """The maximum number of files of each source. Its oldest are deleted first."""
 
-    max_bytes: ByteLimit = 1024 * 1024 * 1024
+    max_bytes: values.ByteLimit = 1024 * 1024 * 1024
     """The maximum total size of the files of each source. Its oldest are deleted first."""
 
     @property
@@ -314,13 +281,13 @@ class SpoolSettings(Section):
 class MetricsSettings(Section):
     """Monitoring over HTTP: Prometheus metrics on /metrics, the health check on /healthz."""
 
-    enabled: Switch = True
+    enabled: values.Switch = True
     """Whether to serve HTTP."""
 
-    host: Host = "127.0.0.1"
+    host: values.Host = "127.0.0.1"
     """The address to listen on: one of this host, or 0.0.0.0 or "::" for all."""
 
-    port: Port = 9464
+    port: values.Port = 9464
     """The TCP port."""
 
     @property
@@ -334,7 +301,7 @@ class Settings(Section):
 
     sources: Annotated[
         tuple[SourceSettings, ...],
-        AfterValidator(not_empty),
+        values.not_empty,
         expects("a list of sources, one or more, each with name and host"),
         Field(json_schema_extra={"minItems": 1}),
     ]
@@ -390,7 +357,8 @@ class Settings(Section):
         for name, section in sections.items():
             for address in section.listens_on if section.enabled else ():
                 for other_key, other in used.items():
-                    if address.collides_with(other):
+                    hosts = {address.host, other.host}
+                    if address.port == other.port and (len(hosts) == 1 or hosts & _ALL_ADDRESSES):
                         raise validation_error(
                             f"found {address.port}, which {other_key} has too; expected another port",
                             *(name, *address.key),

@@ -6,7 +6,9 @@ At the end, those of the section ``transform`` of a source, and the section itse
 import ipaddress
 import math
 import re
-from typing import Annotated, Final, Literal, Self, TypeVar
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -23,7 +25,6 @@ from gateway.config.words import describe, join_or, spelling_hint
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
 
-_Item = TypeVar("_Item")
 _COMPONENT_KEYS: Final = [component.key for component in WIRE_ORDER]
 
 
@@ -31,10 +32,17 @@ def _host(text: str) -> str:
     """Return ``text`` if it is an IP address, or a name that can be sent to a name server (RFC 1035, IDNA).
 
     A name whose last label is a number would be an address to the resolver, for example 127.1 or 0x7f.1.
-    Such short forms are refused, because they are usually mistakes.
+    Such short forms are refused, because they are usually mistakes. An IPv6 address may have a scope, the
+    name or number of a network interface: fe80::1%eth0.
     """
     if "%" in text:
-        return _scoped_address(text)
+        ipaddress.IPv6Address(text)
+        scope = text.partition("%")[2]
+        if not re.fullmatch(
+            r"[!-$&-.0-~]{1,15}", scope
+        ):  # what Linux accepts: 15 bytes, without / and spaces
+            raise ValueError
+        return text
     if re.fullmatch(r"[\w-]+(\.[\w-]+)*\.?", text):
         encoded = text.encode("idna").decode()  # UnicodeError, a ValueError: a label is empty or too long
         last_label = encoded.rstrip(".").rpartition(".")[2]
@@ -44,67 +52,38 @@ def _host(text: str) -> str:
     return text
 
 
-def _scoped_address(text: str) -> str:
-    """Return an IPv6 address with its scope, the name or number of a network interface: fe80::1%eth0."""
-    _, _, scope = text.partition("%")
-    ipaddress.IPv6Address(text)
-    if not re.fullmatch(r"[!-$&-.0-~]{1,15}", scope):  # what Linux accepts: 15 bytes, without / and spaces
-        raise ValueError
-    return text
+def _check(is_valid: Callable[[Any], bool]) -> AfterValidator:
+    """Return an annotation that refuses values for which ``is_valid`` is false."""
+
+    def check(value: object) -> object:
+        if not is_valid(value):
+            raise ValueError
+        return value
+
+    return AfterValidator(check)
 
 
-def not_empty(values: tuple[_Item, ...]) -> tuple[_Item, ...]:
-    """Return ``values``; raise ValueError if there are none."""
-    # With a minimum length on the type, pydantic would count only the valid items.
-    if not values:
-        raise ValueError
-    return values
+not_empty: Final = _check(bool)
+"""Refuses an empty list. With a minimum length on the type, pydantic would count only the valid items."""
 
-
-def _absolute_path(text: str) -> str:
-    if not text.startswith("/") or not text.isprintable():
-        raise ValueError
-    return text
-
-
-def _zero_or_interval(seconds: float) -> float:
-    if 0 < seconds < 0.1:
-        raise ValueError
-    return seconds
-
+_NUMBER: Final = partial(Field, strict=True, allow_inf_nan=False)
 
 Switch = Annotated[bool, Field(strict=True), expects("true or false")]
-Seconds = Annotated[
-    float,
-    Field(strict=True, ge=0.001, le=86400, allow_inf_nan=False),
-    expects("a number of seconds from 0.001 to 86400"),
-]
+Seconds = Annotated[float, _NUMBER(ge=0.001, le=86400), expects("a number of seconds from 0.001 to 86400")]
 IntervalSeconds = Annotated[
     float,
-    Field(strict=True, ge=0, le=86400, allow_inf_nan=False),
-    AfterValidator(_zero_or_interval),
+    _NUMBER(ge=0, le=86400),
+    _check(lambda seconds: not 0 < seconds < 0.1),
     expects("0 for never, or a number of seconds from 0.1 to 86400"),
 ]
-Milliseconds = Annotated[
-    float,
-    Field(strict=True, ge=1, le=60_000, allow_inf_nan=False),
-    expects("a number of milliseconds from 1 to 60000"),
-]
+Milliseconds = Annotated[float, _NUMBER(ge=1, le=60_000), expects("a number of milliseconds from 1 to 60000")]
 Hertz = Annotated[
-    float,
-    Field(strict=True, gt=0, le=1_000_000, allow_inf_nan=False),
-    expects("a number of frames per second above 0, up to 1000000"),
+    float, _NUMBER(gt=0, le=1_000_000), expects("a number of frames per second above 0, up to 1000000")
 ]
 QueryRate = Annotated[
-    float,
-    Field(strict=True, ge=1, le=1_000_000, allow_inf_nan=False),
-    expects("a number of queries per second from 1 to 1000000"),
+    float, _NUMBER(ge=1, le=1_000_000), expects("a number of queries per second from 1 to 1000000")
 ]
-Speed = Annotated[
-    float,
-    Field(strict=True, ge=1.5, le=1000, allow_inf_nan=False),
-    expects("a number from 1.5 to 1000"),
-]
+Speed = Annotated[float, _NUMBER(ge=1.5, le=1000), expects("a number from 1.5 to 1000")]
 Divisor = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 ByteLimit = Annotated[
     int,
@@ -115,7 +94,9 @@ FileLimit = Annotated[
     int, Field(strict=True, ge=1, le=100_000), expects("a whole number of files from 1 to 100000")
 ]
 AbsoluteDirectory = Annotated[
-    str, AfterValidator(_absolute_path), expects("a folder's absolute path, or null")
+    str,
+    _check(lambda text: text.startswith("/") and text.isprintable()),
+    expects("a folder's absolute path, or null"),
 ]
 Host = Annotated[
     str, AfterValidator(_host), expects("a host name or an IP address; the port has its own key")
@@ -181,27 +162,24 @@ def _components(value: object) -> tuple[ComponentType, ...]:
         )
     if list(value) == ["all"]:
         return WIRE_ORDER
-    components = [_component(item, index) for index, item in enumerate(value)]
-    for index, component in enumerate(components):
-        if component in components[:index]:
+    components: list[ComponentType] = []
+    for index, item in enumerate(value):
+        if item == "all":
+            raise validation_error("found 'all' beside other components; expected [all] alone", index)
+        component = _component(item, index)
+        if component in components:
             raise validation_error(f"found {component.key!r} twice; expected each component once", index)
+        components.append(component)
     return tuple(component for component in WIRE_ORDER if component in components)
 
 
-def _component(item: object, index: int) -> ComponentType:
-    match item:
-        case ComponentType():
-            return item
-        case "all":
-            raise validation_error("found 'all' beside other components; expected [all] alone", index)
-        case str() if item in COMPONENTS_BY_KEY:
-            return COMPONENTS_BY_KEY[item]
+def _component(item: object, *location: int) -> ComponentType:
+    if isinstance(item, ComponentType):
+        return item
+    if isinstance(item, str) and item in COMPONENTS_BY_KEY:
+        return COMPONENTS_BY_KEY[item]
     hint = spelling_hint(item, _COMPONENT_KEYS)
-    raise validation_error(f"found {describe(item)}{hint}; expected {join_or(_COMPONENT_KEYS)}", index)
-
-
-def _component_keys(components: tuple[ComponentType, ...]) -> list[str]:
-    return [component.key for component in components]
+    raise validation_error(f"found {describe(item)}{hint}; expected {join_or(_COMPONENT_KEYS)}", *location)
 
 
 Components = Annotated[
@@ -209,7 +187,7 @@ Components = Annotated[
     PlainValidator(
         _components, json_schema_input_type=list[Literal["3d", "6d", "analog", "force", "event", "all"]]
     ),
-    PlainSerializer(_component_keys),
+    PlainSerializer(lambda components: [component.key for component in components]),
 ]
 """In YAML: [all], or a list of keys. Kept in WIRE_ORDER."""
 
@@ -232,10 +210,7 @@ def _max_rates(value: object) -> dict[ComponentType, float]:
         raise validation_error(f"found {describe(value)}; expected a mapping such as {{3d: 60}}, or {{}}")
     rates = {}
     for key, rate in value.items():
-        if key not in COMPONENTS_BY_KEY and not isinstance(key, ComponentType):
-            hint = spelling_hint(key, _COMPONENT_KEYS)
-            raise validation_error(f"found {describe(key)}{hint}; expected {join_or(_COMPONENT_KEYS)}")
-        component = key if isinstance(key, ComponentType) else COMPONENTS_BY_KEY[key]
+        component = _component(key)
         rates[component] = _RATES.validate_python({component.key: rate})[component.key]
     return rates
 
@@ -249,11 +224,7 @@ MaxRates = Annotated[
 
 _MAX_NORM_ERROR: Final = 0.01  # quaternions are often written with two or three digits
 
-_Number = Annotated[
-    float,
-    Field(strict=True, ge=-1e6, le=1e6, allow_inf_nan=False),
-    expects("a number from -1000000 to 1000000"),
-]
+_Number = Annotated[float, _NUMBER(ge=-1e6, le=1e6), expects("a number from -1000000 to 1000000")]
 
 
 def _has_items(count: int) -> BeforeValidator:
@@ -281,17 +252,12 @@ def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, 
     return (x, y, z, w)
 
 
-_ANGLE: Final = expects("a number of degrees from -360 to 360")
-Degrees = Annotated[float, Field(strict=True, ge=-360, le=360, allow_inf_nan=False), _ANGLE]
+Degrees = Annotated[float, _NUMBER(ge=-360, le=360), expects("a number of degrees from -360 to 360")]
 Unit = Annotated[
     Literal["m", "dm", "cm", "mm", "um", "in", "ft"],
     expects("m, dm, cm, mm, um, in or ft, or null for the server's"),
 ]
-Scale = Annotated[
-    float,
-    Field(strict=True, ge=1e-6, le=1e6, allow_inf_nan=False),
-    expects("a number from 0.000001 to 1000000"),
-]
+Scale = Annotated[float, _NUMBER(ge=1e-6, le=1e6), expects("a number from 0.000001 to 1000000")]
 UpAxis = Annotated[Literal["y", "z"], expects("y or z")]
 QuaternionXyzw = Annotated[
     tuple[_Number, _Number, _Number, _Number],

@@ -120,8 +120,9 @@ def test_commands_have_these_subcommands_and_options(place: str, words: tuple[st
         if arguments[0].startswith("-"):  # an option of the program itself, which would be carried out
             assert arguments[0] in {option for each in command.params for option in each.opts}, place
             return
-        assert arguments[0] in command.commands, f"{place}: no {arguments[0]}"
-        command, *arguments = command.commands[arguments[0]], *arguments[1:]
+        subcommand = command.get_command(typer.Context(command), arguments[0])
+        assert subcommand is not None, f"{place}: no {arguments[0]}"
+        command, arguments = subcommand, arguments[1:]
     command.make_context(PROGRAM, arguments)  # raises UsageError; runs nothing
 
 

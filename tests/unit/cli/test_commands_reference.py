@@ -18,7 +18,9 @@ def commands(command: object = None, name: str = "rtc3d-gateway") -> Iterator[tu
     """Yield every command that is not a group, with its full name."""
     command = typer.main.get_command(app) if command is None else command
     if isinstance(command, typer.core.TyperGroup):
-        for subcommand_name, subcommand in command.commands.items():
+        context = typer.Context(command)
+        for subcommand_name in command.list_commands(context):
+            subcommand = command.get_command(context, subcommand_name)
             yield from commands(subcommand, f"{name} {subcommand_name}")
     else:
         assert isinstance(command, TyperCommand)

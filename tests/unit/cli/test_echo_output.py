@@ -12,13 +12,12 @@ from gateway.cli.echo_output import (
     MAX_KEYS,
     MAX_WAITING,
     MIN_WINDOW,
-    Limits,
     Rate,
     Rates,
     print_messages,
     print_rates,
 )
-from gateway.cli.echo_sources import Silence, Units
+from gateway.cli.echo_sources import EchoSources
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from tests.support.clocks import Clock
 from tests.support.parameters import in_root, spec_xml
@@ -26,8 +25,7 @@ from tests.support.parameters import in_root, spec_xml
 MARKERS_BYTES = len(spec_xml("3d"))
 
 
-REQUEST = SubscriptionRequest()
-UNITS = Units("example", REQUEST)
+SOURCES = EchoSources("example", SubscriptionRequest())
 
 
 class Published:
@@ -36,7 +34,7 @@ class Published:
     def __init__(self, *messages: tuple[str, bytes]) -> None:
         self._messages = messages
 
-    def __call__(self, _request: SubscriptionRequest, receive: Receive) -> "Published":
+    def __call__(self, receive: Receive) -> "Published":
         for name, message in self._messages:
             receive(name, message)
         return self
@@ -48,8 +46,7 @@ class Published:
 def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
     out = io.StringIO()
     published = Published((name, message))
-    silence = Silence("example", REQUEST)
-    assert print_messages(published, REQUEST, Limits(1, 10), silence, UNITS, out, as_json=as_json) == 1
+    assert print_messages(published, SOURCES, out, count=1, seconds=10, as_json=as_json) == 1
     return out.getvalue().removesuffix("\n")
 
 
@@ -132,8 +129,7 @@ def test_messages_that_come_faster_than_they_are_printed_are_counted(
     published = Published(*[("mocap/lab/c3d", b'{"n": 1}')] * (MAX_WAITING + 5))
     out = Interrupted() if is_interrupted else io.StringIO()
     with pytest.raises(KeyboardInterrupt) if is_interrupted else nullcontext():
-        silence = Silence("example", REQUEST)
-        assert print_messages(published, REQUEST, Limits(7, 10), silence, UNITS, out, as_json=False) == 7
+        assert print_messages(published, SOURCES, out, count=7, seconds=10, as_json=False) == 7
         assert out.getvalue().count("\n") == 7
     assert capsys.readouterr().err.startswith("5 messages were not printed, because they came faster than")
 
@@ -200,9 +196,8 @@ def test_the_number_of_keys_is_bounded_and_said(capsys: pytest.CaptureFixture[st
 
 def printed_rates(messages: list[tuple[str, bytes]], *, as_json: bool = False) -> str:
     out = io.StringIO()
-    limits, silence = Limits(len(messages), 10), Silence("example", REQUEST)
-    num_messages = print_rates(Published(*messages), REQUEST, limits, silence, out, as_json=as_json)
-    assert num_messages == len(messages)
+    count = len(messages)
+    assert print_rates(Published(*messages), SOURCES, out, count=count, seconds=10, as_json=as_json) == count
     return out.getvalue()
 
 
@@ -225,6 +220,5 @@ def test_json_has_an_object_for_each_key_and_hostile_keys_are_escaped() -> None:
 def test_a_block_is_printed_every_second_until_the_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(echo_output, "_EACH_S", 0.05)
     out = io.StringIO()
-    silence = Silence("example", REQUEST)
-    assert print_rates(Published(("a", b"")), REQUEST, Limits(None, 0.5), silence, out, as_json=False) == 1
+    assert print_rates(Published(("a", b"")), SOURCES, out, count=None, seconds=0.5, as_json=False) == 1
     assert out.getvalue().count("a\t") >= 2

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import pytest
 import rtc3d
 
-from gateway.cli import echo_sources as silence_module
-from gateway.cli.echo_sources import Silence
+from gateway.cli import echo_sources
+from gateway.cli.echo_sources import EchoSources
 from gateway.client.client import GatewayClient
 from gateway.client.found_sources import FoundSources
 from gateway.errors import OutputError, QueryError
@@ -28,8 +28,8 @@ def found_of(*components: str) -> FoundSources:
 
 @pytest.fixture(autouse=True)
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(silence_module, "LOOK_S", 0.0)
-    monkeypatch.setattr(silence_module, "SAY_S", 0.0)
+    monkeypatch.setattr(echo_sources, "LOOK_S", 0.0)
+    monkeypatch.setattr(echo_sources, "SAY_S", 0.0)
 
 
 Said = Callable[..., str]
@@ -47,17 +47,17 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
             return found
 
         monkeypatch.setattr(GatewayClient, "sources", find)
-        silence = Silence("zenoh", SubscriptionRequest(component=component))
+        sources = EchoSources("zenoh", SubscriptionRequest(component=component))
         texts: list[str] = []
 
         def is_said() -> bool:
-            silence.check()
+            sources.check_silence()
             texts.append(capsys.readouterr().err)
             return any(texts)
 
         wait_until(is_said)
         for _ in range(100):
-            silence.check()
+            sources.check_silence()
         return "".join(texts) + capsys.readouterr().err
 
     return say
@@ -91,7 +91,7 @@ def test_a_search_that_fails_ends_nothing(said: Said, problem: Exception) -> Non
 
 
 def test_outputs_that_cannot_be_searched_stay_silent(capsys: pytest.CaptureFixture[str]) -> None:
-    silence = Silence("example", SubscriptionRequest())
+    sources = EchoSources("example", SubscriptionRequest())
     for _ in range(10):
-        silence.check()
+        sources.check_silence()
     assert capsys.readouterr().err == ""

@@ -1,7 +1,6 @@
 """What ``list`` prints about the sources that were found, and what it makes of hostile statuses."""
 
 import io
-import json
 import math
 from typing import Any
 
@@ -10,7 +9,7 @@ import rtc3d
 from rich.cells import cell_len
 from rich.console import Console
 
-from gateway.cli.list_gateways import notes, sources_json, write_sources
+from gateway.cli.list_gateways import found_json, notes, write_sources
 from gateway.client.found_sources import MAX_SOURCES, MAX_STATUS_BYTES, FoundSources
 from gateway.messages.decode import decode
 from tests.unit.messages.samples import status_of
@@ -99,7 +98,7 @@ def test_json_has_the_fields_of_the_reference() -> None:
     stream |= {"rate_hz": 200.0, "tries": 0}
     silent = {"source": "hall", "gateway": None, "problem": "its gateway does not answer", "server": None}
     lab = {"source": "lab", "gateway": None, "problem": "", "server": "192.0.2.20:3020", "host": "mocap-pc"}
-    assert json.loads(sources_json(found)) == {
+    assert found_json(found) == {
         "sources": [
             silent | {"host": None, "version": None, "streams": []},
             lab | {"version": "1.2.3", "streams": [stream]},
@@ -148,7 +147,7 @@ def test_hostile_texts_do_not_reach_the_terminal() -> None:
     line = printed(found, is_terminal=False)
     assert not {"\x1b", "\r"} & set(line + printed(found))
     assert (line.count("\n"), line.count("\t")) == (1, len(COLUMNS) - 1)
-    assert json.loads(sources_json(found))["sources"][0]["streams"][0]["rate_hz"] is None
+    assert found_json(found)["sources"][0]["streams"][0]["rate_hz"] is None
 
 
 def test_thousands_of_sources_are_bounded_and_said() -> None:

@@ -14,8 +14,7 @@ from gateway.cli.config import configuration_from_options
 from gateway.cli.main import app
 from gateway.cli.options import QueryOptions
 from gateway.client import GatewayAddress
-from gateway.config.loading import Configuration
-from gateway.config.show import schema_text
+from gateway.config.loading import Configuration, schema_text
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.support.commands import run_in_process

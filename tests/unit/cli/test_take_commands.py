@@ -10,7 +10,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from gateway.cli.main import app
-from gateway.cli.take_list import ListedTake, size_text, write_list
+from gateway.cli.take_report import ListedTake, size_text, write_list
 from gateway.errors import TakeError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from tests.support.takes import description, markers, parameters, write_take

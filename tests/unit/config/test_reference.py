@@ -12,6 +12,7 @@ from hypothesis import settings as hypothesis_settings
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
+from gateway.config.loading import schema_text
 from gateway.config.section import Section
 from gateway.config.settings import (
     MetricsSettings,
@@ -21,7 +22,6 @@ from gateway.config.settings import (
     SpoolSettings,
     StreamSettings,
 )
-from gateway.config.show import schema_text
 from gateway.config.values import RollPitchYaw, TransformSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings

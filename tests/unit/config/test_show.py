@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gateway.config.show import shown_configuration
+from gateway.config.loading import shown_configuration
 from tests.support.configurations import load, read
 
 FILE = """\

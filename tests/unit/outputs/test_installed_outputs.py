@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from gateway.config import loading
+from gateway.config.loading import schema_text, shown_configuration
 from gateway.config.settings import Settings
-from gateway.config.show import schema_text, shown_configuration
 from gateway.doctor.all_checks import run_checks
 from gateway.errors import ConfigError
 from gateway.outputs.findings import Result
