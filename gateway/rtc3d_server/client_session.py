@@ -133,13 +133,17 @@ class ClientSession:
                 except CommandError as error:
                     return [error_packet(str(error))]
             case PacketType.DATA:
-                return self._switch_recording(packet.body)
+                try:
+                    start = recording_switch(packet.body, self.byte_order)
+                except FrameError as error:
+                    return [error_packet(f"Not a data frame: {error}")]
+                if start is not None:
+                    self._set_recording(start=start)
+                    return []
+                text = "The only data frame accepted is a recording control: one event, 1 to start, 0 to stop"
             case _:
-                return [
-                    error_packet(
-                        f"Packets of type {packet.type} are not accepted; commands have type 1 (string)"
-                    )
-                ]
+                text = f"Packets of type {packet.type} are not accepted; commands have type 1 (string)"
+        return [error_packet(text)]
 
     def due_frames(self, elapsed_us: int) -> Iterator[DataPacket]:
         """Yield the frames that are due, oldest first. Frames that the caller does not take stay due."""
@@ -173,9 +177,8 @@ class ClientSession:
         acknowledgement = encode_packet(PacketType.COMMAND, f"OK-{decode_text(body)}".encode("latin-1"))
         match command:
             case Version(number) if number != VERSION:
-                return [
-                    error_packet(f"Version {number} is not supported; this server speaks version {VERSION}")
-                ]
+                text = f"Version {number} is not supported; this server speaks version {VERSION}"
+                return [error_packet(text)]
             case SetByteOrder(byte_order):
                 self.byte_order = byte_order
             case SendParameters(sections):
@@ -205,9 +208,8 @@ class ClientSession:
         if isinstance(command, StreamFrames):
             self._start_stream(command, elapsed_us)
         else:
-            self._frame_requests.append(
-                FrameRequest(self._callbacks.frames(command.components), self._newest_us)
-            )
+            frames = self._callbacks.frames(command.components)
+            self._frame_requests.append(FrameRequest(frames, self._newest_us))
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
         return []
@@ -240,20 +242,6 @@ class ClientSession:
         self._callbacks.record_for(recording_duration_s(options))
         self.is_recording = start
         _log.info("%s: recording %s", self.name, "started" if start else "stopped")
-
-    def _switch_recording(self, body: bytes) -> list[bytes]:
-        try:
-            start = recording_switch(body, self.byte_order)
-        except FrameError as error:
-            return [error_packet(f"Not a data frame: {error}")]
-        if start is not None:
-            self._set_recording(start=start)
-            return []
-        return [
-            error_packet(
-                "The only data frame accepted is a recording control: one event, 1 to start, 0 to stop"
-            )
-        ]
 
 
 # Which frames a client gets, and when (§5.3.4, §5.3.5) --------------------------------------
@@ -292,7 +280,12 @@ class FrameSchedule:
 
     def _set_stride(self, first: Fraction) -> None:
         """Count the frames of this stream from the one at ``first`` on."""
-        stride = _stride(self._rate, self._base_rate)
+        stride = Fraction(1)  # ticks from one frame to the next, at least 1 (§5.3.5)
+        match self._rate:
+            case FrequencyDivisor(divisor):
+                stride = Fraction(divisor)
+            case Frequency(hz):
+                stride = max(stride, self._base_rate / Fraction(hz).limit_denominator(1_000_000))
         # As integers with one denominator, because this is computed for every frame of every client.
         self._denominator = first.denominator * stride.denominator
         self._first = first.numerator * stride.denominator
@@ -306,35 +299,20 @@ class FrameSchedule:
 
     def advance(self, count: int = 1) -> None:
         """Advance by ``count`` frames, which were sent or dropped."""
-        if isinstance(self._rate, Frequency) and self._has_other_rate():
-            position = Fraction(self._first + self._num_passed * self._stride, self._denominator)
-            self._set_stride(position.limit_denominator(1000))
+        if isinstance(self._rate, Frequency):
+            rate = self.frames.rate
+            if not (self._base_rate < rate * _SAME_RATE and rate < self._base_rate * _SAME_RATE):
+                self._base_rate = rate
+                position = Fraction(self._first + self._num_passed * self._stride, self._denominator)
+                self._set_stride(position.limit_denominator(1000))
         self._num_passed += count
         self.tick = -(-(self._first + self._num_passed * self._stride) // self._denominator)
-
-    def _has_other_rate(self) -> bool:
-        rate = self.frames.rate
-        if self._base_rate < rate * _SAME_RATE and rate < self._base_rate * _SAME_RATE:
-            return False
-        self._base_rate = rate
-        return True
 
     def num_due(self, elapsed_us: int) -> int:
         """Return how many frames are due at ``elapsed_us``."""
         last_tick = self.frames.tick_after(elapsed_us) - 1
         num_begun = (last_tick * self._denominator - self._first) // self._stride + 1
         return max(0, num_begun - self._num_passed)
-
-
-def _stride(rate: Rate | None, base_rate: Fraction) -> Fraction:
-    """Return the number of ticks of ``base_rate`` from one frame to the next, at least 1 (§5.3.5)."""
-    match rate:
-        case FrequencyDivisor(divisor):
-            return Fraction(divisor)
-        case Frequency(hz):
-            return max(Fraction(1), base_rate / Fraction(hz).limit_denominator(1_000_000))
-        case _:
-            return Fraction(1)
 
 
 def recording_switch(body: bytes, byte_order: ByteOrder) -> bool | None:

@@ -1,13 +1,13 @@
 """The contract between a scene and the RT server that serves it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, Items
+from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 
 SampleNumbers = npt.NDArray[np.int64]
@@ -101,35 +101,4 @@ class Scene(Protocol):
         ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16 as in §7.7 (field
         note 6).
         """
-        ...
-
-
-class SceneFunction(Protocol):
-    """A scene that is a function of time alone.
-
-    Its methods never block, and always return the same values for the same arguments, so that all clients
-    see the same scene even if their streams differ.
-    """
-
-    parameters: Parameters
-    """All sections of §6 except General."""
-
-    rates_hz: Mapping[ComponentType, float]
-    """The rate in Hz of each measured component of the scene; components without items are missing."""
-
-    measurement_rate_hz: float
-    """The rate of frames in a measurement, and of streams that have only events."""
-
-    num_frames: int | None
-    """The number of frames in one pass, at ``measurement_rate_hz``; None if the scene has no end."""
-
-    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """Return a measured component's items, shape (len(samples), number of items).
-
-        The dtype is that of ITEM_DTYPES. The first sample of a pass follows the last one.
-        """
-        ...
-
-    def events(self, start_us: int, stop_us: int) -> Items:
-        """Return the events (LONG_EVENT) with time stamps in [start_us, stop_us), in order."""
         ...

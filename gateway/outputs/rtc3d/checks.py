@@ -19,7 +19,8 @@ def check_rtc3d(
     settings: Rtc3dSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], seconds: float
 ) -> list[Finding]:
     """Check that each port belongs to a source, and is free or has the gateway's own RT server."""
-    return [_check_sources(settings, sources), *_check_ports(settings, seconds)]
+    ports = [_check_port(settings.host, source, port, seconds) for source, port in settings.ports.items()]
+    return [_check_sources(settings, sources), *(ports or [_PORTS.not_tested("rtc3d.ports is empty")])]
 
 
 def _check_sources(settings: Rtc3dSettings, sources: Sequence[str]) -> Finding:
@@ -36,12 +37,6 @@ def _check_sources(settings: Rtc3dSettings, sources: Sequence[str]) -> Finding:
             "If they should, add a port in rtc3d.ports.",
         )
     return _SOURCES.passing("each source has a port for RTC3D clients")
-
-
-def _check_ports(settings: Rtc3dSettings, seconds: float) -> list[Finding]:
-    return [_check_port(settings.host, source, port, seconds) for source, port in settings.ports.items()] or [
-        _PORTS.not_tested("rtc3d.ports is empty")
-    ]
 
 
 def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:

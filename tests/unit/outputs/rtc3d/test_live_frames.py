@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
-from gateway.outputs.rtc3d.live_scene import LiveScene
+from gateway.outputs.rtc3d.live_server import LiveScene
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
