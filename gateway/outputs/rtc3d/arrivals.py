@@ -289,41 +289,26 @@ def encode_joined(
 
     If two frames have the same component, the first frame counts.
     """
-    found: dict[ComponentType, tuple[Frame, list[int]]] = {}
+    found: dict[ComponentType, list[bytes]] = {}
     for arrival in arrivals:
-        frame = arrival.frame
-        indices: dict[ComponentType, list[int]] = {}
+        frame, missing = arrival.frame, (chosen & arrival.composition.measured) - found.keys()
         for index, component in enumerate(frame.layout.components):
-            if component.type in chosen and component.type in arrival.composition.measured:
-                indices.setdefault(component.type, []).append(index)
-        for component_type, its_indices in indices.items():
-            found.setdefault(component_type, (frame, its_indices))
-    parts = [
-        _component_bytes(frame, index, byte_order)
-        for component_type in WIRE_ORDER
-        if component_type in found
-        for frame, indices_of_type in [found[component_type]]
-        for index in indices_of_type
-    ]
+            if component.type not in missing:
+                continue
+            if frame.layout.byte_order == byte_order:
+                start, end = frame.layout.content_spans[index]
+                data = frame.body[start - _HEADER_BYTES : end]
+            else:
+                data = _encoded(frame.component(index), byte_order)
+            found.setdefault(component.type, []).append(data)
+    parts = [part for component_type in WIRE_ORDER for part in found.get(component_type, ())]
     return encode_frame([*parts, *events], byte_order)
-
-
-def _component_bytes(frame: Frame, index: int, byte_order: ByteOrder) -> bytes:
-    if frame.layout.byte_order == byte_order:
-        start, end = frame.layout.content_spans[index]
-        return frame.body[start - _HEADER_BYTES : end]
-    return _encoded(frame.component(index), byte_order)
 
 
 def _encoded(component: Component, byte_order: ByteOrder) -> bytes:
     return encode_component(
         component.type, component.frame_number, component.timestamp_us, component.items(), byte_order
     )
-
-
-def _in_order(component: Component, byte_order: ByteOrder) -> Items:
-    items = component.items()
-    return items.astype(items.dtype.newbyteorder(byte_order), copy=False)
 
 
 def encode_events(events: Sequence[Events], main: Arrival, byte_order: ByteOrder) -> list[bytes]:
@@ -335,17 +320,13 @@ def encode_events(events: Sequence[Events], main: Arrival, byte_order: ByteOrder
     components = [component for each in events for component in each.components]
     if all(each.time_us == main.time_us for each in events):
         return [_encoded(component, byte_order) for component in components]
-    by_size: dict[int, list[Component]] = {}
+    by_size: dict[int, list[Items]] = {}
     for component in components:
-        by_size.setdefault(component.item_bytes, []).append(component)
-    frame_number, timestamp_us = main.frame.number_and_timestamp
+        items = component.items()
+        items = items.astype(items.dtype.newbyteorder(byte_order), copy=False)
+        by_size.setdefault(component.item_bytes, []).append(items)
+    number_and_timestamp = main.frame.number_and_timestamp
     return [
-        encode_component(
-            ComponentType.EVENT,
-            frame_number,
-            timestamp_us,
-            np.concatenate([_in_order(component, byte_order) for component in same_size]),
-            byte_order,
-        )
+        encode_component(ComponentType.EVENT, *number_and_timestamp, np.concatenate(same_size), byte_order)
         for same_size in by_size.values()
     ]

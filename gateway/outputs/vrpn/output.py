@@ -23,19 +23,20 @@ from gateway.rtc3d.frames import Frame, FrameLayout
 MAX_TOOLS: Final = 256
 """How many tools of a source can be trackers, and how many poses of a frame are sent, at most."""
 
-Offer = Callable[[Callable[[], None], int], bool]
-"""LoopThread.offer of the server's thread."""
-
 _NO_PARAMETERS: Final = ServerParameters(b"", 0, 0)
 
 
 class VrpnPublisher:
     """Takes whole frames of one source and sends the poses of its tools.
 
+    ``offer`` is LoopThread.offer of the server's thread.
+
     Methods without an underscore are for the gateway's event loop, the others run in the server's thread.
     """
 
-    def __init__(self, source: str, server: VrpnServer, offer: Offer) -> None:
+    def __init__(
+        self, source: str, server: VrpnServer, offer: Callable[[Callable[[], None], int], bool]
+    ) -> None:
         self.losses: Losses | None = None
         """Counts the poses that are lost."""
         self._source = source
@@ -204,5 +205,4 @@ class VrpnOutput(ServerOutput):
 
     def health(self) -> OutputHealth:
         """Return whether clients can connect."""
-        problem = self._server.problem
-        return OutputHealth(not problem, problem)
+        return OutputHealth(not self._server.problem, self._server.problem)

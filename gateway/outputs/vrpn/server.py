@@ -16,7 +16,13 @@ from gateway.logs.failures import DefectLog, EventLog
 from gateway.messages.host_time import now_utime
 from gateway.outputs.frame_output import PortOpener
 from gateway.outputs.vrpn.callbacks import CallbackRequests
-from gateway.outputs.vrpn.protocol import COOKIE, TYPE_DESCRIPTIONS, ClientReader, encode_pong
+from gateway.outputs.vrpn.protocol import (
+    COOKIE,
+    TYPE_DESCRIPTIONS,
+    ClientReader,
+    describe_tracker,
+    encode_pong,
+)
 from gateway.outputs.vrpn.trackers import TrackerNames, Trackers
 from gateway.server_limits import Clients, ServerLimits, notice_vanished
 from gateway.token_bucket import TokenBucket
@@ -64,7 +70,7 @@ class VrpnServer:
             f"it does not listen on {host}, port {port} yet; if this lasts, check vrpn.host and the name "
             "server (DNS)",
         )
-        self._events = EventLog(logger, "vrpn")
+        self.events = EventLog(logger, "vrpn")
         self._defects = DefectLog(logger, "vrpn")
 
     @property
@@ -102,25 +108,23 @@ class VrpnServer:
             finally:
                 requests.close()
 
-    async def _bind_both(self) -> tuple[socket.socket, socket.socket]:
+    async def _bind_both(self) -> list[socket.socket]:
         """Return the sockets for TCP and UDP. Raises PortError."""
-        tcp = await self._bind(socket.SOCK_STREAM, "TCP")
-        try:
-            return tcp, await self._bind(socket.SOCK_DGRAM, "UDP")
-        except BaseException:
-            tcp.close()
-            raise
-
-    async def _bind(self, kind: socket.SocketKind, protocol: str) -> socket.socket:
-        try:
-            loop = asyncio.get_running_loop()
-            return bind(await loop.getaddrinfo(self._host, self._port, type=kind), kind)
-        except OSError as error:
-            raise PortError(
-                f"cannot listen on {self._host}, {protocol} port {self._port}: {error.strerror or error}; "
-                "stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
-                "computer and a free port"
-            ) from error
+        loop = asyncio.get_running_loop()
+        with contextlib.ExitStack() as opened:
+            sockets = []
+            for kind, protocol in ((socket.SOCK_STREAM, "TCP"), (socket.SOCK_DGRAM, "UDP")):
+                try:
+                    addresses = await loop.getaddrinfo(self._host, self._port, type=kind)
+                    sockets.append(opened.enter_context(bind(addresses, kind)))
+                except OSError as error:
+                    raise PortError(
+                        f"cannot listen on {self._host}, {protocol} port {self._port}: "
+                        f"{error.strerror or error}; stop the program that uses the port, or set vrpn.host "
+                        "and vrpn.port to an address of this computer and a free port"
+                    ) from error
+            opened.pop_all()
+            return sockets
 
     async def _accept(self, tcp: socket.socket) -> None:
         """Accept one client. Those that come too fast wait in the kernel, or are refused there."""
@@ -133,7 +137,7 @@ class VrpnServer:
         except OSError as error:
             # The client has gone, or the process has too many open files.
             text = f"a client could not be accepted: {error.strerror or error}"
-            self._events.log(logging.WARNING, text, "not accepted")
+            self.events.log(logging.WARNING, text, "not accepted")
             await asyncio.sleep(_ACCEPT_PAUSE_S)
         except Exception as defect:  # noqa: BLE001 - the next client is accepted nevertheless
             self._defects.log(defect)
@@ -153,7 +157,7 @@ class VrpnServer:
             f"{host} asked by UDP to be connected to on TCP port {port}, which does not work ({reason}); "
             "allow this in its firewall, or let the client use the address tcp://HOST:PORT"
         )
-        self._events.log(logging.INFO, text, "not called")
+        self.events.log(logging.INFO, text, "not called")
 
     async def close(self) -> None:
         """Stop listening and disconnect all clients."""
@@ -170,33 +174,23 @@ class VrpnServer:
 
     # For clients ----------------------------------------------------------------------------
 
-    def client_opened(self, client: "Client") -> bool:
-        """Add a new connection. Return False if there are too many: it is closed."""
-        if self._is_refused(client):
-            return False
-        self.clients.open(client)
-        return True
+    def has_room_for(self, client: "Client") -> bool:
+        """Return whether one more client can be served; if not, it is disconnected."""
+        if self.clients.is_full:
+            text = f"{client.name} is refused: {self.clients.limits.clients} clients are connected"
+            self.events.log(logging.WARNING, text, "refused")
+            client.abort()
+        return not self.clients.is_full
 
     def client_ready(self, client: "Client") -> None:
-        """Take note that a client speaks VRPN."""
-        if self._is_refused(client):
-            client.abort()
+        """Serve a client that has shown that it speaks VRPN."""
+        if not self.has_room_for(client):
             return
         self.clients.serve(client)
         num_clients = len(self.clients.served)
         if num_clients == 1:
             self._on_wanted_changed()
-        self._events.log(logging.INFO, f"{client.name} is connected; clients now: {num_clients}", "connected")
-
-    def _is_refused(self, client: "Client") -> bool:
-        if self.clients.is_full:
-            text = f"{client.name} is refused: {self.clients.limits.clients} clients are connected"
-            self._events.log(logging.WARNING, text, "refused")
-        return self.clients.is_full
-
-    def client_failed(self, client: "Client", text: str) -> None:
-        """Take note that a client is disconnected because of what ``text`` says."""
-        self._events.log(logging.INFO, f"{client.name} is disconnected: {text}", "failed")
+        self.events.log(logging.INFO, f"{client.name} is connected; clients now: {num_clients}", "connected")
 
     def client_closed(self, client: "Client") -> None:
         """Remove a connection that has ended."""
@@ -207,7 +201,7 @@ class VrpnServer:
             if not num_clients:
                 self._on_wanted_changed()
             text = f"{client.name} has disconnected; clients now: {num_clients}"
-            self._events.log(logging.INFO, text, "closed")
+            self.events.log(logging.INFO, text, "closed")
 
 
 def bind(addresses: Sequence[tuple[Any, ...]], kind: socket.SocketKind) -> socket.socket:
@@ -260,9 +254,9 @@ class Client(asyncio.BufferedProtocol):
         address = transport.get_extra_info("peername")
         if address:  # None if the connection has ended already
             self.name = f"{address[0]}:{address[1]}"
-        if not self._owner.client_opened(self):
-            self._transport.abort()
+        if not self._owner.has_room_for(self):
             return
+        self._owner.clients.open(self)
         limits = self._owner.clients.limits
         notice_vanished(cast(socket.socket, transport.get_extra_info("socket")), limits)
         self._transport.set_write_buffer_limits(high=limits.unread_bytes_each)
@@ -288,7 +282,7 @@ class Client(asyncio.BufferedProtocol):
         return self._received
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Answer pings (asyncio.BufferedProtocol)."""
+        """Answer pings of trackers that there are (asyncio.BufferedProtocol)."""
         if self._transport.is_closing():
             return
         try:
@@ -297,39 +291,30 @@ class Client(asyncio.BufferedProtocol):
             self._fail(str(error))
             return
         if self._reader.has_cookie and not self.is_ready:
-            self._become_ready()
-        self._answer(pinged)
-        self._budget.take(nbytes)
-        self._owner.read_budget.take(nbytes)
-        if not self._may_read():
-            self._transport.pause_reading()
-            self._loop.call_later(_READ_PAUSE_S, self._resume_reading)
-
-    def _become_ready(self) -> None:
-        self.is_ready = True
-        self._clear_timeout()
-        self._transport.write(TYPE_DESCRIPTIONS)
-        self.describe_trackers()
-        self._owner.client_ready(self)
-
-    def _answer(self, pinged: list[str]) -> None:
-        """Answer pings of trackers that there are. A client repeats a ping until it is answered."""
+            self.is_ready = True
+            self._clear_timeout()
+            self._transport.write(TYPE_DESCRIPTIONS)
+            self.describe_trackers()
+            self._owner.client_ready(self)
+        # A client repeats a ping until it is answered.
         trackers = filter(None, map(self._owner.trackers.named, pinged))
         pongs = b"".join(encode_pong(tracker.number, now_utime()) for tracker in trackers)
         if pongs and not self._is_full:
             self.describe_trackers()
             self._transport.write(pongs)
+        self._budget.take(nbytes)
+        self._owner.read_budget.take(nbytes)
+        self._read_or_wait()
 
-    def _may_read(self) -> bool:
-        return self._budget.left > 0 and self._owner.read_budget.left > 0
-
-    def _resume_reading(self) -> None:
+    def _read_or_wait(self) -> None:
+        """Read on if the budgets allow it, or wait until they do."""
         if self._transport.is_closing():
             return
-        if self._may_read():
+        if self._budget.left > 0 and self._owner.read_budget.left > 0:
             self._transport.resume_reading()
         else:
-            self._loop.call_later(_READ_PAUSE_S, self._resume_reading)
+            self._transport.pause_reading()
+            self._loop.call_later(_READ_PAUSE_S, self._read_or_wait)
 
     # Writing --------------------------------------------------------------------------------
 
@@ -341,7 +326,7 @@ class Client(asyncio.BufferedProtocol):
         self._version = trackers.version
         new = [tracker for tracker in trackers.current if self._described.get(tracker.number) != tracker.name]
         self._described.update((tracker.number, tracker.name) for tracker in new)
-        self._transport.write(b"".join(tracker.description for tracker in new))
+        self._transport.write(b"".join(describe_tracker(*tracker) for tracker in new))
 
     def send(self, poses: bytes) -> bool:
         """Send messages with poses; return False if the client does not read. It must be ready."""
@@ -375,5 +360,5 @@ class Client(asyncio.BufferedProtocol):
             self._timeout = None
 
     def _fail(self, text: str) -> None:
-        self._owner.client_failed(self, text)
+        self._owner.events.log(logging.INFO, f"{self.name} is disconnected: {text}", "failed")
         self._transport.abort()

@@ -4,10 +4,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
-from gateway.outputs.vrpn.protocol import (
-    MAX_NAME_BYTES,
-    describe_tracker,
-)
+from gateway.outputs.vrpn.protocol import MAX_NAME_BYTES
 
 TrackerNames = Literal["auto", "tool", "source/tool"]
 """How trackers are named: by tool, by source and tool, or (auto) by tool if there is only one source."""
@@ -26,11 +23,6 @@ class Tracker(NamedTuple):
 
     number: int
     name: str
-
-    @property
-    def description(self) -> bytes:
-        """The message that describes it."""
-        return describe_tracker(self.number, self.name)
 
 
 class _Key(NamedTuple):
@@ -94,7 +86,10 @@ class Trackers:
         for key in in_use & self._by_key.keys():
             self._by_key[key] = self._by_key.pop(key)
         new_keys = [key for of_source in keys.values() for key in of_source if key not in self._by_key]
-        self._make_room(len(new_keys), in_use)
+        # Forget as many former tools as necessary, those first that have been away for the longest time.
+        former = [key for key in self._by_key if key not in in_use]
+        for key in former[: max(0, len(self._by_key) + len(new_keys) - MAX_TRACKERS)]:
+            del self._by_key[key]
         self._add(new_keys[: MAX_TRACKERS - len(self._by_key)])
         self._of_source = {
             source: {key.tool: self._by_key.get(key) for key in of_source}
@@ -107,12 +102,6 @@ class Trackers:
             if tracker is not None
         }
         self.version += 1
-
-    def _make_room(self, num_trackers: int, in_use: set[_Key]) -> None:
-        """Forget as many former tools as necessary, those first that have been away for the longest time."""
-        former = [key for key in self._by_key if key not in in_use]
-        for key in former[: max(0, len(self._by_key) + num_trackers - MAX_TRACKERS)]:
-            del self._by_key[key]
 
     def _add(self, keys: Sequence[_Key]) -> None:
         names = {tracker.name for tracker in self._by_key.values()}
