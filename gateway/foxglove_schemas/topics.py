@@ -124,17 +124,8 @@ class FloatTopics:
         return found
 
 
-class FloatRecord(Protocol):
-    """The messages of a topic that have a field of 32 bits for each name, at most MAX_FIELDS."""
-
-    topic: Topic
-
-    def encode(self, values: Items) -> bytes:
-        """Return the message with these values, one per field, in the order of the names."""
-
-
 class CdrRecord:
-    """A FloatRecord in CDR, little-endian, described as a message of ROS 2."""
+    """The messages of a topic with a field of 32 bits for each name, in CDR, as a message of ROS 2."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         names = fitting_labels(names, _ros_field, _MAX_NAME_BYTES, "number")
@@ -142,13 +133,13 @@ class CdrRecord:
         self.topic = Topic(topic_name, "cdr", schema_name, "ros2msg", schema)
 
     def encode(self, values: Items) -> bytes:
-        """See FloatRecord."""
+        """Return the message with these values, one per field, in the order of the names."""
         data: bytes = values.astype("<f4").tobytes()
         return _CDR_LITTLE_ENDIAN + data
 
 
 class ProtobufRecord:
-    """A FloatRecord in protobuf."""
+    """The messages of a topic with a field of 32 bits for each name, at most MAX_FIELDS, in protobuf."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         self.topic = Topic(topic_name, "protobuf", schema_name, "protobuf", _schema(schema_name, names))
@@ -162,10 +153,13 @@ class ProtobufRecord:
         self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
 
     def encode(self, values: Items) -> bytes:
-        """See FloatRecord."""
+        """See CdrRecord."""
         data = self._template.copy()
         data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)
         return data.tobytes()
+
+
+FloatRecord = CdrRecord | ProtobufRecord
 
 
 def field_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:

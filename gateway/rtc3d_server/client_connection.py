@@ -12,7 +12,7 @@ import gateway
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketReader, PacketType
 from gateway.rtc3d.parameters import General
-from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
+from gateway.rtc3d_server.client_session import ClientSession, error_packet
 from gateway.rtc3d_server.measurement import Measurement
 from gateway.rtc3d_server.scene import FrameSource
 from gateway.server_limits import ServerLimits
@@ -106,7 +106,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self.frames_sent = 0
         """How many frames were sent to this client."""
         self.session = ClientSession(
-            SessionCallbacks(owner.frames, self._parameters_xml, owner.frames_requested, self._record_for)
+            owner.frames, self._parameters_xml, owner.frames_requested, self._record_for
         )
 
     @property
@@ -285,7 +285,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._close_if_ended()
 
     def _record_for(self, duration_s: float | None) -> None:
-        """See SessionCallbacks."""
+        """See ClientSession."""
         if self._recording_end is not None:
             self._recording_end.cancel()
             self._recording_end = None

@@ -38,34 +38,32 @@ MAX_FRAME_REQUESTS: Final = 1000
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class SessionCallbacks:
-    """What a session needs from its server."""
-
-    frames: Callable[[Sequence[ComponentType]], FrameSource]
-    """Returns the frames with these components; an empty sequence means all."""
-
-    parameters_xml: Callable[[Sequence[str]], bytes]
-    """Returns the XML of some sections of §6 (keys of SECTIONS); an empty sequence means all."""
-
-    frames_requested: Callable[[], int | None]
-    """Called when the client requests frames; returns the measurement's time in µs, None without one."""
-
-    record_for: Callable[[float | None], None] = lambda _duration_s: None
-    """Called when the client starts or stops a recording, with the time in s after which the caller has to
-    call ``end_recording``; None if only the client stops it."""
-
-
 class ClientSession:
     """The protocol with one client, independent of the transport.
 
     All times are in µs since the measurement's start; the caller has the clock. It calls
     ``measurement_started``, ``measurement_stopped`` and ``scene_changed``, sends the packets that ``answer``
     returns, and at ``due_us`` those that ``due_frames`` yields.
+
+    - ``frames`` returns the frames with these components; an empty sequence means all.
+    - ``parameters_xml`` returns the XML of some sections of §6 (keys of SECTIONS), or of all if it is empty.
+    - ``frames_requested`` is called when the client requests frames. It returns the measurement's time in µs,
+      None without one.
+    - ``record_for`` is called when the client starts or stops a recording, with the time in s after which the
+      caller has to call ``end_recording``; None if only the client stops it.
     """
 
-    def __init__(self, callbacks: SessionCallbacks) -> None:
-        self._callbacks = callbacks
+    def __init__(
+        self,
+        frames: Callable[[Sequence[ComponentType]], FrameSource],
+        parameters_xml: Callable[[Sequence[str]], bytes],
+        frames_requested: Callable[[], int | None],
+        record_for: Callable[[float | None], None] = lambda _duration_s: None,
+    ) -> None:
+        self._frames = frames
+        self._parameters_xml = parameters_xml
+        self._frames_requested = frames_requested
+        self._record_for = record_for
         self.name = "client"
         """The client's name in log messages."""
         self._stream_command: StreamFrames | None = None  # the newest one, until StreamFrames Stop
@@ -182,7 +180,7 @@ class ClientSession:
             case SetByteOrder(byte_order):
                 self.byte_order = byte_order
             case SendParameters(sections):
-                return [encode_packet(PacketType.XML, self._callbacks.parameters_xml(sections))]
+                return [encode_packet(PacketType.XML, self._parameters_xml(sections))]
             case SendCurrentFrame() if len(self._frame_requests) >= MAX_FRAME_REQUESTS:
                 return [error_packet(f"{MAX_FRAME_REQUESTS} requests for the current frame wait already")]
             case SendCurrentFrame() | StreamFrames():
@@ -200,7 +198,7 @@ class ClientSession:
 
     def _request_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:
         """Store a request for frames; return a No Data packet if no measurement is running."""
-        elapsed_us = self._callbacks.frames_requested()
+        elapsed_us = self._frames_requested()
         if isinstance(command, StreamFrames):
             self._stream_command = command
         if elapsed_us is None:
@@ -208,14 +206,14 @@ class ClientSession:
         if isinstance(command, StreamFrames):
             self._start_stream(command, elapsed_us)
         else:
-            frames = self._callbacks.frames(command.components)
+            frames = self._frames(command.components)
             self._frame_requests.append(FrameRequest(frames, self._newest_us))
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
         return []
 
     def _start_stream(self, command: StreamFrames, elapsed_us: int) -> None:
-        frames = self._callbacks.frames(command.components)
+        frames = self._frames(command.components)
         # A frame that is due right now is sent, unless the client already has it. A request during a stream
         # continues that stream, so frames that are overdue are sent, too.
         start_us = elapsed_us if self._schedule is None else min(elapsed_us, self._schedule.due_us)
@@ -239,7 +237,7 @@ class ClientSession:
 
     def _set_recording(self, *, start: bool, options: str = "") -> None:
         """Start or stop a recording. Raises CommandError if the duration in ``options`` is none."""
-        self._callbacks.record_for(recording_duration_s(options))
+        self._record_for(recording_duration_s(options))
         self.is_recording = start
         _log.info("%s: recording %s", self.name, "started" if start else "stopped")
 

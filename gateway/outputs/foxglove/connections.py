@@ -32,8 +32,9 @@ _MESSAGE_DATA: Final = struct.Struct("<BIQ")
 
 _MESSAGE_DATA_OPCODE: Final = 1
 _MAX_ID: Final = (1 << 32) - 1
-_WARNING: Final = 1
-_ERROR: Final = 2
+WARNING: Final = 1
+ERROR: Final = 2
+"""The levels of messages that the viewer shows."""
 
 
 class Subscription(NamedTuple):
@@ -41,13 +42,6 @@ class Subscription(NamedTuple):
 
     number: int
     channel: int
-
-
-class ClientRequest(NamedTuple):
-    """What a client asks for: to begin subscriptions, and to end those with these numbers."""
-
-    subscriptions: tuple[Subscription, ...] = ()
-    ended: tuple[int, ...] = ()
 
 
 def server_info(name: str, session: str) -> str:
@@ -80,14 +74,9 @@ def unadvertise(numbers: list[int]) -> str:
     return json_text({"op": "unadvertise", "channelIds": numbers})
 
 
-def warning(text: str) -> str:
-    """Return the message that shows a warning in the viewer."""
-    return json_text({"op": "status", "level": _WARNING, "message": text})
-
-
-def error(text: str) -> str:
-    """Return the message that shows an error in the viewer."""
-    return json_text({"op": "status", "level": _ERROR, "message": text})
+def status(level: int, text: str) -> str:
+    """Return the message that shows a text in the viewer, as a WARNING or an ERROR."""
+    return json_text({"op": "status", "level": level, "message": text})
 
 
 def message_data(subscription: int, utime: int, data: bytes) -> bytes:
@@ -95,8 +84,8 @@ def message_data(subscription: int, utime: int, data: bytes) -> bytes:
     return _MESSAGE_DATA.pack(_MESSAGE_DATA_OPCODE, subscription, utime * 1000) + data
 
 
-def parse_request(message: str | bytes) -> ClientRequest:
-    """Return what a client asks for.
+def parse_request(message: str | bytes) -> tuple[list[Subscription], list[int]]:
+    """Return which subscriptions a client begins, and the numbers of those that it ends.
 
     Raises QueryError for anything but subscriptions: the server announces no other capability.
     """
@@ -108,9 +97,9 @@ def parse_request(message: str | bytes) -> ClientRequest:
         raise QueryError("a message is not JSON") from None
     match content:
         case {"op": "subscribe", "subscriptions": list(subscriptions)}:
-            return ClientRequest(subscriptions=tuple(_subscription(found) for found in subscriptions))
+            return [_subscription(found) for found in subscriptions], []
         case {"op": "unsubscribe", "subscriptionIds": list(numbers)}:
-            return ClientRequest(ended=tuple(_number(number) for number in numbers))
+            return [], [_number(number) for number in numbers]
     raise QueryError("only subscribe and unsubscribe are served")
 
 
@@ -164,26 +153,24 @@ class ViewerAdmission:
     """Decides which connections may stay open, and logs why others end."""
 
     def __init__(self, host: str, origins: Collection[str]) -> None:
-        self.clients: Clients[ServerConnection] = Clients(LIMITS, lambda each: each.transport.abort())
+        self.clients: Clients[Viewer] = Clients(LIMITS, lambda each: each.transport.abort())
         self._host = host
         self._origins = frozenset(origin.lower() for origin in origins)
         self._events = EventLog(logger, "foxglove")
 
     def refuse(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
-        headers = request.headers
-        reason = foreign_page(
-            self._host, headers.get_all("Host"), headers.get_all("Origin"), self._is_of_a_viewer
-        )
+        address, headers = _address(connection), request.headers
+        origins = headers.get_all("Origin")
+        reason = foreign_page(self._host, headers.get_all("Host"), origins, self._is_of_a_viewer)
         if reason:
             reason = f"{reason}; if a viewer of yours is there, add it to foxglove.origins"
-            text = f"{_address(connection)} is refused: {reason}"
-            self._events.log(logging.WARNING, text, "foreign page")
+            self._events.log(logging.WARNING, f"{address} is refused: {reason}", "foreign page")
             return connection.respond(403, f"{reason}\n")
         if not self.clients.is_full:
             return None
         most = self.clients.limits.clients
-        text = f"{_address(connection)} is refused: {most} viewers are connected; close one of them"
+        text = f"{address} is refused: {most} viewers are connected; close one of them"
         self._events.log(logging.WARNING, text, "refused")
         return connection.respond(503, f"{most} viewers are connected already; close one of them.\n")
 
@@ -192,22 +179,39 @@ class ViewerAdmission:
         origin = origin.lower()
         return origin in self._origins or origin == _DESKTOP or bool(_FOXGLOVE.fullmatch(origin))
 
-    def disconnect(self, connection: ServerConnection, reason: str) -> None:
-        """End a connection at once, without waiting for the peer."""
-        if not connection.transport.is_closing():
-            text = f"{_address(connection)} is disconnected: {reason}"
-            self._events.log(logging.INFO, text, "disconnected")
-            connection.transport.abort()
+    def log_disconnected(self, viewer: "Viewer", reason: str) -> None:
+        """Log that a connection ends."""
+        self._events.log(logging.INFO, f"{viewer.address} is disconnected: {reason}", "disconnected")
 
 
-class Connection(ServerConnection):
-    """A connection that is closed if the peer sends more than a viewer does."""
+class Viewer(ServerConnection):
+    """A viewer's connection. It ends if the viewer sends more than viewers do, or reads too little."""
 
     def __init__(self, admission: ViewerAdmission, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
+        self.subscriptions: dict[int, int] = {}
+        """The numbers of channels by those of subscriptions."""
         self._admission = admission
-        self._received = admission.clients.limits.new_received_budget()
+        self._limits = admission.clients.limits
+        self._received = self._limits.new_received_budget()
         self._num_fragments = 0  # of the message that is not complete yet
+        self._max_waiting_bytes = self._limits.unread_bytes_each
+        self._queued_bytes = 0  # for the next ``_flush``
+        self._was_slow = False
+        self._stalled_s: float | None = None  # since when too much waits, on the monotonic clock
+
+    @property
+    def address(self) -> str:
+        """Its address for messages, such as 192.0.2.7:40512."""
+        return _address(self)
+
+    def disconnect(self, reason: str) -> None:
+        """End the connection at once, without waiting for the peer."""
+        if not self.transport.is_closing():
+            self._admission.log_disconnected(self, reason)
+            self.transport.abort()
+
+    # Reading --------------------------------------------------------------------------------
 
     def connection_made(self, transport: Any) -> None:
         """See asyncio.Protocol."""
@@ -221,9 +225,8 @@ class Connection(ServerConnection):
 
     def data_received(self, data: bytes) -> None:
         """See asyncio.Protocol. Data is parsed in pieces: one read may have 40 000 empty frames to count."""
-        piece_bytes = self._admission.clients.limits.read_bytes
-        for start in range(0, len(data), piece_bytes):
-            piece = data[start : start + piece_bytes]
+        for start in range(0, len(data), self._limits.read_bytes):
+            piece = data[start : start + self._limits.read_bytes]
             self._count_received(len(piece))
             if self.transport.is_closing():
                 return
@@ -236,82 +239,50 @@ class Connection(ServerConnection):
             if event.opcode in DATA_OPCODES:
                 self._num_fragments = 0 if event.fin else self._num_fragments + 1
             if self._num_fragments > MAX_FRAGMENTS:
-                self._admission.disconnect(self, f"it sends a message in more than {MAX_FRAGMENTS} pieces")
+                self.disconnect(f"it sends a message in more than {MAX_FRAGMENTS} pieces")
         if not self.transport.is_closing():
             super().process_event(event)
 
     def _count_received(self, num_bytes: int) -> None:
         if not self._received.try_take(num_bytes):
-            self._admission.disconnect(self, "it sends more than a viewer does")
+            self.disconnect("it sends more than a viewer does")
 
+    # Writing --------------------------------------------------------------------------------
 
-def _address(connection: ServerConnection) -> str:
-    """Return the address of a peer for messages, such as 192.0.2.7:40512."""
-    host, port, *_ = connection.remote_address or ("?", 0)
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-class Viewer:
-    """A connected viewer."""
-
-    def __init__(self, connection: ServerConnection, admission: ViewerAdmission) -> None:
-        self.subscriptions: dict[int, int] = {}
-        """The numbers of channels by those of subscriptions."""
-        self._connection = connection
-        self._admission = admission
-        self._max_waiting_bytes = admission.clients.limits.unread_bytes_each
-        self._unread_s = admission.clients.limits.unread_s
-        self._queued_bytes = 0  # for the next ``_flush``
-        self._was_slow = False
-        self._stalled_s: float | None = None  # since when too much waits, on the monotonic clock
-
-    @property
-    def address(self) -> str:
-        """Its address for messages, such as 192.0.2.7:40512."""
-        return _address(self._connection)
-
-    def send_data(self, subscription: int, utime: int, data: bytes) -> bool:
+    def send_message(self, subscription: int, utime: int, data: bytes) -> bool:
         """Send a message of a channel, or return False if too much waits already: then it is lost."""
-        if self._waiting_bytes > self._max_waiting_bytes:
-            self._stall()
-            return False
-        self._stalled_s = None
-        self._send(message_data(subscription, utime, data))
-        return True
-
-    def _stall(self) -> None:
-        """Tell the user once that messages are lost; disconnect a viewer that does not read at all."""
+        if self._waiting_bytes <= self._max_waiting_bytes:
+            self._stalled_s = None
+            self._queue(message_data(subscription, utime, data))
+            return True
         now_s = time.monotonic()
         if self._stalled_s is None:
             self._stalled_s = now_s
-        elif now_s - self._stalled_s > self._unread_s:
+        elif now_s - self._stalled_s > self._limits.unread_s:
             # A ping of websockets would wait until it is sent.
-            self._disconnect(f"it has not read what waits for it for {self._unread_s:g} s")
-        if not self._was_slow:
+            self.disconnect(f"it has not read what waits for it for {self._limits.unread_s:g} s")
+        if not self._was_slow:  # say so once
             self._was_slow = True
-            self.send_control(warning(_SLOW))
+            self.send_control(status(WARNING, _SLOW))
+        return False
 
     def send_control(self, message: str) -> None:
         """Send a message about channels, which the viewer must not miss."""
         if self._waiting_bytes > _CONTROL_SHARE * self._max_waiting_bytes:
-            self._disconnect("it does not read what it must know about the topics")
+            self.disconnect("it does not read what it must know about the topics")
         else:
-            self._send(message.encode(), is_text=True)
+            self._queue(message.encode(), is_text=True)
 
-    def _disconnect(self, reason: str) -> None:
-        self._admission.disconnect(self._connection, reason)
-
-    def _send(self, message: bytes, *, is_text: bool = False) -> None:
+    def _queue(self, message: bytes, *, is_text: bool = False) -> None:
         """Send a message in this turn of the loop, in one system call with others.
 
         With four viewers of all topics, a frame takes 0.3 ms instead of 0.5 ms.
         """
-        frames = self._connection.protocol
-        if frames.state is not State.OPEN:
+        if self.protocol.state is not State.OPEN:
             return
-        (frames.send_text if is_text else frames.send_binary)(message)
+        (self.protocol.send_text if is_text else self.protocol.send_binary)(message)
         if not self._queued_bytes:
-            self._connection.loop.call_soon(self._flush)
+            self.loop.call_soon(self._flush)
         self._queued_bytes += len(message)
         if self._queued_bytes > _FLUSH_BYTES:
             self._flush()
@@ -319,11 +290,17 @@ class Viewer:
     def _flush(self) -> None:
         self._queued_bytes = 0
         # websockets sends them itself if it has something to send in the same turn.
-        data = b"".join(self._connection.protocol.data_to_send())
-        if data and not self._connection.transport.is_closing():
-            self._connection.transport.write(data)
+        data = b"".join(self.protocol.data_to_send())
+        if data and not self.transport.is_closing():
+            self.transport.write(data)
 
     @property
     def _waiting_bytes(self) -> int:
-        waiting: int = self._connection.transport.get_write_buffer_size()
+        waiting: int = self.transport.get_write_buffer_size()
         return waiting + self._queued_bytes
+
+
+def _address(connection: ServerConnection) -> str:
+    """Return the address of a peer for messages, such as 192.0.2.7:40512."""
+    host, port, *_ = connection.remote_address or ("?", 0)
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

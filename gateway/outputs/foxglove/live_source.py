@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Set
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -92,7 +92,11 @@ class LiveSource:
         for index, layout in enumerate(frame.layout.components):
             if layout.type not in components:
                 continue
-            self._check_number(layout, stamp)
+            if has_too_many_numbers(layout) and self._wanted:
+                text = (
+                    f"a frame has more than {MAX_FIELDS} numbers in {layout.type.key}; they are not published"
+                )
+                self._count_loss(TOO_MANY, text, stamp)
             topics = self._converter.topics(layout.type, layout.num_items)
             wanted = [topic for topic in topics if self._has_subscribers(topic, layout.type, stamp)]
             if wanted and self._can_convert(layout.type, stamp):
@@ -122,9 +126,8 @@ class LiveSource:
             self._renamed_s[topic.name] = time.monotonic()
             self._server.close_channels([before])
         self._components[topic.name] = component
-        self._channels[topic.name] = self._server.open_channel(
-            topic, lambda viewer: self._subscribers_changed(topic.name, viewer)
-        )
+        on_change = partial(self._subscribers_changed, topic.name)
+        self._channels[topic.name] = self._server.open_channel(topic, on_change)
         if before is not None:
             self._check_wanted()
 
@@ -168,11 +171,6 @@ class LiveSource:
             self._count_loss(UNKNOWN_UNIT, unknown_unit_text(self._parameters), stamp)
             return False
         return True
-
-    def _check_number(self, layout: ComponentLayout, stamp: Stamp) -> None:
-        if has_too_many_numbers(layout) and self._wanted:
-            text = f"a frame has more than {MAX_FIELDS} numbers in {layout.type.key}; they are not published"
-            self._count_loss(TOO_MANY, text, stamp)
 
     def _send_component(self, component: Component, stamp: Stamp, wanted: list[Topic]) -> None:
         dtype = ITEM_DTYPES[component.type]
@@ -240,9 +238,14 @@ class ServedSource:
         """Advertise the channels of the source."""
         self._call(self._open)
 
+    def _open(self) -> None:
+        if self._source is None:
+            self._source = LiveSource(self._name, self._server, self._report_wanted)
+            self._source.losses = self.losses
+
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Convert the next frames with these parameters."""
-        self._call(partial(self._set_parameters, parameters))
+        self._call(partial(self._while_open, LiveSource.set_parameters, parameters))
         self._opened.clear()
         self._on_change()  # so that frames are looked at again for what the parameters do not mention
 
@@ -251,12 +254,18 @@ class ServedSource:
         for each in layouts:
             is_new = each.type in NUMBERS_PER_ITEM and each.num_items and each.type not in self._opened
             # If the queue is full, another layout or subscriber does it.
-            if is_new and self._call_in_time(partial(self._open_for, each), 0):
+            if is_new and self._call_in_time(partial(self._while_open, LiveSource.open_for, each), 0):
                 self._opened.add(each.type)
 
     def offer(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> bool:
         """Have the components of a frame sent; return False if too many frames wait."""
-        return self._call_in_time(partial(self._send, frame, stamp, components), len(frame.body))
+        call = partial(self._while_open, LiveSource.send_frame, frame, stamp, components)
+        return self._call_in_time(call, len(frame.body))
+
+    def _while_open(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Make a call of the source, in the thread, if it is open then."""
+        if self._source is not None:
+            call(self._source, *arguments)
 
     @property
     def field_names(self) -> Mapping[str, Mapping[str, str]]:
@@ -269,31 +278,9 @@ class ServedSource:
         self.wanted = frozenset()
         self._call(self._close)
 
-    # In the thread.
-
-    def _open(self) -> None:
-        if self._source is None:
-            self._source = LiveSource(self._name, self._server, self._report_wanted)
-            self._source.losses = self.losses
-
-    def _set_parameters(self, parameters: ServerParameters) -> None:
-        if self._source is not None:
-            self._source.set_parameters(parameters)
-
-    def _open_for(self, layout: ComponentLayout) -> None:
-        if self._source is not None:
-            self._source.open_for(layout)
-
-    def _send(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
-        if self._source is not None:
-            self._source.send_frame(frame, stamp, components)
-
     def _close(self) -> None:
-        if self._source is not None:
-            self._source.close()
-            self._source = None
-
-    # In the gateway's loop.
+        self._while_open(LiveSource.close)
+        self._source = None
 
     def _set_wanted(self, wanted: frozenset[ComponentType]) -> None:
         if wanted != self.wanted and not self._is_closed:

@@ -3,6 +3,7 @@
 import errno
 import logging
 from collections.abc import Callable, Mapping
+from typing import Final
 
 from gateway.errors import PortError, system_reason
 from gateway.logs.failures import DefectLog
@@ -15,6 +16,12 @@ from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.frame_output import PortOpener, ServerOutput
 from gateway.outputs.listen_address import host_in_url
 from gateway.outputs.threads import LoopThread
+
+_BIND_PROBLEMS: Final = {
+    errno.EADDRINUSE: "another program uses this port; stop it, or choose another foxglove.port",
+    errno.EADDRNOTAVAIL: "this computer does not have this address; correct foxglove.host",
+    errno.EACCES: "this port needs the rights of root; choose a foxglove.port from 1024",
+}
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +48,9 @@ class FoxgloveOutput(ServerOutput):
         try:
             await self._server.open()
         except OSError as error:
-            raise PortError(f"cannot listen on {self._address}: {_bind_problem(error)}") from error
+            known = _BIND_PROBLEMS.get(error.errno or 0)
+            problem = known or f"{system_reason(error)}; correct foxglove.host and foxglove.port"
+            raise PortError(f"cannot listen on {self._address}: {problem}") from error
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return a new publisher of a source."""
@@ -105,13 +114,3 @@ class FoxgloveOutput(ServerOutput):
 
 async def _make(call: Callable[[], None]) -> None:
     call()
-
-
-def _bind_problem(error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return "another program uses this port; stop it, or choose another foxglove.port"
-    if error.errno == errno.EADDRNOTAVAIL:
-        return "this computer does not have this address; correct foxglove.host"
-    if error.errno == errno.EACCES:
-        return "this port needs the rights of root; choose a foxglove.port from 1024"
-    return f"{system_reason(error)}; correct foxglove.host and foxglove.port"

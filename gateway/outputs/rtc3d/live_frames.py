@@ -173,7 +173,7 @@ class LiveFrames:
         events = [self._events[number] for number in range(first_event, end_event)]
         main, arrivals = frame.main, (frame.main, *frame.others)
         present = frozenset[ComponentType]().union(*(each.composition.measured for each in arrivals))
-        components = tuple(each for each in self.measured if each in present)
+        components: tuple[ComponentType, ...] = tuple(each for each in self.measured if each in present)
         if events:
             components += (ComponentType.EVENT,)
         own_events = [main.time_us] if main.composition.has_events else []
