@@ -169,7 +169,20 @@ class FoxgloveSource:
 
     def describe(self, utime: int) -> list[FoxgloveMessage]:
         """Return what is the same for all messages: labels, units and rates, and the outlines of plates."""
-        content = {"version": self._version, **self._facts, **_description(self._parameters)}
+        content: dict[str, Any] = {"version": self._version, **self._facts}
+        for component in WIRE_ORDER:
+            if num_items := num_described_items(self._parameters, component):
+                found = describe(component, self._parameters, num_items)
+                content[component.key] = {
+                    "labels": found.labels,
+                    "units": found.units,
+                    "moment_unit": found.moment_unit,
+                    "rate_hz": found.rate_hz,
+                }
+                if component is ComponentType.ANALOG:
+                    content[component.key]["fields"] = field_names(found.labels, "channel")
+        labels = {str(number): label for number, label in event_labels(self._parameters).items()}
+        content["event"] = {"labels": labels}
         data = json_text(content).encode()
         return [FoxgloveMessage(self._description, utime, data), self._placed_outlines(utime)]
 
@@ -355,23 +368,3 @@ def _from_x_axis(x: float, y: float, z: float) -> Quaternion:
         return Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
     length = math.sqrt(w * w + y * y + z * z)
     return Quaternion(x=0.0, y=-z / length, z=y / length, w=w / length)
-
-
-def _description(parameters: Parameters) -> dict[str, Any]:
-    """Return the labels, units and rates of the components, and the labels of events, for JSON."""
-    content: dict[str, Any] = {}
-    for component in WIRE_ORDER:
-        num_items = num_described_items(parameters, component)
-        if not num_items:
-            continue
-        found = describe(component, parameters, num_items)
-        content[component.key] = {
-            "labels": found.labels,
-            "units": found.units,
-            "moment_unit": found.moment_unit,
-            "rate_hz": found.rate_hz,
-        }
-        if component is ComponentType.ANALOG:
-            content[component.key]["fields"] = field_names(found.labels, "channel")
-    content["event"] = {"labels": {str(number): label for number, label in event_labels(parameters).items()}}
-    return content

@@ -146,7 +146,11 @@ class ProtobufRecord:
         data = bytearray()
         places = []
         for number in range(1, len(names) + 1):
-            data += _varint(number << 3 | _FIXED_32_BITS)
+            tag = number << 3 | _FIXED_32_BITS  # as a varint: 7 bits in a byte, the lowest first
+            while tag > 0x7F:
+                data.append(tag & 0x7F | 0x80)
+                tag >>= 7
+            data.append(tag)
             places.append(len(data))
             data += bytes(4)
         self._template = np.frombuffer(bytes(data), np.uint8)
@@ -207,12 +211,3 @@ def _schema(schema_name: str, names: Sequence[str]) -> bytes:
     )
     data: bytes = FileDescriptorSet(file=[file]).SerializeToString()
     return data
-
-
-def _varint(number: int) -> bytes:
-    data = bytearray()
-    while number > 0x7F:
-        data.append(number & 0x7F | 0x80)
-        number >>= 7
-    data.append(number)
-    return bytes(data)

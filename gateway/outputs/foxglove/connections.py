@@ -7,22 +7,20 @@ clients made before 2026, such as Lichtblick 1.21, know the first one only, and 
 import base64
 import json
 import logging
-import re
 import struct
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import DATA_OPCODES, Frame
-from websockets.http11 import Request, Response
 from websockets.protocol import State
 
 from gateway.errors import QueryError
 from gateway.foxglove_schemas.topics import Topic
 from gateway.logs.failures import EventLog
 from gateway.messages.decode import json_text
-from gateway.outputs.listen_address import foreign_page
+from gateway.outputs.listen_address import host_in_url
 from gateway.server_limits import Clients, ServerLimits
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
@@ -139,60 +137,20 @@ _CONTROL_SHARE: Final = 8
 _FLUSH_BYTES: Final = 64 * 1024
 """How many bytes are collected for one system call. After a delay, many messages come at once."""
 
-_FOXGLOVE: Final = re.compile(r"https://([a-z0-9-]+\.)*foxglove\.dev")
-_DESKTOP: Final = "file://"
-"""Lichtblick for the desktop is a page from the disk, which no web site can be."""
-
 _SLOW: Final = "Send buffer limit reached"
 """The words of Foxglove's own bridge. Lichtblick adds an explanation to them."""
-
-logger = logging.getLogger(__name__)
-
-
-class ViewerAdmission:
-    """Decides which connections may stay open, and logs why others end."""
-
-    def __init__(self, host: str, origins: Collection[str]) -> None:
-        self.clients: Clients[Viewer] = Clients(LIMITS, lambda each: each.transport.abort())
-        self._host = host
-        self._origins = frozenset(origin.lower() for origin in origins)
-        self._events = EventLog(logger, "foxglove")
-
-    def refuse(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
-        address, headers = _address(connection), request.headers
-        origins = headers.get_all("Origin")
-        reason = foreign_page(self._host, headers.get_all("Host"), origins, self._is_of_a_viewer)
-        if reason:
-            reason = f"{reason}; if a viewer of yours is there, add it to foxglove.origins"
-            self._events.log(logging.WARNING, f"{address} is refused: {reason}", "foreign page")
-            return connection.respond(403, f"{reason}\n")
-        if not self.clients.is_full:
-            return None
-        most = self.clients.limits.clients
-        text = f"{address} is refused: {most} viewers are connected; close one of them"
-        self._events.log(logging.WARNING, text, "refused")
-        return connection.respond(503, f"{most} viewers are connected already; close one of them.\n")
-
-    def _is_of_a_viewer(self, origin: str) -> bool:
-        """Return whether pages of this origin are viewers: Foxglove's, from the disk, or configured."""
-        origin = origin.lower()
-        return origin in self._origins or origin == _DESKTOP or bool(_FOXGLOVE.fullmatch(origin))
-
-    def log_disconnected(self, viewer: "Viewer", reason: str) -> None:
-        """Log that a connection ends."""
-        self._events.log(logging.INFO, f"{viewer.address} is disconnected: {reason}", "disconnected")
 
 
 class Viewer(ServerConnection):
     """A viewer's connection. It ends if the viewer sends more than viewers do, or reads too little."""
 
-    def __init__(self, admission: ViewerAdmission, *args: Any, **options: Any) -> None:
+    def __init__(self, clients: "Clients[Viewer]", events: EventLog, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.subscriptions: dict[int, int] = {}
         """The numbers of channels by those of subscriptions."""
-        self._admission = admission
-        self._limits = admission.clients.limits
+        self._clients = clients
+        self._events = events
+        self._limits = clients.limits
         self._received = self._limits.new_received_budget()
         self._num_fragments = 0  # of the message that is not complete yet
         self._max_waiting_bytes = self._limits.unread_bytes_each
@@ -203,12 +161,13 @@ class Viewer(ServerConnection):
     @property
     def address(self) -> str:
         """Its address for messages, such as 192.0.2.7:40512."""
-        return _address(self)
+        host, port, *_ = self.remote_address or ("?", 0)
+        return f"{host_in_url(host)}:{port}"
 
     def disconnect(self, reason: str) -> None:
         """End the connection at once, without waiting for the peer."""
         if not self.transport.is_closing():
-            self._admission.log_disconnected(self, reason)
+            self._events.log(logging.INFO, f"{self.address} is disconnected: {reason}", "disconnected")
             self.transport.abort()
 
     # Reading --------------------------------------------------------------------------------
@@ -216,11 +175,11 @@ class Viewer(ServerConnection):
     def connection_made(self, transport: Any) -> None:
         """See asyncio.Protocol."""
         super().connection_made(transport)
-        self._admission.clients.open(self)
+        self._clients.open(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
-        self._admission.clients.close(self)
+        self._clients.close(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -298,9 +257,3 @@ class Viewer(ServerConnection):
     def _waiting_bytes(self) -> int:
         waiting: int = self.transport.get_write_buffer_size()
         return waiting + self._queued_bytes
-
-
-def _address(connection: ServerConnection) -> str:
-    """Return the address of a peer for messages, such as 192.0.2.7:40512."""
-    host, port, *_ = connection.remote_address or ("?", 0)
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

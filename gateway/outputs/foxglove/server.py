@@ -7,25 +7,33 @@ does not read. docs/design.md has more about this.
 
 import asyncio
 import logging
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from websockets.asyncio.server import Server, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from gateway.errors import QueryError
 from gateway.foxglove_schemas.topics import Topic
-from gateway.logs.failures import DefectLog
+from gateway.logs.failures import DefectLog, EventLog
 from gateway.outputs.foxglove import connections
-from gateway.outputs.foxglove.connections import LIMITS, MAX_REQUEST_BYTES, Viewer, ViewerAdmission
+from gateway.outputs.foxglove.connections import LIMITS, MAX_REQUEST_BYTES, Viewer
+from gateway.outputs.listen_address import foreign_page
+from gateway.server_limits import Clients
 
 SERVER_NAME: Final = "rtc3d-gateway"
 
 _PING_INTERVAL_S: Final = 10.0
 _PING_TIMEOUT_S: Final = 20.0
 """A viewer that does not answer a ping for this long is disconnected: its computer may have gone."""
+
+_FOXGLOVE: Final = re.compile(r"https://([a-z0-9-]+\.)*foxglove\.dev")
+_DESKTOP: Final = "file://"
+"""Lichtblick for the desktop is a page from the disk, which no web site can be."""
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +68,9 @@ class FoxgloveServer:
         self._info = connections.server_info(SERVER_NAME, session)
         self._channels: dict[int, Channel] = {}
         self._last_number = 0
-        self._admission = ViewerAdmission(host, origins)
+        self._origins = frozenset(origin.lower() for origin in origins)
+        self.clients: Clients[Viewer] = Clients(LIMITS, lambda each: each.transport.abort())
+        self._events = EventLog(logger, "foxglove")
         self._server: Server | None = None
         self._opening = asyncio.Lock()
         self._is_closed = False
@@ -68,8 +78,8 @@ class FoxgloveServer:
 
     async def open(self) -> None:
         """Listen, unless ``close`` was called. Raises OSError."""
-        create: Any = partial(Viewer, self._admission)
-        handler: Any = self._serve
+        create: Any = partial(Viewer, self.clients, self._events)
+        handler, refuse = cast(Any, self._serve), cast(Any, self._refuse)
         async with self._opening:
             if self._is_closed:
                 return
@@ -79,7 +89,7 @@ class FoxgloveServer:
                 self._port,
                 subprotocols=[Subprotocol(name) for name in connections.SUBPROTOCOLS],
                 compression=None,  # it would cost more than a network in a laboratory
-                process_request=self._admission.refuse,
+                process_request=refuse,
                 open_timeout=LIMITS.handshake_s,
                 ping_interval=_PING_INTERVAL_S,
                 ping_timeout=_PING_TIMEOUT_S,
@@ -118,14 +128,34 @@ class FoxgloveServer:
             self._tell_all(connections.unadvertise([channel.number for channel in channels]))
 
     def _tell_all(self, message: str) -> None:
-        for viewer in tuple(self._admission.clients.served):
+        for viewer in tuple(self.clients.served):
             viewer.send_control(message)
 
     # Viewers.
 
+    def _refuse(self, viewer: Viewer, request: Request) -> Response | None:
+        """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        reason = foreign_page(self._host, hosts, origins, self._is_of_a_viewer)
+        if reason:
+            reason = f"{reason}; if a viewer of yours is there, add it to foxglove.origins"
+            self._events.log(logging.WARNING, f"{viewer.address} is refused: {reason}", "foreign page")
+            return viewer.respond(403, f"{reason}\n")
+        if not self.clients.is_full:
+            return None
+        most = self.clients.limits.clients
+        text = f"{viewer.address} is refused: {most} viewers are connected; close one of them"
+        self._events.log(logging.WARNING, text, "refused")
+        return viewer.respond(503, f"{most} viewers are connected already; close one of them.\n")
+
+    def _is_of_a_viewer(self, origin: str) -> bool:
+        """Return whether pages of this origin are viewers: Foxglove's, from the disk, or configured."""
+        origin = origin.lower()
+        return origin in self._origins or origin == _DESKTOP or bool(_FOXGLOVE.fullmatch(origin))
+
     async def _serve(self, viewer: Viewer) -> None:
         """Serve a viewer until it disconnects."""
-        self._admission.clients.serve(viewer)
+        self.clients.serve(viewer)
         logger.debug("foxglove: %s connected", viewer.address)
         try:
             viewer.send_control(self._info)
@@ -137,7 +167,7 @@ class FoxgloveServer:
         except Exception as defect:  # noqa: BLE001 - the other viewers are served nevertheless
             self._defects.log(defect)
         finally:
-            self._admission.clients.close(viewer)  # it may have ended before this began
+            self.clients.close(viewer)  # it may have ended before this began
             for number in list(viewer.subscriptions):
                 self._unsubscribe(viewer, number)
             logger.debug("foxglove: %s disconnected", viewer.address)

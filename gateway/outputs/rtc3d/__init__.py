@@ -10,5 +10,4 @@ The path of a frame: ``output`` offers it to the thread; ``arrivals`` notes it, 
 - ``live_server``: one source's server: opened, paused while the source does not stream, closed.
 - ``client_filter``: what the gateway adds to a client's connection: limits, the control of recordings, and
   C3D files.
-- ``checks``: what the doctor checks.
 """

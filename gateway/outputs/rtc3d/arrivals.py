@@ -30,21 +30,18 @@ class Composition(NamedTuple):
     is_complete: bool
 
 
-class Arrival:
+class Arrival(NamedTuple):
     """A frame, when it arrived and on which stream.
 
     ``time_us`` is on the clock of the measurement and grows with every arrival. ``timestamp_us`` is the
     server's. ``stream`` is the number of the connection.
     """
 
-    __slots__ = ("composition", "frame", "stream", "time_us", "timestamp_us")
-
-    def __init__(self, frame: Frame, composition: Composition, stream: int, time_us: int) -> None:
-        self.frame = frame
-        self.composition = composition
-        self.stream = stream
-        self.time_us = time_us
-        self.timestamp_us = frame.number_and_timestamp[1]
+    frame: Frame
+    composition: Composition
+    stream: int
+    time_us: int
+    timestamp_us: int
 
     @property
     def num_bytes(self) -> int:
@@ -195,7 +192,7 @@ class Arrivals:
                 known.skip(self.newest_us - max(former_us, 0))
         if self.began_us is None:
             self.began_us = self.newest_us
-        arrival = Arrival(frame, composition, stream, self.newest_us)
+        arrival = Arrival(frame, composition, stream, self.newest_us, frame.number_and_timestamp[1])
         if composition.measured:
             rate = self.rates.get(stream)
             if rate is None:

@@ -12,7 +12,6 @@ from gateway.outputs.rtc3d.arrivals import (
     Arrivals,
     Events,
     Kept,
-    StreamRate,
     encode_events,
     encode_joined,
     events_of,
@@ -342,16 +341,13 @@ class LiveFrames:
             if newest is not None:
                 others.append(newest)
                 self._joined.add(stream)
-            elif stream not in self._joined and self._begins_later(arrival, rate, samples):
+            elif (
+                arrival.time_us - rate.time_us < _FASTER_ALIVE_US
+                and stream not in self._joined
+                and (not samples or samples.oldest.timestamp_us < arrival.timestamp_us + _OTHER_CLOCK_US)
+            ):
                 return
         self._add(arrival, tuple(others))
-
-    @staticmethod
-    def _begins_later(arrival: Arrival, rate: StreamRate, samples: "Kept[Arrival] | tuple[()]") -> bool:
-        """Return whether a stream that has had no sample in a frame has only later ones so far."""
-        if arrival.time_us - rate.time_us >= _FASTER_ALIVE_US:
-            return False
-        return not samples or samples.oldest.timestamp_us < arrival.timestamp_us + _OTHER_CLOCK_US
 
     def _add(self, arrival: Arrival, others: tuple[Arrival, ...] = ()) -> None:
         last_us = self._frames.newest.time_us if self._frames else -1

@@ -1,21 +1,24 @@
-"""The output that serves tools as VRPN trackers."""
+"""The output that serves tools as VRPN trackers, and what the doctor checks of it."""
 
 import asyncio
-from collections.abc import Callable, Collection, Mapping
+import socket
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Final
 
 from gateway.descriptions.labels import describe
 from gateway.descriptions.source_frame import unknown_unit_text
-from gateway.errors import OutputError
+from gateway.errors import OutputError, system_reason
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
+from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.frame_output import ServerOutput
+from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.threads import LoopThread, in_this_loop
-from gateway.outputs.vrpn.protocol import encode_pose
-from gateway.outputs.vrpn.server import VrpnServer
-from gateway.outputs.vrpn.settings import VrpnSettings
+from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START, encode_pose
+from gateway.outputs.vrpn.server import VrpnServer, bind
+from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
 from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -206,3 +209,49 @@ class VrpnOutput(ServerOutput):
     def health(self) -> OutputHealth:
         """Return whether clients can connect."""
         return OutputHealth(not self._server.problem, self._server.problem)
+
+
+_TIMEOUT_S: Final = 2.0
+
+_PORT, _ACCESS = (Check("vrpn", name) for name in VRPN.checks)
+
+
+def check_vrpn(
+    settings: VrpnSettings, _sources: Sequence[str], _loads: Sequence[MessageLoad], _seconds: float
+) -> list[Finding]:
+    """Check that the port can be used, and say who can connect."""
+    access = _ACCESS.passing("only programs on this computer can connect")
+    if not is_loopback(settings.host):
+        access = _ACCESS.note(
+            f"any computer that reaches {settings.host} can connect: VRPN has no password and no encryption",
+            "Open the port in the firewall for the computers that need it, or set vrpn.host to 127.0.0.1.",
+        )
+    return [_check_port(settings), access]
+
+
+def _check_port(settings: VrpnSettings) -> Finding:
+    where = f"{settings.host}, port {settings.port}"
+    try:
+        for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+            bind(socket.getaddrinfo(settings.host, settings.port, type=kind), kind).close()
+    except OSError as error:
+        if _is_served(settings):
+            return _PORT.passing(f"a VRPN server answers on {where}")
+        return _PORT.failing(
+            f"cannot listen on {where}: {system_reason(error)}, and no VRPN server answers there",
+            "Stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
+            "computer and a free port.",
+        )
+    return _PORT.passing(f"TCP and UDP are free on {where}; no gateway serves VRPN there now")
+
+
+def _is_served(settings: VrpnSettings) -> bool:
+    """Return whether a VRPN server answers on the port."""
+    address = (from_this_computer(settings.host), settings.port)
+    try:
+        with socket.create_connection(address, _TIMEOUT_S) as connection:
+            connection.settimeout(_TIMEOUT_S)
+            cookie = connection.recv(COOKIE_BYTES, socket.MSG_WAITALL)
+    except OSError:
+        return False
+    return cookie.startswith(COOKIE_START)
