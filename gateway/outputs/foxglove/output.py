@@ -153,7 +153,7 @@ class FoxglovePublisher:
     ) -> None:
         self.wanted: frozenset[ComponentType] = frozenset()
         """The components that a viewer has subscribed to."""
-        self.losses: Losses | None = None
+        self.losses = Losses(logger, f"{name} to foxglove")
         """Where to count what viewers lose."""
         self._name = name
         self._server = server
@@ -181,8 +181,7 @@ class FoxglovePublisher:
 
     def _open(self) -> None:
         if self._source is None:
-            self._source = LiveSource(self._name, self._server, self._report_wanted)
-            self._source.losses = self.losses
+            self._source = LiveSource(self._name, self._server, self.losses, self._report_wanted)
 
     def _while_open(self, call: Callable[..., None], *arguments: Any) -> None:
         """Make a call of the source, in the thread, if it is open then."""
@@ -251,13 +250,17 @@ class LiveSource:
     """
 
     def __init__(
-        self, name: str, server: FoxgloveServer, on_wanted: Callable[[frozenset[ComponentType]], None]
+        self,
+        name: str,
+        server: FoxgloveServer,
+        losses: Losses,
+        on_wanted: Callable[[frozenset[ComponentType]], None],
     ) -> None:
-        self.losses: Losses | None = None
         self.field_names: Mapping[str, Mapping[str, str]] = {}
         """See ``Output.topic_names``."""
         self._name = name
         self._server = server
+        self._losses = losses
         self._on_wanted = on_wanted
         self._wanted: frozenset[ComponentType] = frozenset()
         self._topics = FloatTopics(name, is_live=True)
@@ -303,7 +306,7 @@ class LiveSource:
                 text = (
                     f"a frame has more than {MAX_FIELDS} numbers in {layout.type.key}; they are not published"
                 )
-                self._count_loss(TOO_MANY, text, stamp)
+                self._losses.message_lost(TOO_MANY, text, stamp)
             topics = self._converter.topics(layout.type, layout.num_items)
             wanted = [topic for topic in topics if self._has_subscribers(topic, layout.type, stamp)]
             if not wanted or not self._can_convert(layout.type, stamp):
@@ -315,7 +318,7 @@ class LiveSource:
                 component.type, items, stamp.capture_utime, component.timestamp_us, wanted
             ):
                 for viewer in send(self._channels[message.topic.name], message.utime, message.data):
-                    self._count_loss(SLOW, _slow_text(viewer), stamp)
+                    self._losses.message_lost(SLOW, _slow_text(viewer), stamp)
 
     def close(self) -> None:
         """Withdraw all channels."""
@@ -354,7 +357,9 @@ class LiveSource:
             if renamed_s is None or time.monotonic() - renamed_s >= _RENAMING_S:
                 self._open_channel(topic, component)
             elif channel is not None and channel.subscribers:
-                self._count_loss(RENAMED, f"the labels of {topic.name} change more than once a second", stamp)
+                self._losses.message_lost(
+                    RENAMED, f"the labels of {topic.name} change more than once a second", stamp
+                )
             return False
         return bool(channel.subscribers)
 
@@ -376,20 +381,16 @@ class LiveSource:
     def _send_description(self, viewer: Viewer, message: FoxgloveMessage) -> None:
         # Now, because viewers show no messages from before they were opened.
         if not send_to(viewer, self._channels[message.topic.name], now_utime(), message.data):
-            self._count_loss(SLOW, _slow_text(viewer), None)
+            self._losses.message_lost(SLOW, _slow_text(viewer), None)
 
     def _can_convert(self, component: ComponentType, stamp: Stamp) -> bool:
         if not 0 <= stamp.capture_utime <= MAX_UTIME:
-            self._count_loss(NO_TIME, "the time of capture is before 1970 or after 2106", stamp)
+            self._losses.message_lost(NO_TIME, "the time of capture is before 1970 or after 2106", stamp)
             return False
         if component in _POSITIONS and self._frame.metres_per_unit is None:
-            self._count_loss(UNKNOWN_UNIT, unknown_unit_text(self._parameters), stamp)
+            self._losses.message_lost(UNKNOWN_UNIT, unknown_unit_text(self._parameters), stamp)
             return False
         return True
-
-    def _count_loss(self, cause: str, text: str, stamp: Stamp | None) -> None:
-        if self.losses is not None:
-            self.losses.message_lost(cause, text, stamp)
 
 
 def has_too_many_numbers(layout: ComponentLayout) -> bool:

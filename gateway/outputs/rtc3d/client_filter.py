@@ -70,7 +70,7 @@ class SourceState:
         self.is_measuring: bool | None = None
         """Whether a measurement runs; None if that is unknown."""
         self.parameters = ServerParameters(b"", 0, 0)
-        self.losses: Losses | None = None
+        self.losses = Losses(_log, f"{source} to rtc3d")
         self.wanted = False
         """Whether any client asks for frames. The server assigns it."""
         self.heard = asyncio.Event()
@@ -124,7 +124,7 @@ class ClientFilter(ConnectionFilter):
                 f"client {self.connection.name} reads a C3D file too slowly: {MAX_HELD_PACKETS} packets wait "
                 "for its end, further ones are dropped; check that program, or the network to it"
             )
-            self._count_loss(SLOW_CLIENT, text)
+            self._state.losses.lost(SLOW_CLIENT, text, frames=0)
 
     def answer(self, packet: Packet) -> list[bytes]:
         """Return the replies to a packet.
@@ -167,10 +167,6 @@ class ClientFilter(ConnectionFilter):
         _log.debug("%s sent no command within %g s; closing", self.connection.name, wait_s)
         self.connection.write(error_packet(f"No command within {wait_s:g} s; closing"))
         self.connection.transport.close()
-
-    def _count_loss(self, cause: str, text: str) -> None:
-        if self._state.losses is not None:
-            self._state.losses.lost(cause, text, frames=0)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -239,7 +235,7 @@ class ClientFilter(ConnectionFilter):
             f"client {self.connection.name} does not get {path.name}: {reason}; the gateway keeps files in "
             "its spool"
         )
-        self._count_loss(FILE, text)
+        self._state.losses.lost(FILE, text, frames=0)
 
     async def _send_file(self, path: Path) -> None:
         """Send one file. Raises OSError; if that is in the middle of the file, the connection ends."""

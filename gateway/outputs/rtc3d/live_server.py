@@ -248,10 +248,7 @@ class LiveServer(RtServer):
         _log.debug("%s: %s", self._state.source, text)
 
     def _count_dropped(self, connection: ClientConnection) -> None:
-        losses = self._state.losses
-        if losses is None:
-            return
-        session = connection.session
+        losses, session = self._state.losses, connection.session
         frames, lacking = self._num_counted.get(connection, (0, 0))
         self._num_counted[connection] = (session.frames_dropped, session.frames_without_events)
         if num_new := session.frames_dropped - frames:

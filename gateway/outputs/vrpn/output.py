@@ -17,10 +17,10 @@ from gateway.outputs.frame_output import ServerOutput
 from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.threads import LoopThread, in_this_loop
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START, encode_pose
-from gateway.outputs.vrpn.server import VrpnServer, bind
+from gateway.outputs.vrpn.server import VrpnServer, bind, logger
 from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
 from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import ComponentType, num_described_items
 from gateway.rtc3d.frames import Frame, FrameLayout
 
 MAX_TOOLS: Final = 256
@@ -40,7 +40,7 @@ class VrpnPublisher:
     def __init__(
         self, source: str, server: VrpnServer, offer: Callable[[Callable[[], None], int], bool]
     ) -> None:
-        self.losses: Losses | None = None
+        self.losses = Losses(logger, f"{source} to vrpn")
         """Counts the poses that are lost."""
         self._source = source
         self._server = server
@@ -92,8 +92,7 @@ class VrpnPublisher:
 
     def _show(self, parameters: ServerParameters, num_tools: int) -> None:
         """Name the trackers of ``num_tools`` tools, or of more if the parameters have more."""
-        tools = parameters.parsed.tools
-        num_labels = 0 if tools is None else len(tools.tools)
+        num_labels = num_described_items(parameters.parsed, ComponentType.TOOLS)
         num_trackers = min(max(num_labels, num_tools), MAX_TOOLS)
         labels = describe(ComponentType.TOOLS, parameters.parsed, num_trackers).labels
         self._server.trackers.set_tools(self._source, labels)
@@ -116,28 +115,24 @@ class VrpnPublisher:
                     messages.append(encode_pose(tracker.number, stamp.capture_utime, pose))
         if num_with_tracker < num_items:
             num_lost = num_items - num_with_tracker
-            self._count_loss(
+            self.losses.lost(
                 "too many tools",
                 f"{num_lost} tools have no tracker: there can be {MAX_TOOLS} of a source and {MAX_TRACKERS} "
                 "of all; remove tools that are not used from the server",
-                num_lost,
+                messages=num_lost,
             )
         slow = self._server.send(b"".join(messages)) if messages else []
         if slow:
-            self._count_loss(
+            self.losses.lost(
                 "slow client",
                 f"poses for {slow[0]} are lost, because it does not read them fast enough; look at that "
                 "program",
-                len(messages) * len(slow),
+                messages=len(messages) * len(slow),
             )
 
     @property
     def _trackers(self) -> Collection[Tracker | None]:
         return self._server.trackers.of_source(self._source).values()
-
-    def _count_loss(self, cause: str, text: str, num_poses: int) -> None:
-        if self.losses is not None:
-            self.losses.lost(cause, text, messages=num_poses)
 
 
 def _tool_indices(layout: FrameLayout) -> list[int]:
