@@ -20,7 +20,7 @@ from gateway.messages.encode import Stamp, lcm_content
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
 from gateway.outputs.foxglove.connections import Viewer
-from gateway.outputs.foxglove.server import Channel, FoxgloveServer, send, send_to
+from gateway.outputs.foxglove.server import Channel, FoxgloveServer, send
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.frame_output import PortOpener, ServerOutput
 from gateway.outputs.listen_address import host_in_url
@@ -380,7 +380,8 @@ class LiveSource:
 
     def _send_description(self, viewer: Viewer, message: FoxgloveMessage) -> None:
         # Now, because viewers show no messages from before they were opened.
-        if not send_to(viewer, self._channels[message.topic.name], now_utime(), message.data):
+        number = self._channels[message.topic.name].subscribers[viewer]
+        if not viewer.send_message(number, now_utime(), message.data):
             self._losses.message_lost(SLOW, _slow_text(viewer), None)
 
     def _can_convert(self, component: ComponentType, stamp: Stamp) -> bool:

@@ -211,8 +211,3 @@ def send(channel: Channel, utime: int, data: bytes) -> list[Viewer]:
     """Send a message to all subscribers; return those that lose it because they do not read fast enough."""
     subscribers = channel.subscribers.items()
     return [viewer for viewer, number in subscribers if not viewer.send_message(number, utime, data)]
-
-
-def send_to(viewer: Viewer, channel: Channel, utime: int, data: bytes) -> bool:
-    """Send a message to one subscriber; return False if it loses the message."""
-    return viewer.send_message(channel.subscribers[viewer], utime, data)

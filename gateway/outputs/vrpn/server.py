@@ -290,7 +290,7 @@ class Client(asyncio.BufferedProtocol):
             self.describe_trackers()
             self._owner.client_ready(self)
         # A client repeats a ping until it is answered.
-        trackers = filter(None, map(self._owner.trackers.named, pinged))
+        trackers = filter(None, map(self._owner.trackers.by_name.get, pinged))
         pongs = b"".join(encode_pong(tracker.number, now_utime()) for tracker in trackers)
         if pongs and not self._is_full:
             self.describe_trackers()
@@ -317,7 +317,8 @@ class Client(asyncio.BufferedProtocol):
         if self._is_full or self._transport.is_closing() or self._version == trackers.version:
             return
         self._version = trackers.version
-        new = [tracker for tracker in trackers.current if self._described.get(tracker.number) != tracker.name]
+        current = trackers.by_name.values()
+        new = [tracker for tracker in current if self._described.get(tracker.number) != tracker.name]
         self._described.update((tracker.number, tracker.name) for tracker in new)
         self._transport.write(b"".join(describe_tracker(*tracker) for tracker in new))
 

@@ -1,7 +1,7 @@
 """The trackers of all sources: their names and numbers."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 from gateway.outputs.vrpn.protocol import MAX_NAME_BYTES
@@ -37,7 +37,7 @@ class Trackers:
     """Gives the tools of each source trackers.
 
     A tool keeps its tracker's name and number while it comes and goes. Only when MAX_TRACKERS are used up, a
-    former tool's number is used for another one. ``version`` grows with every change of ``current``.
+    former tool's number is used for another one. ``version`` grows with every change of ``by_name``.
     """
 
     def __init__(self, names: TrackerNames) -> None:
@@ -46,16 +46,8 @@ class Trackers:
         self._tools: dict[str, Sequence[str]] = {}  # of each source
         self._by_key: dict[_Key, Tracker] = {}  # the most recently given ones are last
         self._of_source: dict[str, dict[str, Tracker | None]] = {}
-        self._by_name: dict[str, Tracker] = {}
-
-    @property
-    def current(self) -> Iterable[Tracker]:
+        self.by_name: dict[str, Tracker] = {}
         """The trackers of the tools that there are now."""
-        return self._by_name.values()
-
-    def named(self, name: str) -> Tracker | None:
-        """Return the tracker with this name, if its tool is there now."""
-        return self._by_name.get(name)
 
     def of_source(self, source: str) -> Mapping[str, Tracker | None]:
         """Return the trackers of a source by the tools' names, in their order; None for one too many.
@@ -95,7 +87,7 @@ class Trackers:
             source: {key.tool: self._by_key.get(key) for key in of_source}
             for source, of_source in keys.items()
         }
-        self._by_name = {
+        self.by_name = {
             tracker.name: tracker
             for of_source in self._of_source.values()
             for tracker in of_source.values()

@@ -175,7 +175,7 @@ async def test_tools_with_new_names_or_numbers_are_described_before_their_poses(
     async with await VrpnClient.connect(port) as client:
         await wait_until_async(lambda: len(client.described) == 2)
         server.trackers.set_tools("lab", ["hand", "Left Foot", "probe"])
-        numbers = {tracker.name: tracker.number for tracker in server.trackers.current}
+        numbers = {tracker.name: tracker.number for tracker in server.trackers.by_name.values()}
         server.send(encode_pose(numbers["probe"], 0, POSE) + encode_pose(numbers["hand"], 0, POSE))
         server.trackers.remove("lab")
         server.trackers.set_tools("stage", ["foot"])
