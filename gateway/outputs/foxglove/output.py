@@ -74,8 +74,8 @@ class FoxgloveOutput(ServerOutput):
             await self._server.open()
         except OSError as error:
             known = _BIND_PROBLEMS.get(error.errno or 0)
-            problem = known or f"{system_reason(error)}; correct foxglove.host and foxglove.port"
-            raise PortError(f"cannot listen on {self._address}: {problem}") from error
+            reason = known or f"{system_reason(error)}; correct foxglove.host and foxglove.port"
+            raise PortError(f"cannot listen on {self._address}: {reason}") from error
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return a new publisher of a source."""
