@@ -261,12 +261,12 @@ class WalkingPerson(ComputedScene):
         )
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See SceneFunction."""
+        """See ComputedScene."""
         length = round(SECONDS * self.rates_hz[component])
         return self._items[component](samples % length)
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See SceneFunction. Each strike of a foot is an event."""
+        """See ComputedScene. Each strike of a foot is an event."""
         strikes = [
             (first_s + number * STRIDE_S, foot)
             for foot, first_s in enumerate((FIRST_STRIKE_S["L"], FIRST_STRIKE_S["R"]), start=1)

@@ -3,25 +3,39 @@
 docs/reference/takes.md has the table of topics.
 """
 
-from collections.abc import Container
+import math
+from collections.abc import Container, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from foxglove.messages import (
+    ArrowPrimitive,
+    Color,
+    Duration,
     FrameTransform,
     FrameTransforms,
+    LinePrimitive,
+    LinePrimitiveLineType,
     Log,
     LogLevel,
     PackedElementField,
     PackedElementFieldNumericType,
+    Point3,
     PointCloud,
     Pose,
     Quaternion,
+    SceneEntity,
+    SceneEntityDeletion,
+    SceneEntityDeletionType,
+    SceneUpdate,
+    TextPrimitive,
     Vector3,
 )
 
+from gateway.descriptions.force_plates import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
 from gateway.descriptions.labels import MAX_EVENT_AGE_US, describe, event_labels, event_text
-from gateway.foxglove_schemas.forces import ForceScene
 from gateway.foxglove_schemas.topics import (
     MAX_FIELDS,
     MAX_UTIME,
@@ -37,7 +51,7 @@ from gateway.foxglove_schemas.topics import (
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import json_text
 from gateway.messages.encode import metres_per_unit
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items, num_described_items
 from gateway.rtc3d.parameters import Parameters
 
 _POINT: Final = np.dtype(
@@ -57,6 +71,16 @@ _POINT_FIELDS: Final = [
 ]
 _NO_POSE: Final = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 """Points without a pose are not valid in rerun."""
+
+_ARROW_COLOR: Final = Color(r=1.0, g=0.75, b=0.1, a=1.0)
+_PLATE_COLOR: Final = Color(r=0.6, g=0.6, b=0.65, a=1.0)
+_LINE_M: Final = 0.005
+_TEXT_M: Final = 0.05
+_SHAFT_M: Final = 0.015
+_HEAD_M: Final = 0.04
+
+_LIFETIME: Final = Duration(1)
+"""An arrow disappears if no other message comes for this many seconds."""
 
 _LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 _NOUNS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
@@ -99,25 +123,24 @@ class FoxgloveSource:
                 self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"
             frame = CoordinateFrame(source, metres or _MILLIMETRE)
         self._frame = frame
-        self._forces = ForceScene(source, parameters, frame)
-        self._labels: dict[tuple[ComponentType, int], tuple[str, ...]] = {}
-        self._records: dict[tuple[ComponentType, int], dict[Topic, FloatRecord]] = {}
+        self._plates = placed_plates(parameters)  # those without a known place are not drawn
+        self._plate_frame = replace(frame, metres_per_unit=frame.scale)  # plates are in metres already
+        self._labels_of = lru_cache(_MAX_LAYOUTS)(self._find_labels)
+        self._number_records = lru_cache(_MAX_LAYOUTS)(self._new_records)
         self._markers = topic_of(f"/{source}/markers", PointCloud)
         self._tools = topic_of(f"/{source}/tools", FrameTransforms)
         self._events = topic_of(f"/{source}/events", Log)
+        self._outlines = topic_of(f"/{source}/plates", SceneUpdate)
+        self._arrows = topic_of(f"/{source}/forces", SceneUpdate)
         self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
 
     @property
     def known_topics(self) -> dict[Topic, ComponentType | None]:
         """All topics and their components; those of numbers only if the parameters say how many there are."""
-        counts = _announced(self._parameters)
-        return {
-            **dict.fromkeys((self._description, self._forces.outlines_topic)),
-            **{
-                topic: component
-                for component in WIRE_ORDER
-                for topic in self.topics(component, counts.get(component, 0))
-            },
+        return dict.fromkeys((self._description, self._outlines)) | {
+            topic: component
+            for component in WIRE_ORDER
+            for topic in self.topics(component, num_described_items(self._parameters, component))
         }
 
     @property
@@ -125,7 +148,7 @@ class FoxgloveSource:
         """The names of fields that are not the labels of channels or plates, by component key and label."""
         found: dict[str, dict[str, str]] = {}
         for component, noun in _NOUNS.items():
-            labels = self._labels_of(component, _announced(self._parameters).get(component, 0))
+            labels = self._labels_of(component, num_described_items(self._parameters, component))
             names = zip(labels, field_names(labels, noun), strict=True)
             found[component.key] = {label: name for label, name in names if label != name}
         return {key: names for key, names in found.items() if names}
@@ -140,15 +163,28 @@ class FoxgloveSource:
             case ComponentType.ANALOG:
                 return tuple(self._number_records(component, num_items))
             case ComponentType.FORCE:
-                return (*self._number_records(component, num_items), self._forces.arrows_topic)
+                return (*self._number_records(component, num_items), self._arrows)
             case ComponentType.EVENT:
                 return (self._events,)
 
     def describe(self, utime: int) -> list[FoxgloveMessage]:
         """Return what is the same for all messages: labels, units and rates, and the outlines of plates."""
-        content = {"version": self._version, **self._facts, **_description(self._parameters)}
+        content: dict[str, Any] = {"version": self._version, **self._facts}
+        for component in WIRE_ORDER:
+            if num_items := num_described_items(self._parameters, component):
+                found = describe(component, self._parameters, num_items)
+                content[component.key] = {
+                    "labels": found.labels,
+                    "units": found.units,
+                    "moment_unit": found.moment_unit,
+                    "rate_hz": found.rate_hz,
+                }
+                if component is ComponentType.ANALOG:
+                    content[component.key]["fields"] = field_names(found.labels, "channel")
+        labels = {str(number): label for number, label in event_labels(self._parameters).items()}
+        content["event"] = {"labels": labels}
         data = json_text(content).encode()
-        return [FoxgloveMessage(self._description, utime, data), self._forces.plates(utime)]
+        return [FoxgloveMessage(self._description, utime, data), self._placed_outlines(utime)]
 
     def convert(
         self,
@@ -175,8 +211,8 @@ class FoxgloveSource:
                     found.append(FoxgloveMessage(topic, capture_utime, data))
             elif topic is self._events:
                 found += [self._log(item, capture_utime, timestamp_us) for item in items]
-            elif topic is self._forces.arrows_topic:
-                found.append(self._forces.arrows(items, capture_utime))
+            elif topic is self._arrows:
+                found.append(self._force_arrows(items, capture_utime))
             else:
                 record = self._number_records(component, len(items))[topic]
                 found.append(FoxgloveMessage(topic, capture_utime, record.encode(items.view(">f4"))))
@@ -223,24 +259,15 @@ class FoxgloveSource:
                 )
         return FrameTransforms(transforms=transforms).encode() if transforms else b""
 
-    def _number_records(self, component: ComponentType, num_items: int) -> dict[Topic, FloatRecord]:
+    def _new_records(self, component: ComponentType, num_items: int) -> dict[Topic, FloatRecord]:
         """Return the topics of a component's values by their labels; {} if there are none or too many."""
         if not 0 < num_items * NUMBERS_PER_ITEM[component] <= MAX_FIELDS:
             return {}
-        found = self._records.get((component, num_items))
-        if found is None:
-            found = {record.topic: record for record in self._new_records(component, num_items)}
-            if len(self._records) >= _MAX_LAYOUTS:
-                self._records.clear()
-            self._records[component, num_items] = found
-        return found
-
-    def _new_records(self, component: ComponentType, num_items: int) -> tuple[FloatRecord, ...]:
-        names = field_names(self._labels_of(component, num_items), _NOUNS[component])
-        if component is ComponentType.ANALOG:
-            return self._topics.records("analog", names)
-        labels = [f"{plate}_{load}" for plate in names for load in _LOADS]
-        return self._topics.records("loads", field_names(labels, "load"))
+        name, names = "analog", field_names(self._labels_of(component, num_items), _NOUNS[component])
+        if component is ComponentType.FORCE:
+            labels = [f"{plate}_{load}" for plate in names for load in _LOADS]
+            name, names = "loads", field_names(labels, "load")
+        return {record.topic: record for record in self._topics.records(name, names)}
 
     def _log(self, item: Any, capture_utime: int, timestamp_us: int) -> FoxgloveMessage:
         """Return an event, at its own time stamp if that is plausible."""
@@ -252,39 +279,92 @@ class FoxgloveSource:
         log = Log(timestamp=timestamp(utime), level=LogLevel.Info, message=message, name=self.source)
         return FoxgloveMessage(self._events, utime, log.encode())
 
-    def _labels_of(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
-        found = self._labels.get((component, num_items))
+    def _find_labels(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
+        return describe(component, self._parameters, num_items).labels
+
+    # Force plates ---------------------------------------------------------------------------
+
+    def _placed_outlines(self, utime: int) -> FoxgloveMessage:
+        """Return the outlines and labels of the plates, in place of all earlier ones."""
+        time = timestamp(utime)
+        entities = []
+        for plate in filter(None, self._plates):
+            outline = LinePrimitive(
+                type=LinePrimitiveLineType.LineLoop,
+                pose=_NO_POSE,
+                thickness=_LINE_M,
+                points=[Point3(x=x, y=y, z=z) for x, y, z in self._placed(plate.corners)],
+                color=_PLATE_COLOR,
+            )
+            [[x, y, z]] = self._placed([plate.centre])
+            label = TextPrimitive(
+                pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
+                billboard=True,
+                font_size=_TEXT_M,
+                color=_PLATE_COLOR,
+                text=plate.label,
+            )
+            entities.append(
+                SceneEntity(
+                    timestamp=time,
+                    frame_id=self._frame.frame_id,
+                    id=plate.label,
+                    lines=[outline],
+                    texts=[label],
+                )
+            )
+        deletion = SceneEntityDeletion(timestamp=time, type=SceneEntityDeletionType.All)
+        update = SceneUpdate(deletions=[deletion], entities=entities)
+        return FoxgloveMessage(self._outlines, utime, update.encode())
+
+    def _force_arrows(self, items: Items, utime: int) -> FoxgloveMessage:
+        """Return an arrow from each centre of pressure; ``items`` are those of the Force component."""
+        time = timestamp(utime)
+        entities = [
+            # An entity without an arrow removes the one before.
+            SceneEntity(
+                timestamp=time,
+                frame_id=self._frame.frame_id,
+                id=plate.label,
+                lifetime=_LIFETIME,
+                arrows=self._arrow(plate, load),
+            )
+            for plate, load in zip(self._plates, items.tolist(), strict=False)
+            if plate is not None
+        ]
+        return FoxgloveMessage(self._arrows, utime, SceneUpdate(entities=entities).encode())
+
+    def _arrow(self, plate: PlacedPlate, load: tuple[float, ...]) -> list[ArrowPrimitive]:
+        """Return the arrow of a load; [] if it is too small or not known."""
+        found = force_on(plate, load)
         if found is None:
-            found = describe(component, self._parameters, num_items).labels
-            if len(self._labels) >= _MAX_LAYOUTS:
-                self._labels.clear()
-            self._labels[component, num_items] = found
-        return found
+            return []
+        [[x, y, z]] = self._placed([found.position])
+        [[fx, fy, fz]] = self._plate_frame.vectors(np.array([found.force])).tolist()
+        force = math.hypot(fx, fy, fz)
+        length = force * METRES_PER_NEWTON
+        head = min(_HEAD_M, length / 2)
+        direction = _from_x_axis(fx / force, fy / force, fz / force)
+        return [
+            ArrowPrimitive(
+                pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=direction),
+                shaft_length=length - head,
+                shaft_diameter=_SHAFT_M,
+                head_length=head,
+                head_diameter=_HEAD_M,
+                color=_ARROW_COLOR,
+            )
+        ]
+
+    def _placed(self, points: Sequence[Sequence[float]]) -> list[list[float]]:
+        moved: list[list[float]] = self._plate_frame.points(np.array(points)).tolist()
+        return moved
 
 
-def _description(parameters: Parameters) -> dict[str, Any]:
-    """Return the labels, units and rates of the components, and the labels of events, for JSON."""
-    content: dict[str, Any] = {}
-    for component, num_items in _announced(parameters).items():
-        found = describe(component, parameters, num_items)
-        content[component.key] = {
-            "labels": found.labels,
-            "units": found.units,
-            "moment_unit": found.moment_unit,
-            "rate_hz": found.rate_hz,
-        }
-        if component is ComponentType.ANALOG:
-            content[component.key]["fields"] = field_names(found.labels, "channel")
-    content["event"] = {"labels": {str(number): label for number, label in event_labels(parameters).items()}}
-    return content
-
-
-def _announced(parameters: Parameters) -> dict[ComponentType, int]:
-    """Return how many items the parameters describe, by component."""
-    counts = {
-        ComponentType.MARKERS: parameters.markers and len(parameters.markers.markers),
-        ComponentType.TOOLS: parameters.tools and len(parameters.tools.tools),
-        ComponentType.ANALOG: parameters.analog and len(parameters.analog.channels),
-        ComponentType.FORCE: parameters.force and len(parameters.force.plates),
-    }
-    return {component: counts[component] or 0 for component in WIRE_ORDER if counts.get(component)}
+def _from_x_axis(x: float, y: float, z: float) -> Quaternion:
+    """Return the shortest rotation from the x-axis to a direction of length 1."""
+    w = 1.0 + x
+    if w < 1e-9:
+        return Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+    length = math.sqrt(w * w + y * y + z * z)
+    return Quaternion(x=0.0, y=-z / length, z=y / length, w=w / length)

@@ -124,17 +124,8 @@ class FloatTopics:
         return found
 
 
-class FloatRecord(Protocol):
-    """The messages of a topic that have a field of 32 bits for each name, at most MAX_FIELDS."""
-
-    topic: Topic
-
-    def encode(self, values: Items) -> bytes:
-        """Return the message with these values, one per field, in the order of the names."""
-
-
 class CdrRecord:
-    """A FloatRecord in CDR, little-endian, described as a message of ROS 2."""
+    """The messages of a topic with a field of 32 bits for each name, in CDR, as a message of ROS 2."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         names = fitting_labels(names, _ros_field, _MAX_NAME_BYTES, "number")
@@ -142,30 +133,37 @@ class CdrRecord:
         self.topic = Topic(topic_name, "cdr", schema_name, "ros2msg", schema)
 
     def encode(self, values: Items) -> bytes:
-        """See FloatRecord."""
+        """Return the message with these values, one per field, in the order of the names."""
         data: bytes = values.astype("<f4").tobytes()
         return _CDR_LITTLE_ENDIAN + data
 
 
 class ProtobufRecord:
-    """A FloatRecord in protobuf."""
+    """The messages of a topic with a field of 32 bits for each name, at most MAX_FIELDS, in protobuf."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         self.topic = Topic(topic_name, "protobuf", schema_name, "protobuf", _schema(schema_name, names))
         data = bytearray()
         places = []
         for number in range(1, len(names) + 1):
-            data += _varint(number << 3 | _FIXED_32_BITS)
+            tag = number << 3 | _FIXED_32_BITS  # as a varint: 7 bits in a byte, the lowest first
+            while tag > 0x7F:
+                data.append(tag & 0x7F | 0x80)
+                tag >>= 7
+            data.append(tag)
             places.append(len(data))
             data += bytes(4)
         self._template = np.frombuffer(bytes(data), np.uint8)
         self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
 
     def encode(self, values: Items) -> bytes:
-        """See FloatRecord."""
+        """See CdrRecord."""
         data = self._template.copy()
         data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)
         return data.tobytes()
+
+
+FloatRecord = CdrRecord | ProtobufRecord
 
 
 def field_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:
@@ -213,12 +211,3 @@ def _schema(schema_name: str, names: Sequence[str]) -> bytes:
     )
     data: bytes = FileDescriptorSet(file=[file]).SerializeToString()
     return data
-
-
-def _varint(number: int) -> bytes:
-    data = bytearray()
-    while number > 0x7F:
-        data.append(number & 0x7F | 0x80)
-        number >>= 7
-    data.append(number)
-    return bytes(data)

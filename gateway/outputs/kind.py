@@ -25,15 +25,22 @@ def missing_package(output: str, extra: str, error: ImportError) -> ConfigError:
     )
 
 
-def imported_late(path: str) -> Callable[..., Any]:
+def imported_late(path: str, extra: str = "") -> Callable[..., Any]:
     """Return the function or class ``MODULE:NAME``, which is imported when it is called.
 
-    So the registry does not import the outputs that the configuration does not enable.
+    So the registry does not import the outputs that the configuration does not enable. If packages of the
+    ``extra`` of the same name as the output are not installed, the call raises ConfigError.
     """
     module, _, name = path.partition(":")
 
     def call(*arguments: Any) -> Any:
-        return getattr(import_module(module), name)(*arguments)
+        try:
+            found = getattr(import_module(module), name)
+        except ImportError as error:
+            if not extra:
+                raise
+            raise missing_package(extra, extra, error) from error
+        return found(*arguments)
 
     return call
 

@@ -1,23 +1,22 @@
-"""One client's TCP connection, and how much it may use up."""
+"""The TCP connections of a server's clients, what they share, and how much each may use up."""
 
 import asyncio
 import logging
 import time
+from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, cast
+from collections.abc import Callable, Sequence
+from typing import Final, cast
 
 import gateway
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketReader, PacketType
 from gateway.rtc3d.parameters import General
-from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
-from gateway.rtc3d_server.connection_filter import ConnectionFilter
+from gateway.rtc3d_server.client_session import ClientSession, error_packet
+from gateway.rtc3d_server.measurement import Measurement
+from gateway.rtc3d_server.scene import FrameSource
 from gateway.server_limits import ServerLimits
 from gateway.token_bucket import TokenBucket
-
-if TYPE_CHECKING:
-    from gateway.rtc3d_server.server import RtServer
 
 MAX_COMMAND_BYTES: Final = 64 * 1024
 """The largest packet that a client may send."""
@@ -38,28 +37,36 @@ _MAX_LOGGED_BYTES: Final = 200  # of a command
 _log = logging.getLogger(__name__)
 
 
-class SentCounts:
-    """Counts data frames and the components in them."""
+class ConnectionFilter:
+    """Passes one connection's bytes through unchanged.
 
-    def __init__(self) -> None:
-        self._frames: Counter[tuple[ComponentType, ...]] = Counter()
+    Subclasses override methods to change, delay or drop them. They reach the socket and the server only
+    through ``connection``.
+    """
 
-    def add(self, components: tuple[ComponentType, ...]) -> None:
-        """Count one frame with these components."""
-        self._frames[components] += 1
+    is_busy: bool = False
+    """Whether no frame and no reply may be sent now. Frames are dropped, commands wait."""
 
-    @property
-    def frames(self) -> int:
-        """The number of frames."""
-        return self._frames.total()
+    def __init__(self, connection: "ClientConnection") -> None:
+        self.connection = connection
 
-    @property
-    def components(self) -> Counter[str]:
-        """How often each component was in a frame, by its key."""
-        counts: Counter[str] = Counter()
-        for components, frames in self._frames.items():
-            counts.update({component.key: frames for component in components})
-        return counts
+    def send(self, packet: bytes) -> None:
+        """Send one packet (a reply or a data frame) to the client."""
+        self.connection.write(packet)
+
+    def receive(self, data: bytes) -> None:
+        """Process bytes that were read from the client's socket."""
+        self.connection.handle(data)
+
+    def answer(self, packet: Packet) -> list[bytes]:
+        """Return the replies to a client's packet; each of them then goes through ``send``."""
+        return self.connection.answer(packet)
+
+    def flush(self) -> None:
+        """Write at once all bytes that the filter holds back: the server is about to close the connection."""
+
+    def connection_lost(self) -> None:
+        """Discard all bytes that the filter holds back, and cancel its timers: the connection has ended."""
 
 
 class ClientConnection(asyncio.BufferedProtocol):
@@ -79,7 +86,7 @@ class ClientConnection(asyncio.BufferedProtocol):
     number: int
     """The connection's number since the server's start, from 1."""
 
-    def __init__(self, owner: "RtServer") -> None:
+    def __init__(self, owner: "ConnectionOwner") -> None:
         self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
@@ -93,19 +100,18 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._was_full = False  # whether it has been full before
         self._has_ended = False  # whether the client has closed its sending half
         self._recording_end: asyncio.TimerHandle | None = None  # of a recording that has a duration
-        self._first_sent_s: float | None = None  # when the first frame was sent, on the monotonic clock
-        self._last_sent_s = 0.0  # when the newest frame was sent
+        self._first_sent_s = self._last_sent_s = 0.0  # when frames were sent, on the monotonic clock
         self.closed: asyncio.Future[None] = self._loop.create_future()
         """Done once the connection has ended."""
-        self.sent_counts = SentCounts()
-        """What was sent to this client."""
+        self.frames_sent = 0
+        """How many frames were sent to this client."""
         self.session = ClientSession(
-            SessionCallbacks(owner.frames, self._parameters_xml, owner.frames_requested, self._record_for)
+            owner.frames, self._parameters_xml, owner.frames_requested, self._record_for
         )
 
     @property
     def name(self) -> str:
-        """The client's address and port."""
+        """The client's address and port, for log messages."""
         return self.session.name
 
     @property
@@ -142,13 +148,8 @@ class ClientConnection(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         """Send and read again: the client reads (asyncio.Protocol)."""
         self._is_full = False
-        elapsed_us = self._owner.elapsed_us()
-        if elapsed_us is not None:
-            self.session.drop_due_frames(elapsed_us)
+        self.continue_sending()
         self._owner.reading_resumed(self)
-        self.resume_reading()
-        self._owner.schedule()
-        self._process_soon()
 
     def resume_reading(self) -> None:
         """Read from the socket again, unless packets are waiting or the connection is closing."""
@@ -168,13 +169,24 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._has_ended = True
         return self._owes_answers or self.filter.is_busy
 
+    # For the filter -------------------------------------------------------------------------
+
     def handle(self, data: bytes) -> None:
-        """Read packets from the next bytes of the client, and answer them."""
+        """Process bytes from the client, bypassing the filter; the replies go through it."""
         self._inbox.extend(self._reader.feed(data))
         if not self._is_processing:
             self._process_inbox()
         if self._inbox and not self.transport.is_closing():
             self.transport.pause_reading()
+
+    def answer(self, packet: Packet) -> list[bytes]:
+        """Execute a client's packet; return the replies, each one packet."""
+        return self.session.answer(packet)
+
+    def write(self, data: bytes) -> None:
+        """Write bytes to the socket with one send. All bytes to the client go through here."""
+        if not self.transport.is_closing():
+            self.transport.write(data)
 
     def hold_commands(self) -> None:
         """Answer no further packets until ``continue_commands``."""
@@ -185,9 +197,15 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._is_held = False
         self._process_soon()
 
-    def answer(self, packet: Packet) -> list[bytes]:
-        """Execute a client's packet; return the replies, each one packet."""
-        return self.session.answer(packet)
+    def continue_sending(self) -> None:
+        """Send frames and replies again after ``is_busy``; the frames in between are dropped."""
+        if (elapsed_us := self._owner.elapsed_us()) is not None:
+            self.session.drop_due_frames(elapsed_us)
+        self.resume_reading()
+        self._owner.schedule()
+        self._process_soon()
+
+    # For the server -------------------------------------------------------------------------
 
     def send_due_frames(self, elapsed_us: int) -> None:
         """Send the frames that are due, or drop them if the client does not read."""
@@ -196,12 +214,11 @@ class ClientConnection(asyncio.BufferedProtocol):
                 self.session.drop_due_frames(elapsed_us)
             return
         for packet, components, _ in self.session.due_frames(elapsed_us):
-            self.send(packet)
-            self.sent_counts.add(components)
-            self._owner.sent_counts.add(components)
+            self.filter.send(packet)
+            self.frames_sent += 1
+            self._owner.sent[components] += 1
             self._last_sent_s = time.monotonic()
-            if self._first_sent_s is None:
-                self._first_sent_s = self._last_sent_s
+            self._first_sent_s = self._first_sent_s or self._last_sent_s
             if not self._can_send():
                 break
         self._close_if_ended()
@@ -209,32 +226,14 @@ class ClientConnection(asyncio.BufferedProtocol):
     def measurement_stopped(self) -> None:
         """Send No Data for the stream and for each request that waits."""
         for packet in self.session.measurement_stopped():
-            self.send(packet)
+            self.filter.send(packet)
         self._close_if_ended()
-
-    def send(self, packet: bytes) -> None:
-        """Send one packet through the filter."""
-        self.filter.send(packet)
-
-    def write(self, data: bytes) -> None:
-        """Write bytes to the socket with one send. All bytes to the client go through here."""
-        if not self.transport.is_closing():
-            self.transport.write(data)
 
     def close(self) -> None:
         """Close the connection once everything has been sent; ``closed`` is done then."""
         self._inbox.clear()
         self.filter.flush()
         self.transport.close()
-
-    def continue_sending(self) -> None:
-        """Send frames and replies again, because the filter is no longer busy."""
-        elapsed_us = self._owner.elapsed_us()
-        if elapsed_us is not None:
-            self.session.drop_due_frames(elapsed_us)
-        self.resume_reading()
-        self._owner.schedule()
-        self._process_soon()
 
     @property
     def _owes_answers(self) -> bool:
@@ -251,16 +250,13 @@ class ClientConnection(asyncio.BufferedProtocol):
         if not self._is_processing:
             self._is_processing = True
             if delay_s:
-                self._loop.call_later(delay_s, self._process_next)
+                self._loop.call_later(delay_s, self._process_inbox)
             else:
-                self._loop.call_soon(self._process_next)
-
-    def _process_next(self) -> None:
-        self._is_processing = False
-        self._process_inbox()
+                self._loop.call_soon(self._process_inbox)
 
     def _process_inbox(self) -> None:
         """Answer one packet. The next one waits for the loop's next turn, so no client delays the others."""
+        self._is_processing = False
         if self._is_held or not self._can_send():
             return
         if self._inbox:
@@ -270,12 +266,11 @@ class ClientConnection(asyncio.BufferedProtocol):
             packet = self._inbox.popleft()
             _log.debug("%s: received %s", self.name, _described(packet))
             for reply in self.filter.answer(packet):
-                self.send(reply)
+                self.filter.send(reply)
             if self.session.said_bye:
                 self.close()
                 return
-            elapsed_us = self._owner.elapsed_us()
-            if elapsed_us is not None:
+            if (elapsed_us := self._owner.elapsed_us()) is not None:
                 self.send_due_frames(elapsed_us)
             self._owner.schedule()
         if self._inbox:
@@ -284,14 +279,13 @@ class ClientConnection(asyncio.BufferedProtocol):
         self.resume_reading()
         if self._reader.error is not None and not self._is_held:
             size = self._reader.error.size
-            self.send(
-                error_packet(f"A packet of {size} bytes is out of bounds (8 to {MAX_COMMAND_BYTES}); closing")
-            )
+            text = f"A packet of {size} bytes is out of bounds (8 to {MAX_COMMAND_BYTES}); closing"
+            self.filter.send(error_packet(text))
             self.close()
         self._close_if_ended()
 
     def _record_for(self, duration_s: float | None) -> None:
-        """See SessionCallbacks."""
+        """See ClientSession."""
         if self._recording_end is not None:
             self._recording_end.cancel()
             self._recording_end = None
@@ -300,8 +294,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def _parameters_xml(self, sections: Sequence[str]) -> bytes:
         address, port = self.transport.get_extra_info("sockname")[:2]
-        frames = self.sent_counts.frames
-        streaming_s = 0.0 if self._first_sent_s is None else self._last_sent_s - self._first_sent_s
+        frames, streaming_s = self.frames_sent, self._last_sent_s - self._first_sent_s
         general = General(
             name=self._owner.name,
             version=gateway.__version__,
@@ -310,7 +303,7 @@ class ClientConnection(asyncio.BufferedProtocol):
             frames_sent=frames,
             frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
         )
-        return self._owner.scene.parameters_xml(sections, general)
+        return self._owner.parameters_xml(sections, general)
 
 
 def _described(packet: Packet) -> str:
@@ -318,3 +311,83 @@ def _described(packet: Packet) -> str:
     if packet.type == PacketType.COMMAND:
         return ascii(packet.body[:_MAX_LOGGED_BYTES].decode("latin-1"))
     return f"a packet of type {packet.type} with {len(packet.body)} bytes"
+
+
+class ConnectionOwner(ABC):
+    """What the connections of one server share: the measurement, limits, and what becomes of each connection.
+
+    RtServer, which adds the port and the timer, describes the arguments.
+    """
+
+    def __init__(
+        self,
+        measurement: Measurement,
+        name: str,
+        new_filter: Callable[[ClientConnection], ConnectionFilter],
+    ) -> None:
+        self.name = name
+        """The name in the General parameters."""
+        self.limits = LIMITS
+        self.new_filter = new_filter
+        self.connections: set[ClientConnection] = set()
+        self.sent: Counter[tuple[ComponentType, ...]] = Counter()
+        """How many frames were sent to all clients together, by the components in them."""
+        self._measurement = measurement
+        self._num_accepted = 0  # connections since the server's start
+        self._dropped_for_closed = 0  # frames dropped on connections that have ended
+
+    def elapsed_us(self) -> int | None:
+        """Return the measurement's time in µs, negative before it begins; None while none runs."""
+        return self._measurement.elapsed_us()
+
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        """Return the frames with these components; an empty sequence means all."""
+        return self._measurement.frames(components)
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
+        """Return the XML of some sections; see Scene."""
+        return self._measurement.scene.parameters_xml(sections, general)
+
+    @abstractmethod
+    def frames_requested(self) -> int | None:
+        """Start the measurement if it waits for the first request for frames; return ``elapsed_us``."""
+
+    @abstractmethod
+    def schedule(self) -> None:
+        """Set the timer again in the loop's next turn, once for all connections that ask for it."""
+
+    def connection_opened(self, connection: ClientConnection) -> int:
+        """Add a new connection; return its number."""
+        self._num_accepted += 1
+        self.connections.add(connection)
+        self.log_opened(connection)
+        return self._num_accepted
+
+    def connection_closed(self, connection: ClientConnection, error: Exception | None) -> None:
+        """Remove a connection that has ended, because of ``error`` or regularly."""
+        self.connections.discard(connection)
+        self._dropped_for_closed += connection.session.frames_dropped
+        self.log_closed(connection, error)
+        self.schedule()
+
+    def log_opened(self, connection: ClientConnection) -> None:
+        """Log a new connection, which may be closed here."""
+        _log.info("%s: connected, number %d", connection.name, self._num_accepted)
+
+    def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:
+        """Log that a connection has ended."""
+        _log.info("%s: disconnected%s", connection.name, f" ({error})" if error else "")
+
+    def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
+        """Note that a client does not read, for the first time or again."""
+        _log.log(
+            logging.WARNING if is_first else logging.DEBUG,
+            "%s does not read: %d MiB wait for it; dropping its frames until it reads again",
+            connection.name,
+            self.limits.unread_bytes_each >> 20,
+        )
+
+    def reading_resumed(self, connection: ClientConnection) -> None:
+        """Note that a client reads again."""
+        num_dropped = connection.session.frames_dropped
+        _log.info("%s reads again; %d of its frames were dropped", connection.name, num_dropped)

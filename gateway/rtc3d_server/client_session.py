@@ -38,34 +38,32 @@ MAX_FRAME_REQUESTS: Final = 1000
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class SessionCallbacks:
-    """What a session needs from its server."""
-
-    frames: Callable[[Sequence[ComponentType]], FrameSource]
-    """Returns the frames with these components; an empty sequence means all."""
-
-    parameters_xml: Callable[[Sequence[str]], bytes]
-    """Returns the XML of some sections of §6 (keys of SECTIONS); an empty sequence means all."""
-
-    frames_requested: Callable[[], int | None]
-    """Called when the client requests frames; returns the measurement's time in µs, None without one."""
-
-    record_for: Callable[[float | None], None] = lambda _duration_s: None
-    """Called when the client starts or stops a recording, with the time in s after which the caller has to
-    call ``end_recording``; None if only the client stops it."""
-
-
 class ClientSession:
     """The protocol with one client, independent of the transport.
 
     All times are in µs since the measurement's start; the caller has the clock. It calls
     ``measurement_started``, ``measurement_stopped`` and ``scene_changed``, sends the packets that ``answer``
     returns, and at ``due_us`` those that ``due_frames`` yields.
+
+    - ``frames`` returns the frames with these components; an empty sequence means all.
+    - ``parameters_xml`` returns the XML of some sections of §6 (keys of SECTIONS), or of all if it is empty.
+    - ``frames_requested`` is called when the client requests frames. It returns the measurement's time in µs,
+      None without one.
+    - ``record_for`` is called when the client starts or stops a recording, with the time in s after which the
+      caller has to call ``end_recording``; None if only the client stops it.
     """
 
-    def __init__(self, callbacks: SessionCallbacks) -> None:
-        self._callbacks = callbacks
+    def __init__(
+        self,
+        frames: Callable[[Sequence[ComponentType]], FrameSource],
+        parameters_xml: Callable[[Sequence[str]], bytes],
+        frames_requested: Callable[[], int | None],
+        record_for: Callable[[float | None], None] = lambda _duration_s: None,
+    ) -> None:
+        self._frames = frames
+        self._parameters_xml = parameters_xml
+        self._frames_requested = frames_requested
+        self._record_for = record_for
         self.name = "client"
         """The client's name in log messages."""
         self._stream_command: StreamFrames | None = None  # the newest one, until StreamFrames Stop
@@ -133,13 +131,17 @@ class ClientSession:
                 except CommandError as error:
                     return [error_packet(str(error))]
             case PacketType.DATA:
-                return self._switch_recording(packet.body)
+                try:
+                    start = recording_switch(packet.body, self.byte_order)
+                except FrameError as error:
+                    return [error_packet(f"Not a data frame: {error}")]
+                if start is not None:
+                    self._set_recording(start=start)
+                    return []
+                text = "The only data frame accepted is a recording control: one event, 1 to start, 0 to stop"
             case _:
-                return [
-                    error_packet(
-                        f"Packets of type {packet.type} are not accepted; commands have type 1 (string)"
-                    )
-                ]
+                text = f"Packets of type {packet.type} are not accepted; commands have type 1 (string)"
+        return [error_packet(text)]
 
     def due_frames(self, elapsed_us: int) -> Iterator[DataPacket]:
         """Yield the frames that are due, oldest first. Frames that the caller does not take stay due."""
@@ -173,13 +175,12 @@ class ClientSession:
         acknowledgement = encode_packet(PacketType.COMMAND, f"OK-{decode_text(body)}".encode("latin-1"))
         match command:
             case Version(number) if number != VERSION:
-                return [
-                    error_packet(f"Version {number} is not supported; this server speaks version {VERSION}")
-                ]
+                text = f"Version {number} is not supported; this server speaks version {VERSION}"
+                return [error_packet(text)]
             case SetByteOrder(byte_order):
                 self.byte_order = byte_order
             case SendParameters(sections):
-                return [encode_packet(PacketType.XML, self._callbacks.parameters_xml(sections))]
+                return [encode_packet(PacketType.XML, self._parameters_xml(sections))]
             case SendCurrentFrame() if len(self._frame_requests) >= MAX_FRAME_REQUESTS:
                 return [error_packet(f"{MAX_FRAME_REQUESTS} requests for the current frame wait already")]
             case SendCurrentFrame() | StreamFrames():
@@ -197,7 +198,7 @@ class ClientSession:
 
     def _request_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:
         """Store a request for frames; return a No Data packet if no measurement is running."""
-        elapsed_us = self._callbacks.frames_requested()
+        elapsed_us = self._frames_requested()
         if isinstance(command, StreamFrames):
             self._stream_command = command
         if elapsed_us is None:
@@ -205,15 +206,14 @@ class ClientSession:
         if isinstance(command, StreamFrames):
             self._start_stream(command, elapsed_us)
         else:
-            self._frame_requests.append(
-                FrameRequest(self._callbacks.frames(command.components), self._newest_us)
-            )
+            frames = self._frames(command.components)
+            self._frame_requests.append(FrameRequest(frames, self._newest_us))
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
         return []
 
     def _start_stream(self, command: StreamFrames, elapsed_us: int) -> None:
-        frames = self._callbacks.frames(command.components)
+        frames = self._frames(command.components)
         # A frame that is due right now is sent, unless the client already has it. A request during a stream
         # continues that stream, so frames that are overdue are sent, too.
         start_us = elapsed_us if self._schedule is None else min(elapsed_us, self._schedule.due_us)
@@ -237,23 +237,9 @@ class ClientSession:
 
     def _set_recording(self, *, start: bool, options: str = "") -> None:
         """Start or stop a recording. Raises CommandError if the duration in ``options`` is none."""
-        self._callbacks.record_for(recording_duration_s(options))
+        self._record_for(recording_duration_s(options))
         self.is_recording = start
         _log.info("%s: recording %s", self.name, "started" if start else "stopped")
-
-    def _switch_recording(self, body: bytes) -> list[bytes]:
-        try:
-            start = recording_switch(body, self.byte_order)
-        except FrameError as error:
-            return [error_packet(f"Not a data frame: {error}")]
-        if start is not None:
-            self._set_recording(start=start)
-            return []
-        return [
-            error_packet(
-                "The only data frame accepted is a recording control: one event, 1 to start, 0 to stop"
-            )
-        ]
 
 
 # Which frames a client gets, and when (§5.3.4, §5.3.5) --------------------------------------
@@ -292,7 +278,12 @@ class FrameSchedule:
 
     def _set_stride(self, first: Fraction) -> None:
         """Count the frames of this stream from the one at ``first`` on."""
-        stride = _stride(self._rate, self._base_rate)
+        stride = Fraction(1)  # ticks from one frame to the next, at least 1 (§5.3.5)
+        match self._rate:
+            case FrequencyDivisor(divisor):
+                stride = Fraction(divisor)
+            case Frequency(hz):
+                stride = max(stride, self._base_rate / Fraction(hz).limit_denominator(1_000_000))
         # As integers with one denominator, because this is computed for every frame of every client.
         self._denominator = first.denominator * stride.denominator
         self._first = first.numerator * stride.denominator
@@ -306,35 +297,20 @@ class FrameSchedule:
 
     def advance(self, count: int = 1) -> None:
         """Advance by ``count`` frames, which were sent or dropped."""
-        if isinstance(self._rate, Frequency) and self._has_other_rate():
-            position = Fraction(self._first + self._num_passed * self._stride, self._denominator)
-            self._set_stride(position.limit_denominator(1000))
+        if isinstance(self._rate, Frequency):
+            rate = self.frames.rate
+            if not (self._base_rate < rate * _SAME_RATE and rate < self._base_rate * _SAME_RATE):
+                self._base_rate = rate
+                position = Fraction(self._first + self._num_passed * self._stride, self._denominator)
+                self._set_stride(position.limit_denominator(1000))
         self._num_passed += count
         self.tick = -(-(self._first + self._num_passed * self._stride) // self._denominator)
-
-    def _has_other_rate(self) -> bool:
-        rate = self.frames.rate
-        if self._base_rate < rate * _SAME_RATE and rate < self._base_rate * _SAME_RATE:
-            return False
-        self._base_rate = rate
-        return True
 
     def num_due(self, elapsed_us: int) -> int:
         """Return how many frames are due at ``elapsed_us``."""
         last_tick = self.frames.tick_after(elapsed_us) - 1
         num_begun = (last_tick * self._denominator - self._first) // self._stride + 1
         return max(0, num_begun - self._num_passed)
-
-
-def _stride(rate: Rate | None, base_rate: Fraction) -> Fraction:
-    """Return the number of ticks of ``base_rate`` from one frame to the next, at least 1 (§5.3.5)."""
-    match rate:
-        case FrequencyDivisor(divisor):
-            return Fraction(divisor)
-        case Frequency(hz):
-            return max(Fraction(1), base_rate / Fraction(hz).limit_denominator(1_000_000))
-        case _:
-            return Fraction(1)
 
 
 def recording_switch(body: bytes, byte_order: ByteOrder) -> bool | None:

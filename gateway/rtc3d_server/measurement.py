@@ -1,7 +1,10 @@
 """The frames of a measurement: its clock, the bytes of its packets, and what all clients share."""
 
+import asyncio
+import math
 import time
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache
@@ -19,9 +22,9 @@ from gateway.rtc3d.components import (
 )
 from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
-from gateway.rtc3d.parameters import General, only_sections
+from gateway.rtc3d.parameters import General, Parameters, only_sections
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.scene import NO_EVENTS, DataPacket, FrameSource, Scene, SceneFunction
+from gateway.rtc3d_server.scene import NO_EVENTS, DataPacket, FrameSource, SampleNumbers, Scene
 
 _BLOCK_FRAMES: Final = 64
 """The scene computes this many frames in one call, because a call of numpy costs much more than a value."""
@@ -53,7 +56,7 @@ class FrameBuilder:
     """
 
     def __init__(
-        self, scene: SceneFunction, requested: Sequence[ComponentType], event_bytes: int = 24
+        self, scene: "ComputedScene", requested: Sequence[ComponentType], event_bytes: int = 24
     ) -> None:
         chosen = [component for component in WIRE_ORDER if not requested or component in requested]
         rates = {c: exact_rate(scene.rates_hz[c]) for c in chosen if c in scene.rates_hz}
@@ -103,9 +106,9 @@ class FrameBuilder:
         if len(events):
             components = (*components, ComponentType.EVENT)
             number = _frame_number(tick, self._events_per_tick)
-            parts.append(
-                encode_component(ComponentType.EVENT, number, timestamp_us, self._resized(events), byte_order)
-            )
+            if self._event_bytes == SHORT_EVENT.itemsize:
+                events = events[["id", "param1", "param2", "param3"]].astype(SHORT_EVENT)
+            parts.append(encode_component(ComponentType.EVENT, number, timestamp_us, events, byte_order))
         packet = encode_packet(PacketType.DATA, encode_frame(parts, byte_order))
         return DataPacket(packet, components)
 
@@ -118,12 +121,6 @@ class FrameBuilder:
             block.append(items.astype(items.dtype.newbyteorder(byte_order), copy=False))
         return block
 
-    def _resized(self, events: Items) -> Items:
-        """Return the events in the configured size."""
-        if self._event_bytes == SHORT_EVENT.itemsize:
-            return events[["id", "param1", "param2", "param3"]].astype(SHORT_EVENT)
-        return events
-
 
 def time_us(tick: int, rate: Fraction) -> int:
     """Return the time of a tick of ``rate`` in µs since the start of the measurement."""
@@ -134,10 +131,35 @@ def _frame_number(tick: int, per_tick: Fraction) -> int:
     return (tick * per_tick.numerator // per_tick.denominator + 1) % _FRAME_NUMBERS
 
 
-class ComputedScene(SceneFunction):
-    """A Scene that is a SceneFunction: subclasses define what the latter contains."""
+class ComputedScene(ABC):
+    """A Scene that is a function of time alone: subclasses define the attributes, ``items`` and ``events``.
+
+    These never block, and always return the same values for the same arguments, so that all clients see the
+    same scene even if their streams differ.
+    """
+
+    parameters: Parameters
+    """All sections of §6 except General."""
+
+    rates_hz: Mapping[ComponentType, float]
+    """The rate in Hz of each measured component of the scene; components without items are missing."""
+
+    measurement_rate_hz: float
+    """The rate of frames in a measurement, and of streams that have only events."""
 
     num_frames: int | None = None
+    """The number of frames in one pass, at ``measurement_rate_hz``; None if the scene has no end."""
+
+    @abstractmethod
+    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
+        """Return a measured component's items, shape (len(samples), number of items).
+
+        The dtype is that of ITEM_DTYPES. The first sample of a pass follows the last one.
+        """
+
+    @abstractmethod
+    def events(self, start_us: int, stop_us: int) -> Items:
+        """Return the events (LONG_EVENT) with time stamps in [start_us, stop_us), in order."""
 
     @property
     def length_us(self) -> int | None:
@@ -150,15 +172,15 @@ class ComputedScene(SceneFunction):
         """See Scene."""
         return encode_parameters(only_sections(replace(self.parameters, general=general), sections))
 
-    def start(self) -> None:
-        """See Scene. There is nothing to prepare."""
+    def start(self) -> None:  # noqa: B027 - there is nothing to prepare
+        """See Scene."""
 
     def advance(self, elapsed_us: int) -> int | None:  # noqa: ARG002 - there is nothing to prepare
         """See Scene. There is nothing to prepare."""
         return None
 
-    def stop(self) -> None:
-        """See Scene. There is nothing to release."""
+    def stop(self) -> None:  # noqa: B027 - there is nothing to release
+        """See Scene."""
 
     def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameBuilder:
         """See Scene."""
@@ -257,3 +279,13 @@ class Measurement:
 
 def _now_us() -> int:
     return time.monotonic_ns() // 1000
+
+
+def call_after_us(delay_us: float, callback: Callable[[], object]) -> asyncio.TimerHandle:
+    """Call ``callback`` after ``delay_us``, rounded up to whole milliseconds; at once if not positive.
+
+    uvloop's timers count whole milliseconds. Without rounding up, a timer could fire just before its
+    time, find nothing due and be set again, many times over.
+    """
+    delay_ms = max(0, math.ceil(delay_us / 1000))
+    return asyncio.get_running_loop().call_later(delay_ms / 1000, callback)

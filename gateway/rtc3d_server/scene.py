@@ -1,13 +1,13 @@
 """The contract between a scene and the RT server that serves it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, Items
+from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 
 SampleNumbers = npt.NDArray[np.int64]
@@ -37,33 +37,26 @@ class FrameSource(Protocol):
     @property
     def measured(self) -> Sequence[ComponentType]:
         """The requested components except events."""
-        ...
 
     @property
     def has_events(self) -> bool:
         """Whether events were requested and can occur."""
-        ...
 
     @property
     def rate(self) -> Fraction:
         """Frames per second: the rate of the slowest measured component (§5.3.5)."""
-        ...
 
     def time_us(self, tick: int) -> int:
         """Return when a frame is due; NOT_YET_US if this is not known yet."""
-        ...
 
     def tick_after(self, elapsed_us: int) -> int:
         """Return the first frame that is due later than ``elapsed_us``."""
-        ...
 
     def oldest_us(self, elapsed_us: int) -> int:
         """Return the time of the oldest frame that is still sent; older ones are dropped."""
-        ...
 
     def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
         """Return a frame; it has the events from ``events_from_us`` to its own time, both included."""
-        ...
 
 
 class Scene(Protocol):
@@ -72,28 +65,22 @@ class Scene(Protocol):
     @property
     def parameters(self) -> Parameters:
         """All sections of §6 that are valid now; the server fills in General if it is None."""
-        ...
 
     @property
     def length_us(self) -> int | None:
         """The time of one pass in µs; None if the scene has no end, or if it is not known yet."""
-        ...
 
     def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
         """Return the XML of some sections (keys of SECTIONS; empty means all), with the server's General."""
-        ...
 
     def start(self) -> None:
         """Begin a measurement: its first pass."""
-        ...
 
     def advance(self, elapsed_us: int) -> int | None:
         """Prepare the frames around this time; return when to call this again, None for never."""
-        ...
 
     def stop(self) -> None:
         """End the measurement."""
-        ...
 
     def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameSource:
         """Return the frames with these components; an empty sequence means all.
@@ -101,35 +88,3 @@ class Scene(Protocol):
         ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16 as in §7.7 (field
         note 6).
         """
-        ...
-
-
-class SceneFunction(Protocol):
-    """A scene that is a function of time alone.
-
-    Its methods never block, and always return the same values for the same arguments, so that all clients
-    see the same scene even if their streams differ.
-    """
-
-    parameters: Parameters
-    """All sections of §6 except General."""
-
-    rates_hz: Mapping[ComponentType, float]
-    """The rate in Hz of each measured component of the scene; components without items are missing."""
-
-    measurement_rate_hz: float
-    """The rate of frames in a measurement, and of streams that have only events."""
-
-    num_frames: int | None
-    """The number of frames in one pass, at ``measurement_rate_hz``; None if the scene has no end."""
-
-    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """Return a measured component's items, shape (len(samples), number of items).
-
-        The dtype is that of ITEM_DTYPES. The first sample of a pass follows the last one.
-        """
-        ...
-
-    def events(self, start_us: int, stop_us: int) -> Items:
-        """Return the events (LONG_EVENT) with time stamps in [start_us, stop_us), in order."""
-        ...

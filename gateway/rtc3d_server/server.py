@@ -2,34 +2,20 @@
 
 import asyncio
 import logging
-import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
 from gateway.errors import PortError, system_reason
-from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.client_connection import LIMITS, ClientConnection, SentCounts
-from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.rtc3d_server.measurement import Measurement
-from gateway.rtc3d_server.scene import FrameSource, Scene
-
-
-def call_after_us(delay_us: float, callback: Callable[[], object]) -> asyncio.TimerHandle:
-    """Call ``callback`` after ``delay_us``, rounded up to whole milliseconds; at once if not positive.
-
-    uvloop's timers count whole milliseconds. Without rounding up, a timer could fire just before its
-    time, find nothing due and be set again, many times over.
-    """
-    delay_ms = max(0, math.ceil(delay_us / 1000))
-    return asyncio.get_running_loop().call_later(delay_ms / 1000, callback)
-
+from gateway.rtc3d_server.client_connection import ClientConnection, ConnectionFilter, ConnectionOwner
+from gateway.rtc3d_server.measurement import Measurement, call_after_us
+from gateway.rtc3d_server.scene import Scene
 
 _log = logging.getLogger(__name__)
 
 
-class RtServer:
+class RtServer(ConnectionOwner):
     """Serves a scene on a TCP port.
 
     With ``port`` 0 the system chooses a free port, which ``port`` contains after ``start``.
@@ -51,22 +37,13 @@ class RtServer:
         event_bytes: int = 24,
         once: bool = False,
         name: str = "RTC3D server",
-        new_filter: Callable[[FilteredConnection], ConnectionFilter] = ConnectionFilter,
+        new_filter: Callable[[ClientConnection], ConnectionFilter] = ConnectionFilter,
     ) -> None:
+        super().__init__(Measurement(scene, event_bytes=event_bytes, once=once), name, new_filter)
         self.host = host
         self.port = port
-        self.name = name
-        """The name in the General parameters."""
-        self.limits = LIMITS
-        self.connections: set[ClientConnection] = set()
-        self.sent_counts = SentCounts()
-        """What was sent to all clients."""
-        self._new_filter = new_filter
-        self._measurement = Measurement(scene, event_bytes=event_bytes, once=once)
         self._once = once
         self._starts_on_request = once  # whether the next request for frames starts the measurement
-        self._num_accepted = 0  # connections since the server's start
-        self._dropped_for_closed = 0  # frames dropped on connections that have ended
         self._server: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._is_scheduling = False  # whether _set_timer is to be called
@@ -84,19 +61,20 @@ class RtServer:
     @property
     def components_sent(self) -> Counter[str]:
         """How often each component was sent, to all clients together, by its key."""
-        return self.sent_counts.components
+        counts: Counter[str] = Counter()
+        for components, frames in self.sent.items():
+            counts.update({component.key: frames for component in components})
+        return counts
 
     @property
     def frames_sent(self) -> int:
         """The number of frames sent to all clients together."""
-        return self.sent_counts.frames
+        return self.sent.total()
 
     @property
     def frames_dropped(self) -> int:
         """The number of frames dropped because clients did not read or the server was late."""
-        return self._dropped_for_closed + sum(
-            connection.session.frames_dropped for connection in self.connections
-        )
+        return self._dropped_for_closed + sum(each.session.frames_dropped for each in self.connections)
 
     # Life cycle -----------------------------------------------------------------------------
 
@@ -163,6 +141,13 @@ class RtServer:
     ) -> None:
         await self.close()
 
+    def connection_opened(self, connection: ClientConnection) -> int:
+        """See ConnectionOwner."""
+        number = super().connection_opened(connection)
+        if not self.is_listening:
+            connection.transport.abort()  # accepted at the moment of a crash
+        return number
+
     # The measurement ------------------------------------------------------------------------
 
     def start_measurement(self) -> None:
@@ -189,6 +174,10 @@ class RtServer:
             connection.measurement_stopped()
         self.schedule()
 
+    def log_measurement(self, text: str) -> None:
+        """Log that a measurement has started or stopped."""
+        _log.info(text)
+
     def change_scene(self, scene: Scene) -> None:
         """Serve another scene from now on; a running measurement and its time stamps continue."""
         self._measurement.change_scene(scene)
@@ -196,89 +185,23 @@ class RtServer:
             connection.session.scene_changed(self.elapsed_us() or 0)
         self.schedule()
 
-    def elapsed_us(self) -> int | None:
-        """Return the measurement's time in µs, negative before it begins; None while none runs."""
-        return self._measurement.elapsed_us()
-
-    # For connections ------------------------------------------------------------------------
-
-    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
-        """Return the frames with these components; an empty sequence means all."""
-        return self._measurement.frames(components)
-
     def frames_requested(self) -> int | None:
-        """Start the measurement if it waits for the first request for frames; return ``elapsed_us``."""
+        """See ConnectionOwner."""
         if self._starts_on_request:
             self.start_measurement()
         else:
             self._measurement.postpone()
         return self.elapsed_us()
 
-    def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
-        """Return the filter for a new connection."""
-        return self._new_filter(connection)
-
-    def connection_opened(self, connection: ClientConnection) -> int:
-        """Add a new connection; return its number."""
-        self._num_accepted += 1
-        self.connections.add(connection)
-        self.log_opened(connection)
-        if not self.is_listening:
-            connection.transport.abort()  # accepted at the moment of a crash
-        return self._num_accepted
-
-    def connection_closed(self, connection: ClientConnection, error: Exception | None) -> None:
-        """Remove a connection that has ended, because of ``error`` or regularly."""
-        self.connections.discard(connection)
-        self._dropped_for_closed += connection.session.frames_dropped
-        self.log_closed(connection, error)
-        self.schedule()
-
-    def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
-        """Note that a client does not read, for the first time or again."""
-        _log.log(
-            logging.WARNING if is_first else logging.DEBUG,
-            "%s does not read: %d MiB wait for it; dropping its frames until it reads again",
-            connection.name,
-            self.limits.unread_bytes_each >> 20,
-        )
-
-    def reading_resumed(self, connection: ClientConnection) -> None:
-        """Note that a client reads again."""
-        _log.info(
-            "%s reads again; %d of its frames were dropped",
-            connection.name,
-            connection.session.frames_dropped,
-        )
-
-    # For subclasses -------------------------------------------------------------------------
+    # Sending --------------------------------------------------------------------------------
 
     def next_frame_us(self) -> int | None:
         """Return when the next frame is due for any client; None if that is unknown."""
         due_us = (connection.due_us for connection in self.connections)
         return min((time_us for time_us in due_us if time_us is not None), default=None)
 
-    def send_frames(self, elapsed_us: int) -> None:
-        """Send every client the frames that are due at this time."""
-        for connection in list(self.connections):
-            connection.send_due_frames(elapsed_us)
-
-    def log_opened(self, connection: ClientConnection) -> None:
-        """Log a new connection, which may be closed here."""
-        _log.info("%s: connected, number %d", connection.name, self._num_accepted)
-
-    def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:
-        """Log that a connection has ended."""
-        _log.info("%s: disconnected%s", connection.name, f" ({error})" if error else "")
-
-    def log_measurement(self, text: str) -> None:
-        """Log that a measurement has started or stopped."""
-        _log.info(text)
-
-    # Sending --------------------------------------------------------------------------------
-
     def schedule(self) -> None:
-        """Set the timer again in the loop's next turn, once for all connections that ask for it."""
+        """See ConnectionOwner."""
         if not self._is_scheduling:
             self._is_scheduling = True
             asyncio.get_running_loop().call_soon(self._set_timer)
@@ -308,3 +231,8 @@ class RtServer:
             self.stop_measurement()
         else:
             self._set_timer()
+
+    def send_frames(self, elapsed_us: int) -> None:
+        """Send every client the frames that are due at this time."""
+        for connection in list(self.connections):
+            connection.send_due_frames(elapsed_us)

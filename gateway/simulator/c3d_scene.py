@@ -52,12 +52,12 @@ class C3dScene(ComputedScene):
         self.parameters = recording.parameters
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See SceneFunction."""
+        """See ComputedScene."""
         items = self._items[component]
         return items.take(samples, axis=0, mode="wrap")
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See SceneFunction. Those of the file happen again in each pass."""
+        """See ComputedScene. Those of the file happen again in each pass."""
         first, stop = self._num_events_before(start_us), self._num_events_before(stop_us)
         if first >= stop:
             return NO_EVENTS

@@ -88,11 +88,11 @@ class SyntheticScene(ComputedScene):
         )
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See SceneFunction."""
+        """See ComputedScene."""
         return self._items[component](samples)
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See SceneFunction. Once a second, a button is pressed and released."""
+        """See ComputedScene. Once a second, a button is pressed and released."""
         first, stop = _events_before(start_us), _events_before(stop_us)
         if first >= stop:
             return NO_EVENTS

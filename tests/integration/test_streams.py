@@ -12,7 +12,7 @@ from gateway.config.settings import StreamSettings
 from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
-from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.client_connection import ClientConnection, ConnectionFilter
 from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
@@ -28,7 +28,7 @@ SCENE = SyntheticScene(markers=3, tools=1, analog=2, plates=1, rate_hz=200, anal
 class _Filter(ConnectionFilter):
     """Lets the server handle what its clients do while there is another client."""
 
-    def __init__(self, connection: FilteredConnection, server: "OneClientServer") -> None:
+    def __init__(self, connection: ClientConnection, server: "OneClientServer") -> None:
         super().__init__(connection)
         self._server = server
 
@@ -79,7 +79,7 @@ class OneClientServer(RtServer):
     def is_listening(self) -> bool:
         return self.on_second == "refuse" or super().is_listening
 
-    def close_others(self, connection: FilteredConnection) -> None:
+    def close_others(self, connection: ClientConnection) -> None:
         for other in list(self.connections):
             if other.number != connection.number:
                 other.transport.abort()
@@ -162,7 +162,7 @@ class _Nameless(_Filter):
 
 async def test_a_server_that_knows_no_component_names_sends_everything_on_one_connection() -> None:
     server = OneClientServer("serve")
-    server._new_filter = lambda each: _Nameless(each, server)
+    server.new_filter = lambda each: _Nameless(each, server)
     async with server, run_gateway(server.port) as lab:
         analog = await lab.wait_for("analog", 100)
         assert step(analog) == 10

@@ -136,7 +136,7 @@ def test_trackers_have_different_names_that_vrpn_accepts(
         else:
             trackers.set_tools(source, tools)
             present[source] = tools
-        current = list(trackers.current)
+        current = list(trackers.by_name.values())
         assert len(current) == sum(map(len, present.values()))
         assert len({tracker.name for tracker in current}) == len(current)
         assert len({tracker.number for tracker in current}) == len(current)

@@ -7,31 +7,33 @@ does not read. docs/design.md has more about this.
 
 import asyncio
 import logging
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, cast
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import Server, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from gateway.errors import QueryError
 from gateway.foxglove_schemas.topics import Topic
-from gateway.logs.failures import DefectLog
+from gateway.logs.failures import DefectLog, EventLog
 from gateway.outputs.foxglove import connections
-from gateway.outputs.foxglove.connections import (
-    LIMITS,
-    MAX_REQUEST_BYTES,
-    Connection,
-    Viewer,
-    ViewerAdmission,
-)
+from gateway.outputs.foxglove.connections import LIMITS, MAX_REQUEST_BYTES, Viewer
+from gateway.outputs.listen_address import foreign_page
+from gateway.server_limits import Clients
 
 SERVER_NAME: Final = "rtc3d-gateway"
 
 _PING_INTERVAL_S: Final = 10.0
 _PING_TIMEOUT_S: Final = 20.0
 """A viewer that does not answer a ping for this long is disconnected: its computer may have gone."""
+
+_FOXGLOVE: Final = re.compile(r"https://([a-z0-9-]+\.)*foxglove\.dev")
+_DESKTOP: Final = "file://"
+"""Lichtblick for the desktop is a page from the disk, which no web site can be."""
 
 logger = logging.getLogger(__name__)
 
@@ -66,8 +68,9 @@ class FoxgloveServer:
         self._info = connections.server_info(SERVER_NAME, session)
         self._channels: dict[int, Channel] = {}
         self._last_number = 0
-        self._viewers: set[Viewer] = set()
-        self._admission = ViewerAdmission(host, origins)
+        self._origins = frozenset(origin.lower() for origin in origins)
+        self.clients: Clients[Viewer] = Clients(LIMITS, lambda each: each.transport.abort())
+        self._events = EventLog(logger, "foxglove")
         self._server: Server | None = None
         self._opening = asyncio.Lock()
         self._is_closed = False
@@ -75,27 +78,26 @@ class FoxgloveServer:
 
     async def open(self) -> None:
         """Listen, unless ``close`` was called. Raises OSError."""
+        create: Any = partial(Viewer, self.clients, self._events)
+        handler, refuse = cast(Any, self._serve), cast(Any, self._refuse)
         async with self._opening:
-            if not self._is_closed:
-                self._server = await self._listen()
-
-    async def _listen(self) -> Server:
-        create: Any = partial(Connection, self._admission)
-        return await serve(
-            self._serve,
-            self._host,
-            self._port,
-            subprotocols=[Subprotocol(name) for name in connections.SUBPROTOCOLS],
-            compression=None,  # it would cost more than a network in a laboratory
-            process_request=self._admission.refuse,
-            open_timeout=LIMITS.handshake_s,
-            ping_interval=_PING_INTERVAL_S,
-            ping_timeout=_PING_TIMEOUT_S,
-            close_timeout=LIMITS.close_s,
-            max_size=MAX_REQUEST_BYTES,
-            logger=_library_logger,
-            create_connection=create,
-        )
+            if self._is_closed:
+                return
+            self._server = await serve(
+                handler,
+                self._host,
+                self._port,
+                subprotocols=[Subprotocol(name) for name in connections.SUBPROTOCOLS],
+                compression=None,  # it would cost more than a network in a laboratory
+                process_request=refuse,
+                open_timeout=LIMITS.handshake_s,
+                ping_interval=_PING_INTERVAL_S,
+                ping_timeout=_PING_TIMEOUT_S,
+                close_timeout=LIMITS.close_s,
+                max_size=MAX_REQUEST_BYTES,
+                logger=_library_logger,
+                create_connection=create,
+            )
 
     async def close(self) -> None:
         """Stop listening, and disconnect all viewers."""
@@ -112,8 +114,7 @@ class FoxgloveServer:
         self._last_number += 1
         channel = Channel(self._last_number, topic, on_change)
         self._channels[channel.number] = channel
-        for viewer in self._viewers:
-            viewer.send_control(connections.advertise([channel.text]))
+        self._tell_all(connections.advertise([channel.text]))
         return channel
 
     def close_channels(self, channels: list[Channel]) -> None:
@@ -124,45 +125,64 @@ class FoxgloveServer:
                 del viewer.subscriptions[number]
             channel.subscribers.clear()
         if channels:
-            message = connections.unadvertise([channel.number for channel in channels])
-            for viewer in self._viewers:
-                viewer.send_control(message)
+            self._tell_all(connections.unadvertise([channel.number for channel in channels]))
+
+    def _tell_all(self, message: str) -> None:
+        for viewer in tuple(self.clients.served):
+            viewer.send_control(message)
 
     # Viewers.
 
-    async def _serve(self, connection: ServerConnection) -> None:
+    def _refuse(self, viewer: Viewer, request: Request) -> Response | None:
+        """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        reason = foreign_page(self._host, hosts, origins, self._is_of_a_viewer)
+        if reason:
+            reason = f"{reason}; if a viewer of yours is there, add it to foxglove.origins"
+            self._events.log(logging.WARNING, f"{viewer.address} is refused: {reason}", "foreign page")
+            return viewer.respond(403, f"{reason}\n")
+        if not self.clients.is_full:
+            return None
+        most = self.clients.limits.clients
+        text = f"{viewer.address} is refused: {most} viewers are connected; close one of them"
+        self._events.log(logging.WARNING, text, "refused")
+        return viewer.respond(503, f"{most} viewers are connected already; close one of them.\n")
+
+    def _is_of_a_viewer(self, origin: str) -> bool:
+        """Return whether pages of this origin are viewers: Foxglove's, from the disk, or configured."""
+        origin = origin.lower()
+        return origin in self._origins or origin == _DESKTOP or bool(_FOXGLOVE.fullmatch(origin))
+
+    async def _serve(self, viewer: Viewer) -> None:
         """Serve a viewer until it disconnects."""
-        self._admission.clients.serve(connection)
-        viewer = Viewer(connection, self._admission)
+        self.clients.serve(viewer)
         logger.debug("foxglove: %s connected", viewer.address)
-        self._viewers.add(viewer)
         try:
             viewer.send_control(self._info)
             viewer.send_control(connections.advertise(channel.text for channel in self._channels.values()))
-            async for message in connection:
+            async for message in viewer:
                 self._handle(viewer, message)
         except ConnectionClosed:
             pass
         except Exception as defect:  # noqa: BLE001 - the other viewers are served nevertheless
             self._defects.log(defect)
         finally:
-            self._admission.clients.close(connection)  # it may have ended before this began
-            self._viewers.discard(viewer)
+            self.clients.close(viewer)  # it may have ended before this began
             for number in list(viewer.subscriptions):
                 self._unsubscribe(viewer, number)
             logger.debug("foxglove: %s disconnected", viewer.address)
 
     def _handle(self, viewer: Viewer, message: str | bytes) -> None:
         try:
-            request = connections.parse_request(message)
+            begun, ended = connections.parse_request(message)
         except QueryError as error:
-            viewer.send_control(connections.error(str(error)))
+            viewer.send_control(connections.status(connections.ERROR, str(error)))
             return
-        problems = [self._subscribe(viewer, *subscription) for subscription in request.subscriptions]
-        for number in request.ended:
+        problems = [self._subscribe(viewer, *subscription) for subscription in begun]
+        for number in ended:
             self._unsubscribe(viewer, number)
         if problem := next(filter(None, problems), ""):  # one of them is enough for the user
-            viewer.send_control(connections.error(problem))
+            viewer.send_control(connections.status(connections.ERROR, problem))
 
     def _subscribe(self, viewer: Viewer, number: int, channel_number: int) -> str:
         """Subscribe a viewer to a channel. Return why the subscription is ignored; "" if it is not."""
@@ -189,11 +209,5 @@ class FoxgloveServer:
 
 def send(channel: Channel, utime: int, data: bytes) -> list[Viewer]:
     """Send a message to all subscribers; return those that lose it because they do not read fast enough."""
-    return [
-        viewer for viewer, number in channel.subscribers.items() if not viewer.send_data(number, utime, data)
-    ]
-
-
-def send_to(viewer: Viewer, channel: Channel, utime: int, data: bytes) -> bool:
-    """Send a message to one subscriber; return False if it loses the message."""
-    return viewer.send_data(channel.subscribers[viewer], utime, data)
+    subscribers = channel.subscribers.items()
+    return [viewer for viewer, number in subscribers if not viewer.send_message(number, utime, data)]

@@ -8,8 +8,7 @@ from pydantic import Field
 from gateway.config.section import expects
 from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, Switch
-from gateway.outputs.contract import Output
-from gateway.outputs.kind import OutputKind, imported_late, missing_package
+from gateway.outputs.kind import OutputKind, imported_late
 from gateway.outputs.listen_address import is_loopback
 
 Origin = Annotated[
@@ -42,19 +41,10 @@ class FoxgloveSettings(OutputSettings):
         return [ListenAddress(("port",), self.host, self.port)]
 
 
-def _create(settings: FoxgloveSettings) -> Output:
-    """Return the output. Raises ConfigError if its packages are not installed."""
-    try:
-        from gateway.outputs.foxglove.output import FoxgloveOutput  # noqa: PLC0415 - needs the extra foxglove
-    except ImportError as error:
-        raise missing_package("foxglove", "foxglove", error) from error
-    return FoxgloveOutput(settings)
-
-
 FOXGLOVE: Final = OutputKind(
     name="foxglove",
     settings=FoxgloveSettings,
-    create=_create,
+    create=imported_late("gateway.outputs.foxglove.output:FoxgloveOutput", extra="foxglove"),
     checks=("package", "port"),
     run_checks=imported_late("gateway.outputs.foxglove.checks:check_foxglove"),
     leaves_host=lambda settings: not is_loopback(settings.host),

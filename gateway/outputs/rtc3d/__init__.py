@@ -4,11 +4,10 @@ The server is ``gateway.rtc3d_server``, the same as the simulator's; the scene i
 Start with ``output``: one port for each source, served in a thread with an event loop of its own.
 
 The path of a frame: ``output`` offers it to the thread; ``arrivals`` notes it, with the rate of its stream;
-``live_frames`` joins components that arrive on different connections, by time stamp; ``live_scene`` gives the
-server the frames that each client has requested.
+``live_frames`` joins components that arrive on different connections, by time stamp; ``LiveScene`` in
+``live_server`` gives the server the frames that each client has requested.
 
 - ``live_server``: one source's server: opened, paused while the source does not stream, closed.
 - ``client_filter``: what the gateway adds to a client's connection: limits, the control of recordings, and
   C3D files.
-- ``checks``: what the doctor checks.
 """

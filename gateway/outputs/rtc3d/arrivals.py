@@ -30,21 +30,18 @@ class Composition(NamedTuple):
     is_complete: bool
 
 
-class Arrival:
+class Arrival(NamedTuple):
     """A frame, when it arrived and on which stream.
 
     ``time_us`` is on the clock of the measurement and grows with every arrival. ``timestamp_us`` is the
     server's. ``stream`` is the number of the connection.
     """
 
-    __slots__ = ("composition", "frame", "stream", "time_us", "timestamp_us")
-
-    def __init__(self, frame: Frame, composition: Composition, stream: int, time_us: int) -> None:
-        self.frame = frame
-        self.composition = composition
-        self.stream = stream
-        self.time_us = time_us
-        self.timestamp_us = frame.number_and_timestamp[1]
+    frame: Frame
+    composition: Composition
+    stream: int
+    time_us: int
+    timestamp_us: int
 
     @property
     def num_bytes(self) -> int:
@@ -195,7 +192,7 @@ class Arrivals:
                 known.skip(self.newest_us - max(former_us, 0))
         if self.began_us is None:
             self.began_us = self.newest_us
-        arrival = Arrival(frame, composition, stream, self.newest_us)
+        arrival = Arrival(frame, composition, stream, self.newest_us, frame.number_and_timestamp[1])
         if composition.measured:
             rate = self.rates.get(stream)
             if rate is None:
@@ -289,41 +286,26 @@ def encode_joined(
 
     If two frames have the same component, the first frame counts.
     """
-    found: dict[ComponentType, tuple[Frame, list[int]]] = {}
+    found: dict[ComponentType, list[bytes]] = {}
     for arrival in arrivals:
-        frame = arrival.frame
-        indices: dict[ComponentType, list[int]] = {}
+        frame, missing = arrival.frame, (chosen & arrival.composition.measured) - found.keys()
         for index, component in enumerate(frame.layout.components):
-            if component.type in chosen and component.type in arrival.composition.measured:
-                indices.setdefault(component.type, []).append(index)
-        for component_type, its_indices in indices.items():
-            found.setdefault(component_type, (frame, its_indices))
-    parts = [
-        _component_bytes(frame, index, byte_order)
-        for component_type in WIRE_ORDER
-        if component_type in found
-        for frame, indices_of_type in [found[component_type]]
-        for index in indices_of_type
-    ]
+            if component.type not in missing:
+                continue
+            if frame.layout.byte_order == byte_order:
+                start, end = frame.layout.content_spans[index]
+                data = frame.body[start - _HEADER_BYTES : end]
+            else:
+                data = _encoded(frame.component(index), byte_order)
+            found.setdefault(component.type, []).append(data)
+    parts = [part for component_type in WIRE_ORDER for part in found.get(component_type, ())]
     return encode_frame([*parts, *events], byte_order)
-
-
-def _component_bytes(frame: Frame, index: int, byte_order: ByteOrder) -> bytes:
-    if frame.layout.byte_order == byte_order:
-        start, end = frame.layout.content_spans[index]
-        return frame.body[start - _HEADER_BYTES : end]
-    return _encoded(frame.component(index), byte_order)
 
 
 def _encoded(component: Component, byte_order: ByteOrder) -> bytes:
     return encode_component(
         component.type, component.frame_number, component.timestamp_us, component.items(), byte_order
     )
-
-
-def _in_order(component: Component, byte_order: ByteOrder) -> Items:
-    items = component.items()
-    return items.astype(items.dtype.newbyteorder(byte_order), copy=False)
 
 
 def encode_events(events: Sequence[Events], main: Arrival, byte_order: ByteOrder) -> list[bytes]:
@@ -335,17 +317,13 @@ def encode_events(events: Sequence[Events], main: Arrival, byte_order: ByteOrder
     components = [component for each in events for component in each.components]
     if all(each.time_us == main.time_us for each in events):
         return [_encoded(component, byte_order) for component in components]
-    by_size: dict[int, list[Component]] = {}
+    by_size: dict[int, list[Items]] = {}
     for component in components:
-        by_size.setdefault(component.item_bytes, []).append(component)
-    frame_number, timestamp_us = main.frame.number_and_timestamp
+        items = component.items()
+        items = items.astype(items.dtype.newbyteorder(byte_order), copy=False)
+        by_size.setdefault(component.item_bytes, []).append(items)
+    number_and_timestamp = main.frame.number_and_timestamp
     return [
-        encode_component(
-            ComponentType.EVENT,
-            frame_number,
-            timestamp_us,
-            np.concatenate([_in_order(component, byte_order) for component in same_size]),
-            byte_order,
-        )
+        encode_component(ComponentType.EVENT, *number_and_timestamp, np.concatenate(same_size), byte_order)
         for same_size in by_size.values()
     ]

@@ -1,14 +1,17 @@
 """What the gateway adds to the connection of an RTC3D client: limits, control of recordings, C3D files."""
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Callable, Coroutine
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 from gateway.errors import CommandError, FrameError, QueryError
 from gateway.logs.failures import DefectLog
+from gateway.logs.losses import Losses
+from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d import commands
 from gateway.rtc3d.packets import (
     PACKET_HEADER,
@@ -18,15 +21,22 @@ from gateway.rtc3d.packets import (
     decode_text,
     encode_packet,
 )
+from gateway.rtc3d_server.client_connection import ClientConnection, ConnectionFilter
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS, error_packet, recording_switch
-from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.server_limits import notice_vanished
+from gateway.server_limits import Clients, notice_vanished
+from gateway.workers import WorkerThread
 
-if TYPE_CHECKING:
-    from gateway.outputs.rtc3d.live_server import LiveServer
+SLOW_CLIENT: Final = "slow client"
+"""The cause of frames that a client did not get because it does not read fast enough."""
+
+FILE: Final = "C3D file"
+"""The cause of C3D files that a client did not get."""
 
 _CONTROL_S: Final = 30.0
 """How long a client waits at most for the start or the end of a recording."""
+
+_PARAMETERS_S: Final = 1.0
+"""How long a client waits for the parameters while the gateway is connecting to the server."""
 
 _CHUNK_BYTES: Final = 256 * 1024
 _FILE_BUFFER_BYTES: Final = 1024 * 1024
@@ -47,23 +57,61 @@ ControlRecording = Callable[[str, bool, str], Coroutine[Any, Any, str]]
 Returns the text of the server's reply, "" if it sent none."""
 
 
-class ClientFilter(ConnectionFilter):
-    """Limits what a client can do without a command, and lets it control recordings and get files."""
+class SourceState:
+    """What the gateway knows about a source, and whether its clients ask for frames.
 
-    def __init__(self, connection: FilteredConnection, owner: "LiveServer") -> None:
+    The gateway's event loop assigns all attributes but ``wanted``; the thread of the clients reads them.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.is_streaming = False
+        """Whether frames arrive."""
+        self.is_measuring: bool | None = None
+        """Whether a measurement runs; None if that is unknown."""
+        self.parameters = ServerParameters(b"", 0, 0)
+        self.losses = Losses(_log, f"{source} to rtc3d")
+        self.wanted = False
+        """Whether any client asks for frames. The server assigns it."""
+        self.heard = asyncio.Event()
+        """Set in the thread once anything is known."""
+
+    @property
+    def has_no_measurement(self) -> bool:
+        """Whether it is known that no frames can come now."""
+        return not self.is_streaming and self.is_measuring is False
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything is known of the source: parameters, frames, or that it has none."""
+        return self.parameters.version > 0 or self.is_streaming or self.is_measuring is not None
+
+
+class ClientFilter(ConnectionFilter):
+    """Limits what a client can do without a command, and lets it control recordings and get files.
+
+    ``disk`` reads the files, and ``control`` starts and stops recordings.
+    """
+
+    def __init__(
+        self,
+        connection: ClientConnection,
+        state: SourceState,
+        clients: "Clients[ClientFilter]",
+        disk: WorkerThread,
+        control: ControlRecording,
+    ) -> None:
         super().__init__(connection)
-        self._owner = owner
+        self._state = state
+        self._clients = clients
+        self._disk = disk
+        self._control = control
         self._files: list[Path] = []
         self._held: list[bytes] = []  # packets that wait for the end of a file
         self._tasks: set[asyncio.Task[None]] = set()
         self._defects = DefectLog(_log, "rtc3d")
-        self._greeting = asyncio.get_running_loop().call_later(owner.limits.handshake_s, self._give_up)
-        notice_vanished(connection.transport.get_extra_info("socket"), owner.limits)
-
-    @property
-    def has_greeted(self) -> bool:
-        """Whether the client has sent a command of the protocol."""
-        return self in self._owner.clients.served
+        self._greeting = asyncio.get_running_loop().call_later(clients.limits.handshake_s, self._give_up)
+        notice_vanished(connection.transport.get_extra_info("socket"), clients.limits)
 
     def send(self, packet: bytes) -> None:
         """Send a packet, or hold it until the end of a file."""
@@ -72,7 +120,11 @@ class ClientFilter(ConnectionFilter):
         elif len(self._held) < MAX_HELD_PACKETS:
             self._held.append(packet)
         else:
-            self._owner.packet_lost(self.connection.name)
+            text = (
+                f"client {self.connection.name} reads a C3D file too slowly: {MAX_HELD_PACKETS} packets wait "
+                "for its end, further ones are dropped; check that program, or the network to it"
+            )
+            self._state.losses.lost(SLOW_CLIENT, text, frames=0)
 
     def answer(self, packet: Packet) -> list[bytes]:
         """Return the replies to a packet.
@@ -82,24 +134,22 @@ class ClientFilter(ConnectionFilter):
         control = recording_control(packet)
         if control is not None:
             self._greet()
-            self._hold(partial(self._control, packet, control))
-            return []
-        if not self._owner.is_known and asks_for_parameters(packet):
+            self._hold(partial(self._control_recording, packet, control))
+        elif not self._state.is_known and asks_for_parameters(packet):
             self._hold(partial(self._answer_when_known, packet))
-            return []
-        return self._answer_now(packet)
+        else:
+            return self._answer_now(packet)
+        return []
 
     def _answer_now(self, packet: Packet) -> list[bytes]:
-        self._owner.apply_parameters()
         replies = self.connection.answer(packet)
-        if not self.has_greeted and any(reply[7] != PacketType.ERROR for reply in replies):
+        if self not in self._clients.served and any(reply[7] != PacketType.ERROR for reply in replies):
             self._greet()
-        self._owner.check_wanted()
         return replies
 
     def connection_lost(self) -> None:
         """End what is done for the client."""
-        self._owner.clients.close(self)
+        self._clients.close(self)
         self._greeting.cancel()
         for task in self._tasks:
             task.cancel()
@@ -109,11 +159,11 @@ class ClientFilter(ConnectionFilter):
         self.connection.transport.abort()
 
     def _greet(self) -> None:
-        self._owner.clients.serve(self)
+        self._clients.serve(self)
         self._greeting.cancel()
 
     def _give_up(self) -> None:
-        wait_s = self._owner.limits.handshake_s
+        wait_s = self._clients.limits.handshake_s
         _log.debug("%s sent no command within %g s; closing", self.connection.name, wait_s)
         self.connection.write(error_packet(f"No command within {wait_s:g} s; closing"))
         self.connection.transport.close()
@@ -122,6 +172,8 @@ class ClientFilter(ConnectionFilter):
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+    # Replies that come later ----------------------------------------------------------------
 
     def _hold(self, work: Callable[[], Coroutine[Any, Any, list[bytes]]]) -> None:
         """Answer no further packet until this work is done, and has returned the replies to this one."""
@@ -139,28 +191,29 @@ class ClientFilter(ConnectionFilter):
             self.connection.continue_commands()
 
     async def _answer_when_known(self, packet: Packet) -> list[bytes]:
-        await self._owner.wait_until_known()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_PARAMETERS_S):
+                await self._state.heard.wait()
         return self._answer_now(packet)
 
-    # Recordings -----------------------------------------------------------------------------
-
-    async def _control(self, packet: Packet, control: commands.ControlRecording) -> list[bytes]:
+    async def _control_recording(self, packet: Packet, control: commands.ControlRecording) -> list[bytes]:
         try:
             async with asyncio.timeout(_CONTROL_S):
-                reply = await self._owner.control_recording(start=control.start, options=control.options)
+                reply = await self._control(self._state.source, control.start, control.options)
             if reply:
                 return [encode_packet(PacketType.COMMAND, reply.encode("latin-1"))]
             return self.connection.answer(packet)
         except (QueryError, TimeoutError) as error:
+            done = "started" if control.start else "stopped"
             text = str(error) or f"no answer within {_CONTROL_S:g} s"
-            return [error_packet(f"The recording was not {_done(control)}: {text}")]
+            return [error_packet(f"The recording was not {done}: {text}")]
 
     # Files ----------------------------------------------------------------------------------
 
     def send_file(self, path: Path) -> None:
         """Send a C3D file after those that wait. Frames are dropped meanwhile; events and replies wait."""
         if len(self._files) >= _MAX_FILES:
-            self._owner.file_lost(self.connection.name, path, f"{_MAX_FILES} files wait for it already")
+            self._file_lost(path, f"{_MAX_FILES} files wait for it already")
             return
         self._files.append(path)
         if len(self._files) == 1:
@@ -171,17 +224,24 @@ class ClientFilter(ConnectionFilter):
             try:
                 await self._send_file(self._files[0])
             except OSError as error:
-                self._owner.file_lost(self.connection.name, self._files[0], error.strerror or str(error))
+                self._file_lost(self._files[0], error.strerror or str(error))
             except Exception as defect:  # noqa: BLE001 - the next file can still be sent
                 self._defects.log(defect)
-                self._owner.file_lost(self.connection.name, self._files[0], "a defect in the gateway")
+                self._file_lost(self._files[0], "a defect in the gateway")
             self._files.pop(0)
+
+    def _file_lost(self, path: Path, reason: str) -> None:
+        text = (
+            f"client {self.connection.name} does not get {path.name}: {reason}; the gateway keeps files in "
+            "its spool"
+        )
+        self._state.losses.lost(FILE, text, frames=0)
 
     async def _send_file(self, path: Path) -> None:
         """Send one file. Raises OSError; if that is in the middle of the file, the connection ends."""
-        file: BinaryIO = await self._owner.disk.run(lambda: path.open("rb"))
+        file: BinaryIO = await self._disk.run(lambda: path.open("rb"))
         try:
-            num_bytes = await self._owner.disk.run(lambda: path.stat().st_size)
+            num_bytes = await self._disk.run(lambda: path.stat().st_size)
             self.is_busy = True
             try:
                 self.connection.write(PACKET_HEADER.pack(PACKET_HEADER_BYTES + num_bytes, PacketType.C3D))
@@ -192,7 +252,7 @@ class ClientFilter(ConnectionFilter):
             finally:
                 self.is_busy = False
         finally:
-            self._owner.disk.submit(file.close)
+            self._disk.submit(file.close)
         held, self._held = self._held, []
         for packet in held:
             self.connection.write(packet)
@@ -202,7 +262,7 @@ class ClientFilter(ConnectionFilter):
         transport = self.connection.transport
         while num_bytes:
             size = min(num_bytes, _CHUNK_BYTES)
-            chunk = await self._owner.disk.run(lambda size=size: file.read(size))  # type: ignore[misc]
+            chunk = await self._disk.run(partial(file.read, size))
             if len(chunk) != size:
                 raise OSError("it is shorter than it was")
             self.connection.write(chunk)
@@ -230,7 +290,3 @@ def asks_for_parameters(packet: Packet) -> bool:
     """Return whether a packet is SendParameters."""
     words = decode_text(packet.body[:_LONGEST_NAME]).split() if packet.type == PacketType.COMMAND else []
     return bool(words) and words[0].lower() == "sendparameters"
-
-
-def _done(control: commands.ControlRecording) -> str:
-    return "started" if control.start else "stopped"

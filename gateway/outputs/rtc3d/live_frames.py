@@ -12,7 +12,6 @@ from gateway.outputs.rtc3d.arrivals import (
     Arrivals,
     Events,
     Kept,
-    StreamRate,
     encode_events,
     encode_joined,
     events_of,
@@ -146,11 +145,19 @@ class LiveFrames:
 
     def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
         """See FrameSource. Events of several frames become one component."""
-        if events_from_us is None or not self._events or self._events.newest.time_us < events_from_us:
-            return self._packet(byte_order, tick, 0, 0)
-        first = self._first_event_from(events_from_us)
-        packet = self._packet(byte_order, tick, first, self._first_event_from(self._frames[tick].time_us + 1))
-        return packet._replace(lacks_events=True) if self._dropped_event_us >= events_from_us else packet
+        first_event = end_event = 0
+        lacks_events = False
+        if events_from_us is not None and self._events and self._events.newest.time_us >= events_from_us:
+            first_event = self._first_event_from(events_from_us)
+            end_event = self._first_event_from(self._frames[tick].time_us + 1)
+            lacks_events = self._dropped_event_us >= events_from_us
+        key = (byte_order, tick, first_event, end_event)
+        packet = self._packets.get(key)
+        if packet is None:
+            if len(self._packets) >= _CACHED_PACKETS:
+                del self._packets[next(iter(self._packets))]
+            packet = self._packets[key] = self._build_packet(*key)
+        return packet._replace(lacks_events=True) if lacks_events else packet
 
     def _first_event_from(self, time_us: int) -> int:
         """Return the number of the first events that came at this time or later."""
@@ -160,41 +167,22 @@ class LiveFrames:
             number -= 1
         return number
 
-    def _packet(self, byte_order: ByteOrder, tick: int, first_event: int, end_event: int) -> DataPacket:
-        key = (byte_order, tick, first_event, end_event)
-        packet = self._packets.get(key)
-        if packet is None:
-            if len(self._packets) >= _CACHED_PACKETS:
-                del self._packets[next(iter(self._packets))]
-            packet = self._packets[key] = self._build_packet(*key)
-        return packet
-
     def _build_packet(self, byte_order: ByteOrder, tick: int, first_event: int, end_event: int) -> DataPacket:
         frame = self._frames[tick]
         events = [self._events[number] for number in range(first_event, end_event)]
-        components = frame.main.composition.measured & self._measured
-        if not frame.others:
-            own_events = [frame.main.time_us] if frame.main.composition.has_events else []
-            if own_events == [each.time_us for each in events]:
-                body = unchanged_body(frame.main, self.chosen, byte_order, takes_all=self._takes_all)
-                if body is not None:
-                    return DataPacket(
-                        encode_packet(PacketType.DATA, body), self._in_wire_order(components, bool(events))
-                    )
-        for other in frame.others:
-            components |= other.composition.measured & self._measured
-        body = encode_joined(
-            (frame.main, *frame.others),
-            self._measured,
-            encode_events(events, frame.main, byte_order),
-            byte_order,
-        )
-        return DataPacket(encode_packet(PacketType.DATA, body), self._in_wire_order(components, bool(events)))
-
-    @staticmethod
-    def _in_wire_order(components: frozenset[ComponentType], has_events: bool) -> tuple[ComponentType, ...]:
-        measured = tuple(each for each in WIRE_ORDER if each in components)
-        return (*measured, ComponentType.EVENT) if has_events else measured
+        main, arrivals = frame.main, (frame.main, *frame.others)
+        present = frozenset[ComponentType]().union(*(each.composition.measured for each in arrivals))
+        components: tuple[ComponentType, ...] = tuple(each for each in self.measured if each in present)
+        if events:
+            components += (ComponentType.EVENT,)
+        own_events = [main.time_us] if main.composition.has_events else []
+        body = None
+        if not frame.others and own_events == [each.time_us for each in events]:
+            body = unchanged_body(main, self.chosen, byte_order, takes_all=self._takes_all)
+        if body is None:
+            encoded_events = encode_events(events, main, byte_order)
+            body = encode_joined(arrivals, self._measured, encoded_events, byte_order)
+        return DataPacket(encode_packet(PacketType.DATA, body), components)
 
     # For the scene --------------------------------------------------------------------------
 
@@ -214,9 +202,12 @@ class LiveFrames:
                     self._undecided.append(arrival)
             self._next_arrival = arrived.end
         if self._undecided is not None:
-            due_us = self._decide(self._undecided, elapsed_us)
-            if due_us is not None:
-                return due_us
+            due_us = self._learned_us()
+            if due_us is not None and due_us > elapsed_us:
+                return due_us if self._undecided else None
+            undecided, self._undecided = self._undecided, None
+            for arrival in undecided.since(undecided.first):
+                self._take(arrival)
         if self._waiting:
             self._release(elapsed_us)
             if self._waiting:
@@ -237,16 +228,6 @@ class LiveFrames:
         self._next_arrival = self._arrivals.frames.end
 
     # Which arrivals become frames -----------------------------------------------------------
-
-    def _decide(self, undecided: Kept[Arrival], now_us: int) -> int | None:
-        """Take the frames so far if it is known what sets the rate; return when to try again otherwise."""
-        due_us = self._learned_us()
-        if due_us is not None and due_us > now_us:
-            return due_us if undecided else None
-        self._undecided = None
-        for arrival in undecided.since(undecided.first):
-            self._take(arrival)
-        return None
 
     def _learned_us(self) -> int | None:
         """Return until when to wait for the streams of the choice; None if they are known."""
@@ -360,16 +341,13 @@ class LiveFrames:
             if newest is not None:
                 others.append(newest)
                 self._joined.add(stream)
-            elif stream not in self._joined and self._begins_later(arrival, rate, samples):
+            elif (
+                arrival.time_us - rate.time_us < _FASTER_ALIVE_US
+                and stream not in self._joined
+                and (not samples or samples.oldest.timestamp_us < arrival.timestamp_us + _OTHER_CLOCK_US)
+            ):
                 return
         self._add(arrival, tuple(others))
-
-    @staticmethod
-    def _begins_later(arrival: Arrival, rate: StreamRate, samples: "Kept[Arrival] | tuple[()]") -> bool:
-        """Return whether a stream that has had no sample in a frame has only later ones so far."""
-        if arrival.time_us - rate.time_us >= _FASTER_ALIVE_US:
-            return False
-        return not samples or samples.oldest.timestamp_us < arrival.timestamp_us + _OTHER_CLOCK_US
 
     def _add(self, arrival: Arrival, others: tuple[Arrival, ...] = ()) -> None:
         last_us = self._frames.newest.time_us if self._frames else -1

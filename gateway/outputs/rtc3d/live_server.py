@@ -1,69 +1,43 @@
-"""The RT server of one live source. It runs in the event loop of the output's thread."""
+"""The RT server of one live source, and its scene. They run in the event loop of the output's thread."""
 
 import asyncio
-import contextlib
 import logging
 import math
-from collections.abc import Callable, Coroutine, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Final, cast
+from weakref import WeakValueDictionary
 
+from gateway.errors import CommandError
 from gateway.logs.failures import EventLog
-from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, ClientFilter, ControlRecording
-from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
-from gateway.outputs.rtc3d.live_scene import LiveScene
-from gateway.rtc3d.components import ComponentType
+from gateway.outputs.rtc3d.arrivals import Arrivals
+from gateway.outputs.rtc3d.client_filter import SLOW_CLIENT, ClientFilter, ControlRecording, SourceState
+from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, LiveFrames
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType, described_rate_hz, num_described_items
 from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.parameters import General, Parameters
+from gateway.rtc3d.parameters_xml import cut_sections
 from gateway.rtc3d_server.client_connection import LIMITS, ClientConnection
 from gateway.rtc3d_server.client_session import error_packet
-from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.scene import FrameSource
 from gateway.rtc3d_server.server import RtServer
 from gateway.server_limits import Clients
 from gateway.workers import WorkerThread
 
-SLOW_CLIENT: Final = "slow client"
-"""The cause of frames that a client did not get because it does not read fast enough."""
-
-FILE: Final = "C3D file"
-"""The cause of C3D files that a client did not get."""
-
 _NO_FRAMES_S: Final = 2.0
 """How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
-
-_PARAMETERS_S: Final = 1.0
-"""How long a client waits for the parameters while the gateway is connecting to the server."""
 
 _END_S: Final = 0.1
 """How long no frame must have come before a measurement ends."""
 
+_KEPT_CHOICES: Final = 2
+_CACHED_SECTIONS: Final = 16  # clients can ask for 63 different choices
+
 _log = logging.getLogger(__name__)
-
-
-class SourceState:
-    """What the gateway knows about a source, and whether its clients ask for frames.
-
-    The gateway's event loop assigns all attributes but ``wanted``; the thread of the clients reads them.
-    """
-
-    def __init__(self, source: str) -> None:
-        self.source = source
-        self.is_streaming = False
-        """Whether frames arrive."""
-        self.is_measuring: bool | None = None
-        """Whether a measurement runs; None if that is unknown."""
-        self.parameters = ServerParameters(b"", 0, 0)
-        self.losses: Losses | None = None
-        self.wanted = False
-        """Whether any client asks for frames. The server assigns it."""
-
-    @property
-    def has_no_measurement(self) -> bool:
-        """Whether it is known that no frames can come now."""
-        return not self.is_streaming and self.is_measuring is False
 
 
 class LiveServer(RtServer):
@@ -84,18 +58,22 @@ class LiveServer(RtServer):
         control: ControlRecording,
     ) -> None:
         self._live_scene = LiveScene(state.source)
-        super().__init__(self._live_scene, host, port, name=f"rtc3d.ports.{state.source}")
+        super().__init__(
+            self._live_scene,
+            host,
+            port,
+            name=f"rtc3d.ports.{state.source}",
+            new_filter=lambda each: ClientFilter(each, state, self.clients, self.disk, control),
+        )
         self.clients: Clients[ClientFilter] = Clients(LIMITS, ClientFilter.abort)
         self.set_max_clients(max_clients)
         self._state = state
         self._applied_parameters: ServerParameters | None = None
         self._wanted_changed = wanted_changed
-        self._control = control
         self._events = EventLog(_log, f"{state.source} to rtc3d")
         self._giving_up: asyncio.TimerHandle | None = None  # waits for frames, before No Data
         self._ending: asyncio.TimerHandle | None = None  # waits for the last frames, before No Data
         self._last_frame_s = -math.inf
-        self._heard = asyncio.Event()  # set once anything is known of the source
         # How many dropped frames and frames without events of each client are in the losses.
         self._num_counted: dict[ClientConnection, tuple[int, int]] = {}
         self.disk = WorkerThread(f"{state.source} files")
@@ -129,8 +107,8 @@ class LiveServer(RtServer):
         """
         self.apply_parameters()
         state = self._state
-        if self.is_known:
-            self._heard.set()
+        if state.is_known:
+            state.heard.set()
         is_waiting = self._giving_up is not None and not state.has_no_measurement
         if self.elapsed_us() is None or state.is_streaming or is_waiting:
             return
@@ -152,25 +130,17 @@ class LiveServer(RtServer):
             self._applied_parameters = parameters
             self._live_scene.set_parameters(parameters.xml, parameters.parsed)
 
-    @property
-    def is_known(self) -> bool:
-        """Whether anything is known of the source: parameters, frames, or that it has none."""
-        state = self._state
-        return state.parameters.version > 0 or state.is_streaming or state.is_measuring is not None
-
-    async def wait_until_known(self) -> None:
-        """Wait until ``is_known``, but not for long."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_PARAMETERS_S):
-                await self._heard.wait()
-
     def send_file(self, path: Path) -> None:
         """Send a C3D file to every client that has sent a command."""
         for client in self.clients.served:
             client.send_file(path)
 
     def maintain(self) -> None:
-        """Count the frames that slow clients have lost. Call it once a second."""
+        """Apply what is new of the source, and count the frames that slow clients have lost.
+
+        Call it once a second, and after a change of the source.
+        """
+        self.apply_state()
         for connection in self.connections:
             self._count_dropped(connection)
         self.check_wanted()  # after a change of the port, the former server has said that nothing is wanted
@@ -184,7 +154,13 @@ class LiveServer(RtServer):
 
     def frames(self, components: Sequence[ComponentType]) -> FrameSource:
         """See RtServer. Frames that no client asks for are not made."""
+        self.apply_parameters()
         return self._live_scene.frames(components)
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
+        """See RtServer."""
+        self.apply_parameters()
+        return super().parameters_xml(sections, general)
 
     def next_frame_us(self) -> int | None:
         """See RtServer. Frames are sent when they arrive."""
@@ -204,9 +180,10 @@ class LiveServer(RtServer):
                 self._giving_up = asyncio.get_running_loop().call_later(_NO_FRAMES_S, self._give_up)
         return self.elapsed_us()
 
-    def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
-        """See RtServer."""
-        return ClientFilter(connection, self)
+    def schedule(self) -> None:
+        """See RtServer. What clients ask for may have changed."""
+        self.check_wanted()
+        super().schedule()
 
     async def close(self) -> None:
         """See RtServer."""
@@ -214,28 +191,8 @@ class LiveServer(RtServer):
         if self._ending is not None:
             self._ending.cancel()
         await super().close()
-        self.check_wanted()
 
     # For connections ------------------------------------------------------------------------
-
-    def control_recording(self, *, start: bool, options: str) -> Coroutine[Any, Any, str]:
-        """Start or stop a recording on the source's server; return its reply or "". Raises QueryError."""
-        return self._control(self._state.source, start, options)
-
-    def file_lost(self, client: str, path: Path, reason: str) -> None:
-        """Count and log a C3D file that a client does not get."""
-        if self._state.losses is not None:
-            text = f"client {client} does not get {path.name}: {reason}; the gateway keeps files in its spool"
-            self._state.losses.lost(FILE, text, frames=0)
-
-    def packet_lost(self, client: str) -> None:
-        """Count and log a packet that a client does not get, because it reads a C3D file too slowly."""
-        if self._state.losses is not None:
-            text = (
-                f"client {client} reads a C3D file too slowly: {MAX_HELD_PACKETS} packets wait for its end, "
-                "further ones are dropped; check that program, or the network to it"
-            )
-            self._state.losses.lost(SLOW_CLIENT, text, frames=0)
 
     def check_wanted(self) -> None:
         """Note whether any client asks for frames now."""
@@ -267,7 +224,6 @@ class LiveServer(RtServer):
         """Log that a client has gone, and count what it lost."""
         self._count_dropped(connection)
         self._num_counted.pop(connection, None)
-        self.check_wanted()
         reason = f" ({error})" if error else ""
         self._events.log(logging.INFO, f"client {connection.name} disconnected{reason}", "disconnected")
 
@@ -292,10 +248,7 @@ class LiveServer(RtServer):
         _log.debug("%s: %s", self._state.source, text)
 
     def _count_dropped(self, connection: ClientConnection) -> None:
-        losses = self._state.losses
-        if losses is None:
-            return
-        session = connection.session
+        losses, session = self._state.losses, connection.session
         frames, lacking = self._num_counted.get(connection, (0, 0))
         self._num_counted[connection] = (session.frames_dropped, session.frames_without_events)
         if num_new := session.frames_dropped - frames:
@@ -325,3 +278,92 @@ class LiveServer(RtServer):
         if self._giving_up is not None:
             self._giving_up.cancel()
             self._giving_up = None
+
+
+class LiveScene:
+    """The scene of a live source (see Scene). Its time is that of the arrival of frames."""
+
+    length_us = None
+
+    def __init__(self, source: str) -> None:
+        self._source = source
+        self._arrivals = Arrivals()
+        # What clients ask for, by its components. It is there while any client asks for it, and a bit longer,
+        # because a client can ask for one frame after the other.
+        self._frames: WeakValueDictionary[frozenset[ComponentType], LiveFrames] = WeakValueDictionary()
+        self._recent: deque[LiveFrames] = deque(maxlen=_KEPT_CHOICES)
+        self.has_new_frames = False
+        """Whether there are frames for clients that were not there when this was set to False."""
+        self.set_parameters(b"", Parameters())
+
+    def set_parameters(self, xml: bytes, parsed: Parameters) -> None:
+        """Serve these parameters from now on; ``xml`` is empty if the server gives none."""
+        self._xml = xml
+        self._parsed = parsed
+        self._announced_hz: Mapping[ComponentType, float] = {
+            component: rate_hz
+            for component in WIRE_ORDER
+            if num_described_items(parsed, component)
+            and (rate_hz := described_rate_hz(parsed, component)) is not None
+        }
+        self._xml_of = lru_cache(_CACHED_SECTIONS)(partial(cut_sections, xml, parsed))
+
+    def add(self, frame: Frame, stream: int, wanted: frozenset[ComponentType], elapsed_us: int) -> bool:
+        """Add a frame that arrives now on this stream; return whether it has ``wanted`` components."""
+        return self._arrivals.add(frame, stream, wanted, elapsed_us) is not None
+
+    def forget_frames(self) -> None:
+        """Forget the frames so far, because none are added any more while no client asks for any."""
+        self._arrivals.frames.clear()
+        self._recent.clear()
+        for frames in list(self._frames.values()):
+            frames.forget()
+
+    @property
+    def newest_us(self) -> int:
+        """When the newest frame arrived, on the clock of the measurement; -1 before the first."""
+        return self._arrivals.newest_us
+
+    @property
+    def parameters(self) -> Parameters:
+        """See Scene."""
+        return self._parsed
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:  # noqa: ARG002 - its own
+        """See Scene. General is that of the source's server.
+
+        Raises CommandError if its server gives no parameters.
+        """
+        if not self._xml:
+            raise CommandError(f"The server of source {self._source} has given no parameters")
+        return self._xml_of(frozenset(sections))
+
+    def start(self) -> None:
+        """See Scene."""
+        self.stop()
+
+    def advance(self, elapsed_us: int) -> int | None:
+        """See Scene. It takes new frames for all that clients ask for."""
+        due_us: int | None = None
+        for frames in list(self._frames.values()):
+            next_frame = frames.next_frame
+            its_due_us = frames.update(elapsed_us)
+            self.has_new_frames = self.has_new_frames or frames.next_frame != next_frame
+            if its_due_us is not None and (due_us is None or its_due_us < due_us):
+                due_us = its_due_us
+        return due_us
+
+    def stop(self) -> None:
+        """See Scene."""
+        self._arrivals.restart()
+        self._frames.clear()
+        self._recent.clear()
+
+    def frames(self, components: Sequence[ComponentType], event_bytes: int = 24) -> LiveFrames:  # noqa: ARG002
+        """See Scene. Events have the size in which they arrive."""
+        choice = frozenset(components)
+        frames = self._frames.get(choice)
+        if frames is None:
+            frames = self._frames[choice] = LiveFrames(components, self._arrivals, self._announced_hz)
+            self._recent.append(frames)
+        return frames

@@ -1,9 +1,11 @@
-"""The output that serves RTC3D clients: an RT server for each source that has a port."""
+"""The output that serves RTC3D clients, an RT server for each source that has a port, and its checks."""
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from gateway.errors import OutputError, PortError
@@ -19,29 +21,33 @@ from gateway.outputs.contract import (
     ServerFile,
     ServerParameters,
 )
+from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.frame_output import PortOpener, ServerOutput
-from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT, LiveServer, SourceState
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.listen_address import from_this_computer, listen_problem
+from gateway.outputs.rtc3d.client_filter import FILE, SLOW_CLIENT, SourceState
+from gateway.outputs.rtc3d.live_server import LiveServer
+from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
 from gateway.outputs.threads import LoopThread, in_this_loop
+from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
 
 QUEUE_FULL: Final = "queue full"
 """The cause of frames that nobody got because the thread of the clients cannot keep up."""
 
-Take = Callable[[str, Frame, int, frozenset[ComponentType]], None]
-"""Takes the source, a frame, the number of its stream, and the components to send. Called in the thread."""
-
 
 class Rtc3dPublisher:
-    """Hands frames of one source over, while any client wants frames."""
+    """Hands frames of one source over, while any client wants frames.
+
+    ``offer`` has the thread make a call with the source's server; see LoopThread.offer.
+    """
 
     def __init__(
-        self, state: SourceState, offer: Callable[[Callable[[], None], int], bool], take: Take
+        self, state: SourceState, offer: Callable[[Callable[[LiveServer], None], int], bool]
     ) -> None:
         self._state = state
         self._offer = offer
-        self._take = take
         self._is_closed = False
 
     @property
@@ -63,8 +69,10 @@ class Rtc3dPublisher:
             raise OutputError(
                 f"rtc3d: {self._state.source} is closed; ask for a new publisher", cause="closed"
             )
-        call = partial(self._take, self._state.source, frame, stamp.session, components)
-        if self._state.wanted and not self._offer(call, len(frame.body)):
+        session = stamp.session
+        if self._state.wanted and not self._offer(
+            lambda server: server.take(frame, session, components), len(frame.body)
+        ):
             raise OutputError(
                 f"rtc3d: the frames of {self._state.source} arrive faster than they can be sent to all "
                 "clients; let fewer clients connect, or let them ask for fewer frames",
@@ -89,8 +97,13 @@ class _Served:
         self.opener = PortOpener(_log, f"{source} to rtc3d", f"port {port} is not open yet")
         self.server: LiveServer | None = None
         self.task: asyncio.Task[None] | None = None
-        self.is_stopped = False
         self.closed = asyncio.Event()
+
+    async def stop(self) -> None:
+        """Close the port."""
+        if self.task is not None:
+            self.task.cancel()
+            await self.closed.wait()
 
 
 class Rtc3dOutput(ServerOutput):
@@ -120,7 +133,7 @@ class Rtc3dOutput(ServerOutput):
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return a publisher of whole frames."""
-        return Rtc3dPublisher(self._state(source), self._offer, self._take)
+        return Rtc3dPublisher(self._state(source), partial(self._offer_to, source))
 
     def health(self) -> OutputHealth:
         """Return whether clients can connect to all sources that have a port."""
@@ -134,22 +147,21 @@ class Rtc3dOutput(ServerOutput):
             self._states[source] = SourceState(source)
         return self._states[source]
 
-    def _server(self, source: str) -> LiveServer | None:
-        """Return the server of a source, in the thread; None while its port is not open."""
+    def _offer_to(self, source: str, call: Callable[[LiveServer], None], num_bytes: int = 0) -> bool:
+        """Have the thread make a call with the source's server, if its port is open then; see ``_offer``."""
+        return self._offer(partial(self._call, source, call), num_bytes)
+
+    def _call(self, source: str, call: Callable[[LiveServer], None]) -> None:
         served = self._served.get(source)
-        return None if served is None else served.server
+        if served is not None and served.server is not None:
+            call(served.server)
 
     # Maintenance ----------------------------------------------------------------------------
 
     def maintain(self) -> None:
         """Let the thread count what slow clients have lost."""
-        self._offer(self._maintain)
-
-    def _maintain(self) -> None:
         for source in list(self._served):
-            if (server := self._server(source)) is not None:
-                server.apply_state()
-                server.maintain()
+            self._offer_to(source, LiveServer.maintain)
 
     def is_configured_like(self, other: Output) -> bool:
         """Any settings can be taken over."""
@@ -191,30 +203,25 @@ class Rtc3dOutput(ServerOutput):
     def show_streaming(self, source: str, is_streaming: bool) -> None:
         """Let clients know when frames end."""
         self._state(source).is_streaming = is_streaming
-        self._offer(self._maintain)
+        self._offer_to(source, LiveServer.maintain)
 
     def show_measurement(self, source: str, is_running: bool | None) -> None:
         """Let clients know when a measurement ends."""
         self._state(source).is_measuring = is_running
-        self._offer(self._maintain)
+        self._offer_to(source, LiveServer.maintain)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Serve these parameters to clients that ask for them."""
         self._state(source).parameters = parameters
-        self._offer(self._maintain)
+        self._offer_to(source, LiveServer.maintain)
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Pass a C3D file on to the clients."""
         if self._thread is not None:
-            self._thread.run(self._send_file(source, file))  # not _offer, which can be refused
+            self._thread.run(self._send_file(source, file.path))  # not _offer, which can be refused
 
-    async def _send_file(self, source: str, file: ServerFile) -> None:
-        if (server := self._server(source)) is not None:
-            server.send_file(file.path)
-
-    def _take(self, source: str, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
-        if (server := self._server(source)) is not None:
-            server.take(frame, stream, wanted)
+    async def _send_file(self, source: str, path: Path) -> None:
+        self._call(source, lambda server: server.send_file(path))
 
     # Recordings -----------------------------------------------------------------------------
 
@@ -243,44 +250,43 @@ class Rtc3dOutput(ServerOutput):
         )
         if self._thread is None:
             return
+        max_clients = self.settings.max_clients
         for source, port in ports.items():
             if source not in self._served:
                 served = self._served[source] = _Served(source, port)
                 self._closing = [former for former in self._closing if not former.closed.is_set()]
                 self._thread.run(self._keep_open(self._state(source), served, tuple(self._closing)))
-            self._offer(partial(self._set_max_clients, source, self.settings.max_clients))
-
-    def _set_max_clients(self, source: str, max_clients: int) -> None:
-        if (server := self._server(source)) is not None:
-            server.set_max_clients(max_clients)
+            self._offer_to(source, lambda server: server.set_max_clients(max_clients))
 
     def _close_ports(self, sources: list[str]) -> None:
         for source in sources:
             served = self._served.pop(source)
-            served.is_stopped = True
             if self._thread is not None:
                 self._closing.append(served)
-                self._thread.run(_stop(served))
+                self._thread.run(served.stop())
 
     async def _stop(self) -> None:
-        await asyncio.gather(*(_stop(served) for served in self._served.values()))
+        await asyncio.gather(*(served.stop() for served in self._served.values()))
 
-    async def _keep_open(self, state: SourceState, served: _Served, closing: Sequence[_Served]) -> None:
+    async def _keep_open(self, state: SourceState, served: _Served, closing: tuple[_Served, ...]) -> None:
         """Listen on the port until stopped. Wait for those that are ``closing`` first."""
         served.task = asyncio.current_task()
-        for former in closing:
-            await former.closed.wait()
-        if served.is_stopped:
-            return
-        host, port = self.settings.host, served.port
-        listen = partial(self._listen, state, host, port)
-        with log_fields(source=state.source):
-            served.server = await served.opener.open(listen, f"clients can connect to {host}, port {port}")
-            try:
-                await asyncio.Event().wait()  # until cancelled
-            finally:
-                server, served.server = served.server, None
-                await server.close()
+        try:
+            for former in closing:
+                await former.closed.wait()
+            host, port = self.settings.host, served.port
+            listen = partial(self._listen, state, host, port)
+            with log_fields(source=state.source):
+                server = served.server = await served.opener.open(
+                    listen, f"clients can connect to {host}, port {port}"
+                )
+                try:
+                    await asyncio.Event().wait()  # until cancelled
+                finally:
+                    served.server = None
+                    await server.close()
+        finally:
+            served.closed.set()
 
     async def _listen(self, state: SourceState, host: str, port: int) -> LiveServer:
         on_wanted = self._on_wanted.get(state.source, lambda: None)
@@ -292,9 +298,64 @@ class Rtc3dOutput(ServerOutput):
         return server
 
 
-async def _stop(served: _Served) -> None:
-    served.is_stopped = True
-    if served.task is not None:
-        served.task.cancel()
-        await asyncio.wait([served.task])
-    served.closed.set()
+_MAX_REPLY_BYTES: Final = 64 * 1024
+
+_SOURCES, _PORTS = (Check("rtc3d", name) for name in RTC3D.checks)
+
+
+def check_rtc3d(
+    settings: Rtc3dSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], seconds: float
+) -> list[Finding]:
+    """Check that each port belongs to a source, and is free or has the gateway's own RT server."""
+    ports = [_check_port(settings.host, source, port, seconds) for source, port in settings.ports.items()]
+    return [_check_sources(settings, sources), *(ports or [_PORTS.not_tested("rtc3d.ports is empty")])]
+
+
+def _check_sources(settings: Rtc3dSettings, sources: Sequence[str]) -> Finding:
+    unknown = [source for source in settings.ports if source not in sources]
+    if unknown:
+        return _SOURCES.warning(
+            f"rtc3d.ports has a port for {', '.join(unknown)}, which is no source",
+            f"Correct the name; the sources are {', '.join(sources)}.",
+        )
+    missing = [source for source in sources if source not in settings.ports]
+    if missing:
+        return _SOURCES.note(
+            f"RTC3D clients cannot connect to {', '.join(missing)}",
+            "If they should, add a port in rtc3d.ports.",
+        )
+    return _SOURCES.passing("each source has a port for RTC3D clients")
+
+
+def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
+    place = f"{host}, port {port} (for {source})"
+    problem = listen_problem(host, port)
+    if not problem:
+        return _PORTS.passing(f"{place} is free")
+    if _is_rt_server(host, port, seconds):
+        return _PORTS.passing(f"an RT server answers on {place}: the gateway, if it runs")
+    return _PORTS.failing(
+        f"cannot listen on {place}: {problem}",
+        f"Choose another port in rtc3d.ports.{source}, correct rtc3d.host, or stop the program that has it.",
+    )
+
+
+def _is_rt_server(host: str, port: int, seconds: float) -> bool:
+    """Return whether a server on this port answers a command of the protocol."""
+    command = encode_packet(PacketType.COMMAND, encode_command(Version()))
+    try:
+        with socket.create_connection((from_this_computer(host), port), timeout=seconds) as tcp:
+            tcp.sendall(command)
+            header = tcp.recv(PACKET_HEADER_BYTES, socket.MSG_WAITALL)
+            if len(header) < PACKET_HEADER_BYTES:
+                return False
+            size, packet_type = PACKET_HEADER.unpack(header)
+            if packet_type not in {PacketType.ERROR, PacketType.COMMAND}:
+                return False
+            if not PACKET_HEADER_BYTES <= size <= _MAX_REPLY_BYTES:
+                return False
+            # The whole reply, because closing a connection with unread bytes resets it.
+            tcp.recv(size - PACKET_HEADER_BYTES, socket.MSG_WAITALL)
+    except OSError:
+        return False
+    return True

@@ -1,9 +1,9 @@
 """The section ``rtc3d`` of the configuration, and the output in the registry."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Final, Self
 
-from pydantic import AfterValidator, Field, PlainSerializer, model_validator
+from pydantic import Field, PlainSerializer, model_validator
 
 from gateway.config.section import expects, validation_error
 from gateway.config.settings import ListenAddress, OutputSettings
@@ -14,20 +14,8 @@ from gateway.outputs.listen_address import is_loopback
 DEFAULT_MAX_CLIENTS: Final = 128
 
 
-def _check_different(ports: Mapping[str, int]) -> Mapping[str, int]:
-    owners: dict[int, str] = {}
-    for source, port in ports.items():
-        if port in owners:
-            raise validation_error(
-                f"found {port}, which {owners[port]} has too; expected another port for each source", source
-            )
-        owners[port] = source
-    return ports
-
-
 Ports = Annotated[
     dict[SourceName, Port],
-    AfterValidator(_check_different),
     PlainSerializer(dict),
     expects("a port for each source that is served, as in {lab: 3120}"),
 ]
@@ -57,7 +45,12 @@ class Rtc3dSettings(OutputSettings):
         return [ListenAddress(("ports", source), self.host, port) for source, port in self.ports.items()]
 
     @model_validator(mode="after")
-    def _check_any_port(self) -> Self:
+    def _check_ports(self) -> Self:
+        owners: dict[int, str] = {}
+        for source, port in self.ports.items():
+            if (owner := owners.setdefault(port, source)) != source:
+                text = f"found {port}, which {owner} has too; expected another port for each source"
+                raise validation_error(text, "ports", source)
         if self.enabled and not self.ports:
             raise validation_error(
                 "found nothing; expected a port for each source that is served, as in {lab: 3120}", "ports"
@@ -70,6 +63,6 @@ RTC3D: Final = OutputKind(
     settings=Rtc3dSettings,
     create=imported_late("gateway.outputs.rtc3d.output:Rtc3dOutput"),
     checks=("sources", "ports"),
-    run_checks=imported_late("gateway.outputs.rtc3d.checks:check_rtc3d"),
+    run_checks=imported_late("gateway.outputs.rtc3d.output:check_rtc3d"),
     leaves_host=lambda settings: not is_loopback(settings.host),
 )

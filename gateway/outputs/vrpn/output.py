@@ -1,30 +1,30 @@
-"""The output that serves tools as VRPN trackers."""
+"""The output that serves tools as VRPN trackers, and what the doctor checks of it."""
 
 import asyncio
-from collections.abc import Callable, Collection, Mapping
+import socket
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Final
 
 from gateway.descriptions.labels import describe
 from gateway.descriptions.source_frame import unknown_unit_text
-from gateway.errors import OutputError
+from gateway.errors import OutputError, system_reason
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
+from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.frame_output import ServerOutput
+from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.threads import LoopThread, in_this_loop
-from gateway.outputs.vrpn.protocol import encode_pose
-from gateway.outputs.vrpn.server import VrpnServer
-from gateway.outputs.vrpn.settings import VrpnSettings
+from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START, encode_pose
+from gateway.outputs.vrpn.server import VrpnServer, bind, logger
+from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
 from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import ComponentType, num_described_items
 from gateway.rtc3d.frames import Frame, FrameLayout
 
 MAX_TOOLS: Final = 256
 """How many tools of a source can be trackers, and how many poses of a frame are sent, at most."""
-
-Offer = Callable[[Callable[[], None], int], bool]
-"""LoopThread.offer of the server's thread."""
 
 _NO_PARAMETERS: Final = ServerParameters(b"", 0, 0)
 
@@ -32,11 +32,15 @@ _NO_PARAMETERS: Final = ServerParameters(b"", 0, 0)
 class VrpnPublisher:
     """Takes whole frames of one source and sends the poses of its tools.
 
+    ``offer`` is LoopThread.offer of the server's thread.
+
     Methods without an underscore are for the gateway's event loop, the others run in the server's thread.
     """
 
-    def __init__(self, source: str, server: VrpnServer, offer: Offer) -> None:
-        self.losses: Losses | None = None
+    def __init__(
+        self, source: str, server: VrpnServer, offer: Callable[[Callable[[], None], int], bool]
+    ) -> None:
+        self.losses = Losses(logger, f"{source} to vrpn")
         """Counts the poses that are lost."""
         self._source = source
         self._server = server
@@ -88,8 +92,7 @@ class VrpnPublisher:
 
     def _show(self, parameters: ServerParameters, num_tools: int) -> None:
         """Name the trackers of ``num_tools`` tools, or of more if the parameters have more."""
-        tools = parameters.parsed.tools
-        num_labels = 0 if tools is None else len(tools.tools)
+        num_labels = num_described_items(parameters.parsed, ComponentType.TOOLS)
         num_trackers = min(max(num_labels, num_tools), MAX_TOOLS)
         labels = describe(ComponentType.TOOLS, parameters.parsed, num_trackers).labels
         self._server.trackers.set_tools(self._source, labels)
@@ -112,28 +115,24 @@ class VrpnPublisher:
                     messages.append(encode_pose(tracker.number, stamp.capture_utime, pose))
         if num_with_tracker < num_items:
             num_lost = num_items - num_with_tracker
-            self._count_loss(
+            self.losses.lost(
                 "too many tools",
                 f"{num_lost} tools have no tracker: there can be {MAX_TOOLS} of a source and {MAX_TRACKERS} "
                 "of all; remove tools that are not used from the server",
-                num_lost,
+                messages=num_lost,
             )
         slow = self._server.send(b"".join(messages)) if messages else []
         if slow:
-            self._count_loss(
+            self.losses.lost(
                 "slow client",
                 f"poses for {slow[0]} are lost, because it does not read them fast enough; look at that "
                 "program",
-                len(messages) * len(slow),
+                messages=len(messages) * len(slow),
             )
 
     @property
     def _trackers(self) -> Collection[Tracker | None]:
         return self._server.trackers.of_source(self._source).values()
-
-    def _count_loss(self, cause: str, text: str, num_poses: int) -> None:
-        if self.losses is not None:
-            self.losses.lost(cause, text, messages=num_poses)
 
 
 def _tool_indices(layout: FrameLayout) -> list[int]:
@@ -204,5 +203,50 @@ class VrpnOutput(ServerOutput):
 
     def health(self) -> OutputHealth:
         """Return whether clients can connect."""
-        problem = self._server.problem
-        return OutputHealth(not problem, problem)
+        return OutputHealth(not self._server.problem, self._server.problem)
+
+
+_TIMEOUT_S: Final = 2.0
+
+_PORT, _ACCESS = (Check("vrpn", name) for name in VRPN.checks)
+
+
+def check_vrpn(
+    settings: VrpnSettings, _sources: Sequence[str], _loads: Sequence[MessageLoad], _seconds: float
+) -> list[Finding]:
+    """Check that the port can be used, and say who can connect."""
+    access = _ACCESS.passing("only programs on this computer can connect")
+    if not is_loopback(settings.host):
+        access = _ACCESS.note(
+            f"any computer that reaches {settings.host} can connect: VRPN has no password and no encryption",
+            "Open the port in the firewall for the computers that need it, or set vrpn.host to 127.0.0.1.",
+        )
+    return [_check_port(settings), access]
+
+
+def _check_port(settings: VrpnSettings) -> Finding:
+    where = f"{settings.host}, port {settings.port}"
+    try:
+        for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+            bind(socket.getaddrinfo(settings.host, settings.port, type=kind), kind).close()
+    except OSError as error:
+        if _is_served(settings):
+            return _PORT.passing(f"a VRPN server answers on {where}")
+        return _PORT.failing(
+            f"cannot listen on {where}: {system_reason(error)}, and no VRPN server answers there",
+            "Stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
+            "computer and a free port.",
+        )
+    return _PORT.passing(f"TCP and UDP are free on {where}; no gateway serves VRPN there now")
+
+
+def _is_served(settings: VrpnSettings) -> bool:
+    """Return whether a VRPN server answers on the port."""
+    address = (from_this_computer(settings.host), settings.port)
+    try:
+        with socket.create_connection(address, _TIMEOUT_S) as connection:
+            connection.settimeout(_TIMEOUT_S)
+            cookie = connection.recv(COOKIE_BYTES, socket.MSG_WAITALL)
+    except OSError:
+        return False
+    return cookie.startswith(COOKIE_START)

@@ -91,7 +91,10 @@ class ClientReader:
             if len(self._waiting) - start < _HEADER_BYTES:
                 break
             length, _, _, sender, type_, _ = _HEADER.unpack_from(self._waiting, start)
-            body_bytes = _body_bytes(length)
+            body_bytes = length - _HEADER_BYTES  # without padding
+            if not 0 <= body_bytes <= MAX_BODY_BYTES:
+                most = _HEADER_BYTES + MAX_BODY_BYTES
+                raise PeerError(f"a message of {length} bytes; expected {_HEADER_BYTES} to {most}")
             padded_bytes = _padded(body_bytes)
             if type_ in (_SENDER_DESCRIPTION, _TYPE_DESCRIPTION):
                 if body_bytes > _MAX_DESCRIPTION_BYTES:
@@ -112,9 +115,8 @@ class ClientReader:
     def _take_cookie(self) -> bool:
         begin = bytes(self._waiting[: len(COOKIE_START)])
         if begin != COOKIE_START[: len(begin)]:
-            raise PeerError(
-                f"it does not speak VRPN 07; its first bytes are {quoted(begin.decode('latin-1'))}"
-            )
+            first = quoted(begin.decode("latin-1"))
+            raise PeerError(f"it does not speak VRPN 07; its first bytes are {first}")
         self.has_cookie = len(self._waiting) >= COOKIE_BYTES
         if self.has_cookie:
             del self._waiting[:COOKIE_BYTES]
@@ -130,16 +132,6 @@ class ClientReader:
             self._ping_type = number
         elif number == self._ping_type:
             self._ping_type = None
-
-
-def _body_bytes(length: int) -> int:
-    """Return the size of a body without padding from the length in its header."""
-    body_bytes = length - _HEADER_BYTES
-    if not 0 <= body_bytes <= MAX_BODY_BYTES:
-        raise PeerError(
-            f"a message of {length} bytes; expected {_HEADER_BYTES} to {_HEADER_BYTES + MAX_BODY_BYTES}"
-        )
-    return body_bytes
 
 
 def _padded(num_bytes: int) -> int:

@@ -8,15 +8,21 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final, cast
 
 from gateway.errors import PeerError, PortError
 from gateway.logs.failures import DefectLog, EventLog
 from gateway.messages.host_time import now_utime
 from gateway.outputs.frame_output import PortOpener
-from gateway.outputs.vrpn.callbacks import CallbackRequests
-from gateway.outputs.vrpn.protocol import COOKIE, TYPE_DESCRIPTIONS, ClientReader, encode_pong
+from gateway.outputs.vrpn.protocol import (
+    COOKIE,
+    TYPE_DESCRIPTIONS,
+    ClientReader,
+    callback_port,
+    describe_tracker,
+    encode_pong,
+)
 from gateway.outputs.vrpn.trackers import TrackerNames, Trackers
 from gateway.server_limits import Clients, ServerLimits, notice_vanished
 from gateway.token_bucket import TokenBucket
@@ -64,7 +70,7 @@ class VrpnServer:
             f"it does not listen on {host}, port {port} yet; if this lasts, check vrpn.host and the name "
             "server (DNS)",
         )
-        self._events = EventLog(logger, "vrpn")
+        self.events = EventLog(logger, "vrpn")
         self._defects = DefectLog(logger, "vrpn")
 
     @property
@@ -95,32 +101,30 @@ class VrpnServer:
             self._bind_both, f"trackers are served on {self._host}, port {self._port}"
         )
         with tcp, udp:
-            requests = CallbackRequests(udp, self._call_back, self._call_failed, self._port)
+            requests = CallbackRequests(udp, self._call_back, self.events, self._port)
             try:
                 while True:
                     await self._accept(tcp)
             finally:
                 requests.close()
 
-    async def _bind_both(self) -> tuple[socket.socket, socket.socket]:
+    async def _bind_both(self) -> list[socket.socket]:
         """Return the sockets for TCP and UDP. Raises PortError."""
-        tcp = await self._bind(socket.SOCK_STREAM, "TCP")
-        try:
-            return tcp, await self._bind(socket.SOCK_DGRAM, "UDP")
-        except BaseException:
-            tcp.close()
-            raise
-
-    async def _bind(self, kind: socket.SocketKind, protocol: str) -> socket.socket:
-        try:
-            loop = asyncio.get_running_loop()
-            return bind(await loop.getaddrinfo(self._host, self._port, type=kind), kind)
-        except OSError as error:
-            raise PortError(
-                f"cannot listen on {self._host}, {protocol} port {self._port}: {error.strerror or error}; "
-                "stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
-                "computer and a free port"
-            ) from error
+        loop = asyncio.get_running_loop()
+        with contextlib.ExitStack() as opened:
+            sockets = []
+            for kind, protocol in ((socket.SOCK_STREAM, "TCP"), (socket.SOCK_DGRAM, "UDP")):
+                try:
+                    addresses = await loop.getaddrinfo(self._host, self._port, type=kind)
+                    sockets.append(opened.enter_context(bind(addresses, kind)))
+                except OSError as error:
+                    raise PortError(
+                        f"cannot listen on {self._host}, {protocol} port {self._port}: "
+                        f"{error.strerror or error}; stop the program that uses the port, or set vrpn.host "
+                        "and vrpn.port to an address of this computer and a free port"
+                    ) from error
+            opened.pop_all()
+            return sockets
 
     async def _accept(self, tcp: socket.socket) -> None:
         """Accept one client. Those that come too fast wait in the kernel, or are refused there."""
@@ -133,7 +137,7 @@ class VrpnServer:
         except OSError as error:
             # The client has gone, or the process has too many open files.
             text = f"a client could not be accepted: {error.strerror or error}"
-            self._events.log(logging.WARNING, text, "not accepted")
+            self.events.log(logging.WARNING, text, "not accepted")
             await asyncio.sleep(_ACCEPT_PAUSE_S)
         except Exception as defect:  # noqa: BLE001 - the next client is accepted nevertheless
             self._defects.log(defect)
@@ -147,13 +151,6 @@ class VrpnServer:
             # uvloop does not call connection_lost if this comes just after connection_made.
             self.client_closed(client)
             raise
-
-    def _call_failed(self, host: str, port: int, reason: str) -> None:
-        text = (
-            f"{host} asked by UDP to be connected to on TCP port {port}, which does not work ({reason}); "
-            "allow this in its firewall, or let the client use the address tcp://HOST:PORT"
-        )
-        self._events.log(logging.INFO, text, "not called")
 
     async def close(self) -> None:
         """Stop listening and disconnect all clients."""
@@ -170,33 +167,23 @@ class VrpnServer:
 
     # For clients ----------------------------------------------------------------------------
 
-    def client_opened(self, client: "Client") -> bool:
-        """Add a new connection. Return False if there are too many: it is closed."""
-        if self._is_refused(client):
-            return False
-        self.clients.open(client)
-        return True
+    def has_room_for(self, client: "Client") -> bool:
+        """Return whether one more client can be served; if not, it is disconnected."""
+        if self.clients.is_full:
+            text = f"{client.name} is refused: {self.clients.limits.clients} clients are connected"
+            self.events.log(logging.WARNING, text, "refused")
+            client.abort()
+        return not self.clients.is_full
 
     def client_ready(self, client: "Client") -> None:
-        """Take note that a client speaks VRPN."""
-        if self._is_refused(client):
-            client.abort()
+        """Serve a client that has shown that it speaks VRPN."""
+        if not self.has_room_for(client):
             return
         self.clients.serve(client)
         num_clients = len(self.clients.served)
         if num_clients == 1:
             self._on_wanted_changed()
-        self._events.log(logging.INFO, f"{client.name} is connected; clients now: {num_clients}", "connected")
-
-    def _is_refused(self, client: "Client") -> bool:
-        if self.clients.is_full:
-            text = f"{client.name} is refused: {self.clients.limits.clients} clients are connected"
-            self._events.log(logging.WARNING, text, "refused")
-        return self.clients.is_full
-
-    def client_failed(self, client: "Client", text: str) -> None:
-        """Take note that a client is disconnected because of what ``text`` says."""
-        self._events.log(logging.INFO, f"{client.name} is disconnected: {text}", "failed")
+        self.events.log(logging.INFO, f"{client.name} is connected; clients now: {num_clients}", "connected")
 
     def client_closed(self, client: "Client") -> None:
         """Remove a connection that has ended."""
@@ -207,7 +194,7 @@ class VrpnServer:
             if not num_clients:
                 self._on_wanted_changed()
             text = f"{client.name} has disconnected; clients now: {num_clients}"
-            self._events.log(logging.INFO, text, "closed")
+            self.events.log(logging.INFO, text, "closed")
 
 
 def bind(addresses: Sequence[tuple[Any, ...]], kind: socket.SocketKind) -> socket.socket:
@@ -260,9 +247,9 @@ class Client(asyncio.BufferedProtocol):
         address = transport.get_extra_info("peername")
         if address:  # None if the connection has ended already
             self.name = f"{address[0]}:{address[1]}"
-        if not self._owner.client_opened(self):
-            self._transport.abort()
+        if not self._owner.has_room_for(self):
             return
+        self._owner.clients.open(self)
         limits = self._owner.clients.limits
         notice_vanished(cast(socket.socket, transport.get_extra_info("socket")), limits)
         self._transport.set_write_buffer_limits(high=limits.unread_bytes_each)
@@ -288,7 +275,7 @@ class Client(asyncio.BufferedProtocol):
         return self._received
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Answer pings (asyncio.BufferedProtocol)."""
+        """Answer pings of trackers that there are (asyncio.BufferedProtocol)."""
         if self._transport.is_closing():
             return
         try:
@@ -297,39 +284,30 @@ class Client(asyncio.BufferedProtocol):
             self._fail(str(error))
             return
         if self._reader.has_cookie and not self.is_ready:
-            self._become_ready()
-        self._answer(pinged)
-        self._budget.take(nbytes)
-        self._owner.read_budget.take(nbytes)
-        if not self._may_read():
-            self._transport.pause_reading()
-            self._loop.call_later(_READ_PAUSE_S, self._resume_reading)
-
-    def _become_ready(self) -> None:
-        self.is_ready = True
-        self._clear_timeout()
-        self._transport.write(TYPE_DESCRIPTIONS)
-        self.describe_trackers()
-        self._owner.client_ready(self)
-
-    def _answer(self, pinged: list[str]) -> None:
-        """Answer pings of trackers that there are. A client repeats a ping until it is answered."""
-        trackers = filter(None, map(self._owner.trackers.named, pinged))
+            self.is_ready = True
+            self._clear_timeout()
+            self._transport.write(TYPE_DESCRIPTIONS)
+            self.describe_trackers()
+            self._owner.client_ready(self)
+        # A client repeats a ping until it is answered.
+        trackers = filter(None, map(self._owner.trackers.by_name.get, pinged))
         pongs = b"".join(encode_pong(tracker.number, now_utime()) for tracker in trackers)
         if pongs and not self._is_full:
             self.describe_trackers()
             self._transport.write(pongs)
+        self._budget.take(nbytes)
+        self._owner.read_budget.take(nbytes)
+        self._read_or_wait()
 
-    def _may_read(self) -> bool:
-        return self._budget.left > 0 and self._owner.read_budget.left > 0
-
-    def _resume_reading(self) -> None:
+    def _read_or_wait(self) -> None:
+        """Read on if the budgets allow it, or wait until they do."""
         if self._transport.is_closing():
             return
-        if self._may_read():
+        if self._budget.left > 0 and self._owner.read_budget.left > 0:
             self._transport.resume_reading()
         else:
-            self._loop.call_later(_READ_PAUSE_S, self._resume_reading)
+            self._transport.pause_reading()
+            self._loop.call_later(_READ_PAUSE_S, self._read_or_wait)
 
     # Writing --------------------------------------------------------------------------------
 
@@ -339,9 +317,10 @@ class Client(asyncio.BufferedProtocol):
         if self._is_full or self._transport.is_closing() or self._version == trackers.version:
             return
         self._version = trackers.version
-        new = [tracker for tracker in trackers.current if self._described.get(tracker.number) != tracker.name]
+        current = trackers.by_name.values()
+        new = [tracker for tracker in current if self._described.get(tracker.number) != tracker.name]
         self._described.update((tracker.number, tracker.name) for tracker in new)
-        self._transport.write(b"".join(tracker.description for tracker in new))
+        self._transport.write(b"".join(describe_tracker(*tracker) for tracker in new))
 
     def send(self, poses: bytes) -> bool:
         """Send messages with poses; return False if the client does not read. It must be ready."""
@@ -375,5 +354,94 @@ class Client(asyncio.BufferedProtocol):
             self._timeout = None
 
     def _fail(self, text: str) -> None:
-        self._owner.client_failed(self, text)
+        self._owner.events.log(logging.INFO, f"{self.name} is disconnected: {text}", "failed")
         self._transport.abort()
+
+
+MAX_CALLS: Final = 16
+"""To how many clients the server tries to connect at the same time."""
+
+MAX_CALLS_PER_HOST: Final = 4
+"""So many of them may be to one computer, so that it leaves room for others."""
+
+_CALL_TIMEOUT_S: Final = 2.0  # then the client asks again
+_CALLS_PER_S: Final = 20.0
+"""Nobody can use the server to send more than this many connections to another computer."""
+
+_DATAGRAMS_TOGETHER: Final = 20
+_PAUSE_S: Final = 0.1
+"""How many datagrams are read at once, and how long none is read after that."""
+
+_MAX_DATAGRAM_BYTES: Final = 512  # an address and a port
+
+CallBack = Callable[[str, int], Awaitable[None]]
+"""Connects to a client's address and TCP port. Raises OSError."""
+
+
+class CallbackRequests:
+    """Reads requests from a UDP socket and calls back those who sent them.
+
+    That is how libvrpn connects unless the address begins with tcp:. Anybody can send such a datagram, with
+    any sender's address. So the server connects only to the address that the datagram came from, never to
+    ports of system services, and only to a few addresses at a time; datagrams beyond a rate are not read. A
+    client repeats its request every 2 s. ``own_port`` is the server's own port, to which it must not connect.
+    """
+
+    def __init__(self, udp: socket.socket, call_back: CallBack, events: EventLog, own_port: int) -> None:
+        self._udp = udp
+        self._call_back = call_back
+        self._events = events
+        self._own_port = own_port
+        self._loop = asyncio.get_running_loop()
+        self._calls = TokenBucket(_CALLS_PER_S)
+        self._in_progress: dict[tuple[str, int], asyncio.Task[None]] = {}
+        self._pause: asyncio.TimerHandle | None = None
+        self._read_on()
+
+    def close(self) -> None:
+        """Stop reading and calling; the socket stays open."""
+        if self._pause is not None:
+            self._pause.cancel()
+        self._loop.remove_reader(self._udp)
+        for task in self._in_progress.values():
+            task.cancel()
+
+    def _read_on(self) -> None:
+        self._pause = None
+        self._loop.add_reader(self._udp, self._read)
+
+    def _read(self) -> None:
+        """Read what has arrived, then pause: the kernel drops what its buffer cannot hold meanwhile."""
+        for _ in range(_DATAGRAMS_TOGETHER):
+            try:
+                datagram, address = self._udp.recvfrom(_MAX_DATAGRAM_BYTES)
+            except OSError:  # there is none, or the network reports an error about an earlier one
+                break
+            self._receive(datagram, address[0])
+        self._loop.remove_reader(self._udp)
+        self._pause = self._loop.call_later(_PAUSE_S, self._read_on)
+
+    def _receive(self, datagram: bytes, host: str) -> None:
+        port = callback_port(datagram)
+        if port is None or port == self._own_port or (host, port) in self._in_progress:
+            return
+        num_of_host = sum(other == host for other, _ in self._in_progress)
+        if len(self._in_progress) >= MAX_CALLS or num_of_host >= MAX_CALLS_PER_HOST:
+            return
+        if self._calls.try_take():
+            self._in_progress[host, port] = self._loop.create_task(self._call(host, port))
+
+    async def _call(self, host: str, port: int) -> None:
+        try:
+            async with asyncio.timeout(_CALL_TIMEOUT_S):
+                await self._call_back(host, port)
+        except OSError as error:
+            is_late = isinstance(error, TimeoutError)
+            reason = f"no answer within {_CALL_TIMEOUT_S:g} s" if is_late else error.strerror or str(error)
+            text = (
+                f"{host} asked by UDP to be connected to on TCP port {port}, which does not work ({reason}); "
+                "allow this in its firewall, or let the client use the address tcp://HOST:PORT"
+            )
+            self._events.log(logging.INFO, text, "not called")
+        finally:
+            del self._in_progress[host, port]

@@ -39,6 +39,6 @@ VRPN: Final = OutputKind(
     settings=VrpnSettings,
     create=imported_late("gateway.outputs.vrpn.output:VrpnOutput"),
     checks=("port", "access"),
-    run_checks=imported_late("gateway.outputs.vrpn.checks:check_vrpn"),
+    run_checks=imported_late("gateway.outputs.vrpn.output:check_vrpn"),
     leaves_host=lambda settings: not is_loopback(settings.host),
 )

@@ -1,13 +1,10 @@
 """The trackers of all sources: their names and numbers."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
-from gateway.outputs.vrpn.protocol import (
-    MAX_NAME_BYTES,
-    describe_tracker,
-)
+from gateway.outputs.vrpn.protocol import MAX_NAME_BYTES
 
 TrackerNames = Literal["auto", "tool", "source/tool"]
 """How trackers are named: by tool, by source and tool, or (auto) by tool if there is only one source."""
@@ -27,11 +24,6 @@ class Tracker(NamedTuple):
     number: int
     name: str
 
-    @property
-    def description(self) -> bytes:
-        """The message that describes it."""
-        return describe_tracker(self.number, self.name)
-
 
 class _Key(NamedTuple):
     """What a tracker belongs to. ``has_prefix`` is whether the name begins with the source's."""
@@ -45,7 +37,7 @@ class Trackers:
     """Gives the tools of each source trackers.
 
     A tool keeps its tracker's name and number while it comes and goes. Only when MAX_TRACKERS are used up, a
-    former tool's number is used for another one. ``version`` grows with every change of ``current``.
+    former tool's number is used for another one. ``version`` grows with every change of ``by_name``.
     """
 
     def __init__(self, names: TrackerNames) -> None:
@@ -54,16 +46,8 @@ class Trackers:
         self._tools: dict[str, Sequence[str]] = {}  # of each source
         self._by_key: dict[_Key, Tracker] = {}  # the most recently given ones are last
         self._of_source: dict[str, dict[str, Tracker | None]] = {}
-        self._by_name: dict[str, Tracker] = {}
-
-    @property
-    def current(self) -> Iterable[Tracker]:
+        self.by_name: dict[str, Tracker] = {}
         """The trackers of the tools that there are now."""
-        return self._by_name.values()
-
-    def named(self, name: str) -> Tracker | None:
-        """Return the tracker with this name, if its tool is there now."""
-        return self._by_name.get(name)
 
     def of_source(self, source: str) -> Mapping[str, Tracker | None]:
         """Return the trackers of a source by the tools' names, in their order; None for one too many.
@@ -94,25 +78,22 @@ class Trackers:
         for key in in_use & self._by_key.keys():
             self._by_key[key] = self._by_key.pop(key)
         new_keys = [key for of_source in keys.values() for key in of_source if key not in self._by_key]
-        self._make_room(len(new_keys), in_use)
+        # Forget as many former tools as necessary, those first that have been away for the longest time.
+        former = [key for key in self._by_key if key not in in_use]
+        for key in former[: max(0, len(self._by_key) + len(new_keys) - MAX_TRACKERS)]:
+            del self._by_key[key]
         self._add(new_keys[: MAX_TRACKERS - len(self._by_key)])
         self._of_source = {
             source: {key.tool: self._by_key.get(key) for key in of_source}
             for source, of_source in keys.items()
         }
-        self._by_name = {
+        self.by_name = {
             tracker.name: tracker
             for of_source in self._of_source.values()
             for tracker in of_source.values()
             if tracker is not None
         }
         self.version += 1
-
-    def _make_room(self, num_trackers: int, in_use: set[_Key]) -> None:
-        """Forget as many former tools as necessary, those first that have been away for the longest time."""
-        former = [key for key in self._by_key if key not in in_use]
-        for key in former[: max(0, len(self._by_key) + num_trackers - MAX_TRACKERS)]:
-            del self._by_key[key]
 
     def _add(self, keys: Sequence[_Key]) -> None:
         names = {tracker.name for tracker in self._by_key.values()}

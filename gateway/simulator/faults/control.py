@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from gateway.config.section import validation_error
 from gateway.config.words import describe, spelling_hint
 from gateway.errors import ConfigError, GatewayError
-from gateway.rtc3d_server.connection_filter import FilteredConnection
+from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.rtc3d_server.scene import Scene
 from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.faults.base import (
@@ -221,7 +221,7 @@ class Faults:
 
     # For connections ------------------------------------------------------------------------
 
-    def new_pipeline(self, connection: FilteredConnection) -> FaultPipeline:
+    def new_pipeline(self, connection: ClientConnection) -> FaultPipeline:
         """Return the filter for a new connection."""
         return FaultPipeline(connection, self.active_on, self._count)
 

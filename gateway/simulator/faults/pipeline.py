@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from gateway.rtc3d.packets import Packet
+from gateway.rtc3d_server.client_connection import ClientConnection, ConnectionFilter
 from gateway.rtc3d_server.client_session import error_packet
-from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.rtc3d_server.server import call_after_us
+from gateway.rtc3d_server.measurement import call_after_us
 from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault, PendingWrite, Reply
 from gateway.simulator.faults.reply_faults import HeldReplies
 
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 class WriteQueue:
     """Writes to a connection in order, each write when it is due."""
 
-    def __init__(self, connection: FilteredConnection) -> None:
+    def __init__(self, connection: ClientConnection) -> None:
         self._connection = connection
         self._waiting: deque[PendingWrite] = deque()
         self._timer: asyncio.TimerHandle | None = None
@@ -92,7 +92,7 @@ class FaultPipeline(ConnectionFilter):
 
     def __init__(
         self,
-        connection: FilteredConnection,
+        connection: ClientConnection,
         active_faults: Callable[[int], ActiveConnectionFaults],
         count: Callable[[Iterable[ActiveFault]], None],
     ) -> None:

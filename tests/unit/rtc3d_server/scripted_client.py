@@ -2,7 +2,7 @@
 
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
-from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from gateway.rtc3d_server.client_session import ClientSession
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ByteOrder, WireComponent, components_in, packets_in
 
@@ -16,12 +16,10 @@ class ScriptedClient:
         self.recording_durations_s: list[float | None] = []
         general = General(name="server under test")
         self.session = ClientSession(
-            SessionCallbacks(
-                frames=lambda components: self.scene.frames(components, 24),
-                parameters_xml=lambda sections: self.scene.parameters_xml(sections, general),
-                frames_requested=lambda: self.elapsed_us,
-                record_for=self.recording_durations_s.append,
-            )
+            frames=lambda components: self.scene.frames(components, 24),
+            parameters_xml=lambda sections: self.scene.parameters_xml(sections, general),
+            frames_requested=lambda: self.elapsed_us,
+            record_for=self.recording_durations_s.append,
         )
 
     def send(self, text: bytes | str, packet_type: int = COMMAND) -> list[tuple[int, bytes]]:

@@ -9,8 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.measurement import LEAD_US, MAX_LEAD_US, FrameBuilder, Measurement, exact_rate
-from gateway.rtc3d_server.server import call_after_us
+from gateway.rtc3d_server.measurement import (
+    LEAD_US,
+    MAX_LEAD_US,
+    FrameBuilder,
+    Measurement,
+    call_after_us,
+    exact_rate,
+)
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,

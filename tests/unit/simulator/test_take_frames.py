@@ -10,7 +10,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import AnalogChannel, Marker, Parameters, Parameters3D, ParametersAnalog
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from gateway.rtc3d_server.client_session import ClientSession
 from gateway.simulator.take_frames import RecordedFrames, TakePass
 from gateway.simulator.take_moments import Moment, RecordedParameters
 from gateway.takes.files.reader import TakeReader
@@ -158,7 +158,7 @@ class Client:
         self.elapsed_us = -SECOND_US
         self.sources: list[RecordedFrames] = []
         self._is_end = is_end
-        self.session = ClientSession(SessionCallbacks(self._frames, lambda _: b"", lambda: self.elapsed_us))
+        self.session = ClientSession(self._frames, lambda _: b"", lambda: self.elapsed_us)
 
     def _frames(self, components: Sequence[ComponentType]) -> RecordedFrames:
         frames = RecordedFrames(components, self.event_bytes, MEASURED)

@@ -6,17 +6,17 @@ import pytest
 
 from gateway.errors import QueryError
 from gateway.foxglove_schemas.topics import Topic
-from gateway.outputs.foxglove.connections import ClientRequest as Request
 from gateway.outputs.foxglove.connections import (
+    ERROR,
+    WARNING,
     Subscription,
     advertise,
     channel_text,
-    error,
     message_data,
     parse_request,
     server_info,
+    status,
     unadvertise,
-    warning,
 )
 
 
@@ -43,8 +43,8 @@ def test_messages_of_the_server() -> None:
         ),
         (advertise([]), {"op": "advertise", "channels": []}),
         (unadvertise([2, 1]), {"op": "unadvertise", "channelIds": [2, 1]}),
-        (warning("slow"), {"op": "status", "level": 1, "message": "slow"}),
-        (error("no"), {"op": "status", "level": 2, "message": "no"}),
+        (status(WARNING, "slow"), {"op": "status", "level": 1, "message": "slow"}),
+        (status(ERROR, "no"), {"op": "status", "level": 2, "message": "no"}),
     ):
         assert json.loads(message) == expected
 
@@ -54,8 +54,8 @@ def test_requests_of_viewers() -> None:
     subscribe = (
         '{"op":"subscribe","subscriptions":[{"id":0,"channelId":3.0},{"id":4294967295,"channelId":5,"x":1}]}'
     )
-    assert parse_request(subscribe) == Request((Subscription(0, 3), Subscription(4294967295, 5)))
-    assert parse_request('{"op":"unsubscribe","subscriptionIds":[1, 2]}') == Request(ended=(1, 2))
+    assert parse_request(subscribe) == ([Subscription(0, 3), Subscription(4294967295, 5)], [])
+    assert parse_request('{"op":"unsubscribe","subscriptionIds":[1, 2]}') == ([], [1, 2])
 
 
 def one(subscription: str) -> str:

@@ -101,7 +101,7 @@ async def test_a_viewer_that_reads_nothing_for_long_is_disconnected(
 ) -> None:
     caplog.set_level(logging.INFO)
     async with serving("lab") as (port, [lab]):
-        lab.output._server._admission.clients.limits = replace(LIMITS, unread_s=0.1)
+        lab.output._server.clients.limits = replace(LIMITS, unread_s=0.1)
         with stalled_viewer(port):
             await lab.wait_until_wanted()
 
@@ -139,7 +139,7 @@ async def test_one_viewer_too_many_is_refused_with_a_reason(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with serving("lab") as (port, [lab]):
-        lab.output._server._admission.clients.limits = replace(LIMITS, clients=3)
+        lab.output._server.clients.limits = replace(LIMITS, clients=3)
         async with AsyncExitStack() as stack:
             for _ in range(3):
                 await stack.enter_async_context(viewing(port))

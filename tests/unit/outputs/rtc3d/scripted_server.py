@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 
 from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.rtc3d.live_server import LiveServer, SourceState
+from gateway.outputs.rtc3d.client_filter import SourceState
+from gateway.outputs.rtc3d.live_server import LiveServer
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters_xml import parse_parameters

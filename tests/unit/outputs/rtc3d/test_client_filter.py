@@ -7,8 +7,13 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, asks_for_parameters, recording_control
-from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
+from gateway.outputs.rtc3d.client_filter import (
+    FILE,
+    MAX_HELD_PACKETS,
+    SLOW_CLIENT,
+    asks_for_parameters,
+    recording_control,
+)
 from gateway.rtc3d.commands import ControlRecording
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d_server.client_connection import ClientConnection

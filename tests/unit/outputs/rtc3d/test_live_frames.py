@@ -5,12 +5,12 @@ from itertools import pairwise
 import pytest
 
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
-from gateway.outputs.rtc3d.live_scene import LiveScene
+from gateway.outputs.rtc3d.live_server import LiveScene
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
-from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from gateway.rtc3d_server.client_session import ClientSession
 from tests.unit.outputs.rtc3d.scripted_server import (
     FAST,
     SLOW,
@@ -97,11 +97,9 @@ class LiveClient:
     def __init__(self, source: LiveSource) -> None:
         self.bodies: list[bytes] = []
         self.session = ClientSession(
-            SessionCallbacks(
-                source.scene.frames,
-                lambda sections: source.scene.parameters_xml(sections, General()),
-                lambda: max(source.now_us, source.scene.newest_us),
-            )
+            source.scene.frames,
+            lambda sections: source.scene.parameters_xml(sections, General()),
+            lambda: max(source.now_us, source.scene.newest_us),
         )
         self._source = source
 

@@ -6,8 +6,8 @@ import weakref
 
 import pytest
 
-from gateway.outputs.rtc3d.live_scene import LiveScene
-from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
+from gateway.outputs.rtc3d.client_filter import SLOW_CLIENT
+from gateway.outputs.rtc3d.live_server import LiveScene
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import SECTIONS, General

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gateway.outputs.findings import Finding, Result
-from gateway.outputs.rtc3d.checks import check_rtc3d
+from gateway.outputs.rtc3d.output import check_rtc3d
 from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
 from gateway.simulator.simulator import Simulator
 from tests.support.configurations import mistakes

@@ -4,8 +4,7 @@ import socket
 import threading
 
 from gateway.outputs.findings import Result
-from gateway.outputs.vrpn.checks import check_vrpn
-from gateway.outputs.vrpn.output import VrpnOutput
+from gateway.outputs.vrpn.output import VrpnOutput, check_vrpn
 from gateway.outputs.vrpn.settings import VRPN, VrpnSettings
 from tests.support.networks import free_port
 from tests.support.waiting import wait_until

@@ -10,9 +10,16 @@ from dataclasses import replace
 import pytest
 import pytest_asyncio
 
-from gateway.outputs.vrpn.callbacks import MAX_CALLS, MAX_CALLS_PER_HOST, CallbackRequests
+from gateway.logs.failures import EventLog
 from gateway.outputs.vrpn.protocol import encode_pose
-from gateway.outputs.vrpn.server import LIMITS, VrpnServer, bind
+from gateway.outputs.vrpn.server import (
+    LIMITS,
+    MAX_CALLS,
+    MAX_CALLS_PER_HOST,
+    CallbackRequests,
+    VrpnServer,
+    bind,
+)
 from gateway.token_bucket import TokenBucket
 from tests.support.networks import free_port
 from tests.support.vrpn_client import COOKIE, Pose, VrpnClient, send_datagram
@@ -68,7 +75,7 @@ async def test_calls_are_bounded_for_each_host_and_in_all() -> None:
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.setblocking(False)
-        requests = CallbackRequests(udp, call, lambda *_: None, OWN_PORT)
+        requests = CallbackRequests(udp, call, EventLog(logging.getLogger(__name__), "vrpn"), OWN_PORT)
         for port in (OWN_PORT, "HTTP"):
             await request_callback("192.0.2.1", port)
         for number in range(5000, 5000 + MAX_CALLS_PER_HOST + 1):
@@ -123,7 +130,7 @@ async def test_refused_calls_are_logged_few_times(running: Running, caplog: pyte
 
 async def test_flood_of_udp_calls_is_read_slowly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
-    monkeypatch.setattr("gateway.outputs.vrpn.callbacks.callback_port", read.append)
+    monkeypatch.setattr("gateway.outputs.vrpn.server.callback_port", read.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         for _ in range(3000):
             udp.sendto(b"127.0.0.1 5000\0", ("127.0.0.1", running[1]))
@@ -168,7 +175,7 @@ async def test_tools_with_new_names_or_numbers_are_described_before_their_poses(
     async with await VrpnClient.connect(port) as client:
         await wait_until_async(lambda: len(client.described) == 2)
         server.trackers.set_tools("lab", ["hand", "Left Foot", "probe"])
-        numbers = {tracker.name: tracker.number for tracker in server.trackers.current}
+        numbers = {tracker.name: tracker.number for tracker in server.trackers.by_name.values()}
         server.send(encode_pose(numbers["probe"], 0, POSE) + encode_pose(numbers["hand"], 0, POSE))
         server.trackers.remove("lab")
         server.trackers.set_tools("stage", ["foot"])

@@ -54,7 +54,7 @@ def test_tool_keeps_its_tracker_while_it_comes_and_goes() -> None:
     assert trackers.version == version
     trackers.set_tools("lab", ["hand"])
     assert trackers.version > version
-    assert (trackers.named("wand"), trackers.named("hand")) == (None, Tracker(2, "hand"))
+    assert (trackers.by_name.get("wand"), trackers.by_name.get("hand")) == (None, Tracker(2, "hand"))
     trackers.set_tools("lab", ["foot", "hand", "wand"])
     assert trackers.of_source("lab") == {**before, "hand": Tracker(2, "hand")}
 
@@ -65,15 +65,15 @@ def test_former_tools_make_room_for_new_ones() -> None:
     for first in range(0, 5 * MAX_TRACKERS, 100):
         trackers.set_tools("lab", ["wand", *(f"tool {number}" for number in range(first, first + 100))])
         assert "" not in names(trackers)
-    assert trackers.named("wand") == Tracker(0, "wand")
-    assert {tracker.number for tracker in trackers.current} <= set(range(MAX_TRACKERS))
+    assert trackers.by_name.get("wand") == Tracker(0, "wand")
+    assert {tracker.number for tracker in trackers.by_name.values()} <= set(range(MAX_TRACKERS))
 
 
 def test_tools_beyond_the_limit_get_no_tracker() -> None:
     trackers = Trackers("auto")
     trackers.set_tools("lab", [f"tool {number}" for number in range(MAX_TRACKERS + 3)])
     assert names(trackers)[MAX_TRACKERS - 1 :] == [f"tool_{MAX_TRACKERS - 1}", "", "", ""]
-    assert len(list(trackers.current)) == MAX_TRACKERS
+    assert len(trackers.by_name) == MAX_TRACKERS
     trackers.set_tools("lab", ["wand"])
     assert names(trackers) == ["wand"]
 
@@ -83,4 +83,4 @@ def test_the_tool_that_has_been_away_longest_makes_room_first() -> None:
     trackers = Trackers("tool")
     for tools in (["a"], ["b"], ["a"], [f"tool {number}" for number in range(MAX_TRACKERS - 1)], ["a"]):
         trackers.set_tools("lab", tools)
-    assert [each.number for each in trackers.current] == [0]
+    assert [each.number for each in trackers.by_name.values()] == [0]

@@ -1,9 +1,10 @@
 """A client of a simulator with faults, without a socket."""
 
 import asyncio
-from typing import Any
+from typing import Any, cast
 
 from gateway.rtc3d.packets import Packet, PacketReader
+from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.simulator.faults.base import ActiveFault, Fault
 from gateway.simulator.faults.pipeline import FaultPipeline
 from gateway.simulator.simulator import Simulator
@@ -16,7 +17,7 @@ VERSION = (COMMAND, b"OK-Version 1.0")
 
 
 class FaultyClient:
-    """A client's connection (FilteredConnection) behind the simulator's faults; records what is written."""
+    """A client's connection (ClientConnection) behind the simulator's faults; records what is written."""
 
     name = "client"
 
@@ -25,7 +26,7 @@ class FaultyClient:
         self.simulator = simulator or Simulator(CountingScene(RATE_HZ))
         self.faults = self.simulator.faults
         self.server = ScriptedClient(RATE_HZ)
-        self.filter: FaultPipeline = self.faults.new_pipeline(self)
+        self.filter: FaultPipeline = self.faults.new_pipeline(cast(ClientConnection, self))
         self.simulator.connections.add(self)  # type: ignore[arg-type] # has what faults use
         self.transport: Any = self
         self.calls: list[str] = []
@@ -57,7 +58,7 @@ class FaultyClient:
         """The packets that were written."""
         return packets_in(b"".join(data for _, data in self.writes))
 
-    # FilteredConnection and its transport -----------------------------------------------------
+    # ClientConnection and its transport -----------------------------------------------------
 
     def write(self, data: bytes) -> None:
         elapsed_s = asyncio.get_running_loop().time() - self._began_s
