@@ -126,7 +126,7 @@ def lcm_prefix(prefix: str) -> str:
     """Return the prefix of LCM channels for one of Zenoh keys; raises BadParameter if there is none."""
     from pydantic import TypeAdapter, ValidationError
 
-    from gateway.outputs.lcm.settings import ChannelPrefix
+    from gateway.config.values import ChannelPrefix
 
     channels = re.sub(r"[^A-Z0-9]+", "_", prefix.upper())
     try:

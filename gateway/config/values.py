@@ -73,6 +73,11 @@ def _zero_or_interval(seconds: float) -> float:
     return seconds
 
 
+ChannelPrefix = Annotated[
+    str,
+    Field(pattern=r"^[A-Za-z0-9_]{1,16}$"),
+    expects("1 to 16 of the letters A to Z and a to z, digits and '_'"),
+]
 Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 Seconds = Annotated[
     float,
