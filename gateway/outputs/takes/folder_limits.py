@@ -3,7 +3,8 @@
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future
 from pathlib import Path
@@ -23,13 +24,21 @@ not wait: the former gateway with this folder may just be ending."""
 _DAY_S: Final = 86_400.0
 
 
+_FRESH_S: Final = 5.0
+"""A take that was written so recently is not deleted: it may have been started a moment ago."""
+
+logger = logging.getLogger(__name__)
+
+
 class FolderWatch:
-    """Checks the folder of ``settings`` in a thread of its own, because its disk may not respond."""
+    """Checks the folder of ``settings`` in a thread of its own, because its disk may not respond.
+
+    The same thread deletes the oldest takes beyond the limits.
+    """
 
     def __init__(self, settings: TakesSettings, host: Host) -> None:
         self._monotonic = host.monotonic
         self.folder = TakesFolder(settings.effective_directory)
-        self._limits = FolderLimits(self.folder, host.monotonic)
         self.is_checked = False
         """Whether it has been checked once."""
         self.excess_bytes = 0
@@ -38,6 +47,8 @@ class FolderWatch:
         self._thread = host.thread("takes-folder")
         self._check: Future[None] | None = None
         self._next_check_s = 0.0
+        # Of each take: when it was written last, and when that was noticed; None if it was there before.
+        self._noticed: dict[Path, tuple[float, float | None]] | None = None
 
     @property
     def problem(self) -> str:
@@ -56,58 +67,40 @@ class FolderWatch:
         if (self._check is None or self._check.done()) and self._monotonic() >= self._next_check_s:
             self._check = self._thread.submit(lambda: self._check_now(settings, protected))
 
+    def close(self) -> None:
+        """Let another gateway use the folder, once no check is in progress."""
+        self._thread.submit(self.folder.close)
+
+    # In the thread.
+
     def _check_now(self, settings: TakesSettings, protected: AbstractSet[Path]) -> None:
         began_s = self._monotonic()
         problem, excess_bytes = self.folder.open(), 0
         if not problem:
             days = settings.max_age_days
             try:
-                excess_bytes = self._limits.delete_old(
-                    max_bytes=settings.max_bytes,
-                    max_age_s=None if days is None else days * _DAY_S,
-                    protected=protected,
-                )
+                max_age_s = None if days is None else days * _DAY_S
+                excess_bytes = self.delete_old(settings.max_bytes, max_age_s, protected)
             except OSError as error:
                 problem = disk_problem(self.folder.directory, error)
         self._problem, self.excess_bytes, self.is_checked = problem, excess_bytes, True
         ended_s = self._monotonic()  # with thousands of takes, every second would keep a disk busy
         self._next_check_s = ended_s if problem else ended_s + _REST * (ended_s - began_s)
 
-    def close(self) -> None:
-        """Let another gateway use the folder, once no check is in progress."""
-        self._thread.submit(self.folder.close)
-
-
-_FRESH_S: Final = 5.0
-"""A take that was written so recently is not deleted: it may have been started a moment ago."""
-
-logger = logging.getLogger(__name__)
-
-
-class FolderLimits:
-    """Deletes the oldest takes of a folder beyond its limits. It blocks: call it in a thread."""
-
-    def __init__(self, folder: TakesFolder, monotonic: Callable[[], float] = time.monotonic) -> None:
-        self._folder = folder
-        self._monotonic = monotonic
-        # Of each take: when it was written last, and when that was noticed; None if it was there before.
-        self._noticed: dict[Path, tuple[float, float | None]] | None = None
-
-    def delete_old(self, *, max_bytes: int, max_age_s: float | None, protected: Collection[Path]) -> int:
+    def delete_old(self, max_bytes: int, max_age_s: float | None, protected: AbstractSet[Path]) -> int:
         """Delete the oldest takes beyond the limits, except the ``protected`` ones (paths without extension).
 
         If there are none of those, the newest take of each source stays: it may be the one that has just
         ended because of this limit. Returns how many bytes are still too many. Raises OSError.
         """
-        entries = sorted(self._folder.entries(), key=lambda entry: entry.end_s)
+        entries = sorted(self.folder.entries(), key=lambda entry: entry.end_s)
         newest = {} if protected else {entry.source: entry.path for entry in entries}
-        users: dict[FileId, int] = {}
-        sizes = self._folder.rolling_sizes()
+        users: Counter[FileId] = Counter()
+        sizes = self.folder.rolling_sizes()
         rolling = set(sizes)
         for entry in entries:
             sizes |= entry.sizes
-            for file in entry.sizes:
-                users[file] = users.get(file, 0) + 1
+            users.update(entry.sizes.keys())
         total = sum(sizes.values())
         ages_s = self._ages_s(entries)
         for entry in entries:
@@ -120,7 +113,10 @@ class FolderLimits:
                 reason = f"the folder has {total} bytes, and takes.max_bytes is {max_bytes}"
             else:
                 continue
-            _delete(entry)
+            for path, _ in (*entry.logs, *entry.c3d_files):
+                path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a file, or a folder in which somebody has put other files
+                entry.path.rmdir()
             logger.info("takes: deleted %s, the oldest one: %s", entry.path, reason)
             for file, size in entry.sizes.items():
                 users[file] -= 1
@@ -144,10 +140,3 @@ class FolderLimits:
             self._noticed[entry.path] = entry.end_s, noticed_s
             ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
         return ages_s
-
-
-def _delete(entry: TakeEntry) -> None:
-    for path, _ in (*entry.logs, *entry.c3d_files):
-        path.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # a file, or a folder in which somebody has put other files
-        entry.path.rmdir()

@@ -45,23 +45,19 @@ class TakeFollower:
         self._failures = FailureLog(logger, source, HOLD_S)
 
     @property
-    def _follow(self) -> str:
-        return self._takes.settings.follow
-
-    @property
     def needs_events(self) -> bool:
         """Whether events start and stop takes."""
-        return self._follow == "events"
+        return self._takes.settings.follow == "events"
 
     async def follow_recording(self, *, start: bool, name: str) -> dict[str, Any]:
         """Start or stop a take with a recording on the server; return what to add to the peer's reply."""
-        if self._follow != "recording":
+        if self._takes.settings.follow != "recording":
             return {}
         try:
             if start:
                 return {"take": (await self._begin(name)).name}
             if self.is_running:
-                return {"take": (await self._takes.end(self._source)).name}
+                return {"take": (await self._takes.stop(self._source)).name}
         except QueryError as error:
             logger.warning("%s: no take follows the recording: %s", self._source, error)
             return {"take_problem": str(error)}
@@ -80,7 +76,7 @@ class TakeFollower:
         does not end it, or it would be split into several takes; but what does not come back for LOST_S has
         ended.
         """
-        if self._follow != "measurement":
+        if self._takes.settings.follow != "measurement":
             return
         if self._is_measuring:
             if not self._is_handled:
@@ -105,7 +101,7 @@ class TakeFollower:
 
     def _begin(self, name: str = "") -> Coroutine[Any, Any, StoredTake]:
         """Start a take at once; the coroutine waits for the disk. Raises QueryError."""
-        take = self._takes.begin(self._source, name, has_free_name=True)
+        take = self._takes.start(self._source, name, has_free_name=True)
         self._take = self._takes.running(self._source)
         return take
 
@@ -130,23 +126,23 @@ class TakeFollower:
     def _end_soon(self) -> None:
         if self.is_running:
             try:
-                self._run(self._takes.end(self._source))
+                self._run(self._takes.stop(self._source))
             except QueryError as error:
                 self._failures.failed(f"the take is not stopped: {error}")
 
     def _run(self, call: Coroutine[Any, Any, StoredTake]) -> None:
-        task = asyncio.get_running_loop().create_task(self._log_failure(call))
+        async def log_failure() -> None:
+            try:
+                await call
+            except QueryError as error:
+                self._is_handled = False
+                self._failures.failed(f"a take is not started or stopped: {error}")
+            else:
+                self._failures.recovered("takes are started and stopped again")
+
+        task = asyncio.get_running_loop().create_task(log_failure())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-
-    async def _log_failure(self, call: Coroutine[Any, Any, StoredTake]) -> None:
-        try:
-            await call
-        except QueryError as error:
-            self._is_handled = False
-            self._failures.failed(f"a take is not started or stopped: {error}")
-        else:
-            self._failures.recovered("takes are started and stopped again")
 
 
 class EventPublisher:

@@ -4,7 +4,6 @@ import contextlib
 import logging
 import os
 import shutil
-import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -13,10 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import QueryError, TakeError
-from gateway.logs.losses import Losses
-from gateway.outputs.takes.disk import Disk, is_full
-from gateway.outputs.takes.folder import new_folder
-from gateway.outputs.takes.take_file import SourceWriter
+from gateway.outputs.takes.disk import is_full
+from gateway.outputs.takes.folder import free_stem
+from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.new_file import default_name
@@ -86,14 +84,10 @@ class RollingSegments(SourceWriter):
         self,
         folder: Path,
         keep_s: float,
-        *,
-        description: SourceDescription,
-        parameters: bytes | None,
-        disk: Disk,
-        losses: Losses,
-        monotonic: Callable[[], float] = time.monotonic,
+        facts: SourceFacts,
+        monotonic: Callable[[], float],
     ) -> None:
-        super().__init__(description, parameters, disk, losses)
+        super().__init__(facts)
         self._monotonic = monotonic
         self._keep_s = keep_s
         self._folder = folder
@@ -132,7 +126,11 @@ class RollingSegments(SourceWriter):
             self._end_segment()
         self._is_in_place = True
         if self._log is None:
-            self._log = self._new_log(utime)
+            for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing
+                folder.mkdir(exist_ok=True)
+            name = f"{default_name(self.description.source)}-{self._num_segments:06}"
+            self._log = self._begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
+            self._num_segments += 1
             self._log_began_s = now_s
             for save in [*self._saves]:
                 self._add_to_save(save)
@@ -140,8 +138,12 @@ class RollingSegments(SourceWriter):
             self._written_s = now_s
         return self._log
 
+    def make_room(self, error: OSError) -> bool:
+        """See TakeWriter."""
+        return is_full(error) and self.delete_less_important()
+
     def delete_less_important(self) -> bool:
-        """See SourceWriter: delete what has expired, otherwise the oldest segment."""
+        """Delete what has expired, otherwise the oldest segment. Return False if there is none."""
         num_segments = len(self._segments)
         self._delete_expired()
         if self._segments and len(self._segments) == num_segments:
@@ -151,14 +153,6 @@ class RollingSegments(SourceWriter):
     def waits_for_room(self, error: OSError) -> bool:
         """Do not wait for room: what waits would hold up the running takes, and take their room later."""
         return not is_full(error)
-
-    def _new_log(self, utime: int) -> LogFile:
-        for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing
-            folder.mkdir(exist_ok=True)
-        name = f"{default_name(self.description.source)}-{self._num_segments:06}"
-        log = self._begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
-        self._num_segments += 1
-        return log
 
     def _end_segment(self) -> None:
         log = self._close_log()
@@ -203,7 +197,8 @@ class RollingSegments(SourceWriter):
         """
         if self._log is None and not self._segments:
             raise QueryError("no messages are kept yet, so there is nothing to save", code="nothing-yet")
-        save = Save(new_folder(folder, has_free_name=has_free_name))
+        save = Save(free_stem(folder, has_free_name=has_free_name))
+        save.folder.mkdir()
         try:
             for segment in self._segments:
                 if segment.end_s >= since_s:

@@ -4,7 +4,6 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Coroutine, Sequence
-from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
@@ -12,13 +11,13 @@ from typing import Any, Final, NamedTuple, TypeVar
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.takes.disk import Disk, Host, disk_problem, disk_result
+from gateway.outputs.takes.disk import Disk, Host, disk_result
 from gateway.outputs.takes.folder import ROLLING, StoredTake, TakePiece, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_limits import FolderWatch
 from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
-from gateway.outputs.takes.take_file import TakeFile
+from gateway.outputs.takes.take_file import SourceFacts, TakeFile
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.new_file import check_name, default_name
 from gateway.takes.files.writer_thread import WriterThread
@@ -77,19 +76,14 @@ class Takes:
 
     # For peers.
 
-    async def start(self, source: str, name: str = "", details: TakeDetails = NO_DETAILS) -> StoredTake:
-        """Start a take and return it; everything that is published after this call is in it.
-
-        "" means a name of source and time. A source has one running take.
-        """
-        return await self.begin(source, name, details, has_free_name=not name)
-
-    def begin(
-        self, source: str, name: str, details: TakeDetails = NO_DETAILS, *, has_free_name: bool
+    def start(
+        self, source: str, name: str = "", details: TakeDetails = NO_DETAILS, *, has_free_name: bool = False
     ) -> Coroutine[Any, Any, StoredTake]:
-        """Start a take at once, like ``start``; the coroutine, which must be awaited, waits for the disk.
+        """Start a take; everything that is published after this call is in it.
 
-        With ``has_free_name``, a number is added to the name if there is such a take already.
+        "" means a name of source and time. With ``has_free_name``, a number is added to the name if there is
+        such a take already. A source has one running take. The coroutine, which must be awaited, waits for
+        the disk and returns the take.
         """
         recording, writer = self._announced(source), self._open_writer()
         if name:
@@ -101,64 +95,56 @@ class Takes:
         take = TakeFile(
             self._folder.directory / source / (name or default_name(source)),
             now_utime(),
-            has_free_name=has_free_name,
-            description=self._description(source, details),
-            parameters=recording.parameters,
-            disk=self.disk,
-            losses=recording.losses,
+            self._facts(recording, details),
+            has_free_name=has_free_name or not name,
             delete_less_important=self._delete_rolling,
         )
-        recording.take = take
-        created = writer.call(take.create)  # first, because what is recorded from now on follows it
-        recording.add(writer, take, self.settings.components, is_first=True)
-        return self._begun(writer, recording, take, created)
+        created = recording.begin_take(writer, take)
+
+        async def begun() -> StoredTake:
+            try:
+                await disk_result(created, take.path, self.disk)
+            except QueryError:
+                recording.cancel_take(take)
+                raise
+            logger.info("takes: recording %s", take.path)
+            return StoredTake(take.name, 0, take.utime, 0.0, is_running=True, details=details)
+
+        return begun()
 
     def _delete_rolling(self) -> bool:
         """Delete rolling segments, the oldest of each source, in the thread that writes."""
         rolling = [each.segments for each in [*self._recordings.values()] if each.segments is not None]
         return any([segments.delete_less_important() for segments in rolling])  # noqa: C419 - of every source
 
-    async def _begun(
-        self, writer: WriterThread, recording: SourceRecording, take: TakeFile, created: Future[None]
-    ) -> StoredTake:
-        try:
-            await disk_result(created, take.path, self.disk)
-        except QueryError:
-            take.cancel()
-            writer.call(take.discard)
-            recording.detach(take)
-            raise
-        logger.info("takes: recording %s", take.path)
-        details = take.description.details
-        return StoredTake(take.name, 0, take.utime, 0.0, is_running=True, details=details)
-
     def running(self, source: str) -> TakeFile | None:
         """Return the running take of a source."""
         recording = self._recordings.get(source)
         return None if recording is None else recording.take
 
-    async def stop(self, source: str) -> StoredTake:
-        """End the running take, and return it when everything is on the disk."""
-        return await self.end(source)
+    def stop(self, source: str) -> Coroutine[Any, Any, StoredTake]:
+        """End the running take.
 
-    def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
-        """End the running take at once, like ``stop``; the coroutine, which must be awaited, waits."""
+        The coroutine, which must be awaited, returns it when everything is on the disk.
+        """
         recording = self._announced(source)
         self._started_writer()  # otherwise, it says why nothing is recorded
         take = recording.take
         if take is None:
             raise QueryError(f"no take of source {source!r} is running", code="nothing-yet")
-        return self._ended(take, recording.end_take(take))
+        completed = recording.end_take()
 
-    async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
-        await disk_result(ended, take.path, self.disk)
-        stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
-        size = f"{stored.seconds:.1f} s, {stored.num_bytes / 1e6:.1f} MB"
-        if take.num_lost or stored.is_cut_off:
-            logger.warning("takes: %s is not complete: %s, %d messages lost", take.path, size, take.num_lost)
-        else:
-            logger.info("takes: %s is complete: %s", take.path, size)
-        return stored._replace(num_lost=take.num_lost)
+        async def ended() -> StoredTake:
+            await disk_result(completed, take.path, self.disk)
+            stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
+            size, lost = f"{stored.seconds:.1f} s, {stored.num_bytes / 1e6:.1f} MB", take.num_lost
+            if lost or stored.is_cut_off:
+                logger.warning("takes: %s is not complete: %s, %d messages lost", take.path, size, lost)
+            else:
+                logger.info("takes: %s is complete: %s", take.path, size)
+            return stored._replace(num_lost=lost)
+
+        return ended()
 
     async def save(
         self,
@@ -215,7 +201,7 @@ class Takes:
     async def list(self, source: str) -> SourceTakes:
         """Return the takes of a source."""
         recording = self._announced(source)
-        folder, running = self._folder, recording.running_names
+        folder, running = self._folder, {path.name for path in recording.running_paths}
         takes = await self._read(partial(folder.takes, source, running), folder.directory)
         take = recording.take
         current: StoredTake | None = None
@@ -272,28 +258,25 @@ class Takes:
         """End everything that is recorded of a source, and accept no takes of it."""
         recording = self._recordings.pop(source, None)
         if recording is not None:
-            recording.end()
+            recording.end_takes()
+            recording.end_segments()
 
     def _keep(self, recording: SourceRecording) -> None:
         """Begin rolling segments of a source if they are switched on."""
         writer = self._writer
         if writer is None or self._is_closed or not recording.is_announced or not self.settings.keep_last_s:
             return
-        segments = RollingSegments(
-            self._folder.directory / ROLLING / recording.source,
-            self.settings.keep_last_s,
-            description=self._description(recording.source),
-            parameters=recording.parameters,
-            disk=self.disk,
-            losses=recording.losses,
-            monotonic=self._host.monotonic,
-        )
-        recording.segments = segments
-        recording.add(writer, segments, self.settings.components)
+        folder = self._folder.directory / ROLLING / recording.source
+        facts, keep_s = self._facts(recording), self.settings.keep_last_s
+        recording.keep(writer, RollingSegments(folder, keep_s, facts, self._host.monotonic))
 
-    def _description(self, source: str, details: TakeDetails = NO_DETAILS) -> SourceDescription:
-        channels = lcm_channel(self.settings.prefix, source)
-        return SourceDescription(source, channels, self.server(source), details=details)
+    def _facts(self, recording: SourceRecording, details: TakeDetails = NO_DETAILS) -> SourceFacts:
+        source, settings = recording.source, self.settings
+        channels = lcm_channel(settings.prefix, source)
+        description = SourceDescription(source, channels, self.server(source), details=details)
+        return SourceFacts(
+            description, recording.parameters, self.disk, recording.losses, settings.components
+        )
 
     def add_c3d(self, source: str, c3d_file: Path) -> None:
         """Link or copy a C3D file beside the take to which it belongs, if there is one."""
@@ -308,18 +291,10 @@ class Takes:
         if self._writer is not None or self._is_closed:
             return
         self._writer = writer = self._host.writer("takes", self._max_queued_bytes)
-        writer.call(partial(self._recover, self._folder))
+        writer.call(self._folder.recover)
         self._check_folder()
         for recording in self._recordings.values():
             self._keep(recording)
-
-    def _recover(self, folder: TakesFolder) -> None:
-        if folder.open():
-            return
-        try:
-            folder.recover()
-        except OSError as error:
-            logger.warning("takes: %s", disk_problem(folder.directory / ROLLING, error))
 
     @property
     def problem(self) -> str:
@@ -352,9 +327,9 @@ class Takes:
         """Check the folder and its limits. Called once a second."""
         for recording in self._recordings.values():
             recording.maintain()
-        if self._watch.excess_bytes:
-            self._end_because_full(self._watch.excess_bytes)
-            self._watch.excess_bytes = 0
+        excess_bytes, self._watch.excess_bytes = self._watch.excess_bytes, 0
+        if excess_bytes and self._writer is not None:
+            self._end_because_full(self._writer, excess_bytes)
         self._check_folder()
 
     def _check_folder(self) -> None:
@@ -362,14 +337,11 @@ class Takes:
             protected = {path for each in self._recordings.values() for path in each.running_paths}
             self._watch.check(self.settings, protected)
 
-    def _end_because_full(self, excess_bytes: int) -> None:
-        writer = self._writer
-        if writer is None:
-            return
+    def _end_because_full(self, writer: WriterThread, excess_bytes: int) -> None:
         limit = f"the folder {self._folder.directory} has {excess_bytes} bytes more than takes.max_bytes"
-        recordings = [each for each in self._recordings.values() if each.running_names]
+        recordings = [each for each in self._recordings.values() if each.running_paths]
         for recording in recordings:
-            names = ", ".join(sorted(recording.running_names))
+            names = ", ".join(sorted(path.name for path in recording.running_paths))
             recording.losses.lost(
                 "folder full",
                 f"{names} ends, because {limit}, and no other take can be deleted; raise takes.max_bytes",
@@ -392,9 +364,13 @@ class Takes:
         if writer is None:
             return
         writer.call(self._folder.open)
+        are_files_alike = all(
+            getattr(settings, name) == getattr(before, name)
+            for name in ("effective_directory", "prefix", "components")
+        )
         for recording in self._recordings.values():
             segments = recording.segments
-            if segments is not None and settings.keep_last_s and _same_files(settings, before):
+            if segments is not None and settings.keep_last_s and are_files_alike:
                 writer.call(partial(segments.keep, settings.keep_last_s))
             elif segments is not None or settings.keep_last_s:
                 recording.end_segments()
@@ -414,7 +390,8 @@ class Takes:
         writer = self._writer
         if writer is not None:
             for recording in self._recordings.values():
-                recording.end()
+                recording.end_takes()
+                recording.end_segments()
             if not writer.close(_CLOSE_S):
                 logger.warning(
                     "takes: the disk of %s does not respond; %d bytes are not written",
@@ -431,10 +408,3 @@ def _add_c3d(take: Path, c3d_file: Path) -> None:
         logger.warning("takes: the C3D file of %s is not kept beside it: %s", take, error)
     else:
         logger.info("takes: %s is the C3D file of this take from the server", path)
-
-
-def _same_files(settings: TakesSettings, before: TakesSettings) -> bool:
-    """Return whether segments of both settings are the same files."""
-    return (settings.effective_directory, settings.prefix, settings.components) == (
-        *(before.effective_directory, before.prefix, before.components),
-    )

@@ -22,7 +22,7 @@ from gateway.outputs.takes import disk as disk_module
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.take_file import SourceWriter
+from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.take_writer import RETRY_S
 from gateway.takes.files.writer_thread import LogFile
@@ -297,7 +297,7 @@ class Sink(SourceWriter):
 
     def __init__(self, log: ScriptedLog) -> None:
         self.losses = Losses(logging.getLogger("gateway"), "lab to takes")
-        super().__init__(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses)
+        super().__init__(SourceFacts(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses))
         self.log = log
         self.utimes: list[int] = []
         self.waits = Waits()

@@ -11,7 +11,7 @@ import pytest
 from gateway.outputs.takes import folder_limits
 from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
-from gateway.outputs.takes.folder_limits import FolderLimits, FolderWatch
+from gateway.outputs.takes.folder_limits import FolderWatch
 from tests.support.clocks import Clock
 from tests.support.recording_output import NoThread, settings_in
 from tests.unit.outputs.takes.test_folder import NOW_S, stored
@@ -25,10 +25,14 @@ def takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TakesFolder:
     return TakesFolder(tmp_path)
 
 
+def watch_of(takes: TakesFolder, clock: Clock | None = None) -> FolderWatch:
+    return FolderWatch(settings_in(takes.directory), Host(clock or Clock()))
+
+
 def excess(takes: TakesFolder, max_bytes: int, *protected: str) -> int:
     """Apply a limit; return how many bytes are still too many."""
     paths = {takes.directory / name for name in protected}
-    return FolderLimits(takes).delete_old(max_bytes=max_bytes, max_age_s=None, protected=paths)
+    return watch_of(takes).delete_old(max_bytes, None, paths)
 
 
 def left(
@@ -36,11 +40,11 @@ def left(
     max_bytes: int,
     *protected: str,
     max_age_s: float | None = None,
-    limits: FolderLimits | None = None,
+    watch: FolderWatch | None = None,
 ) -> list[str]:
     """Apply the limits; return the takes that are left, as SOURCE/NAME."""
     paths = {takes.directory / name for name in protected}
-    (limits or FolderLimits(takes)).delete_old(max_bytes=max_bytes, max_age_s=max_age_s, protected=paths)
+    (watch or watch_of(takes)).delete_old(max_bytes, max_age_s, paths)
     return sorted(f"{entry.source}/{entry.path.name}" for entry in takes.entries())
 
 
@@ -139,15 +143,15 @@ def test_a_corrected_clock_makes_no_take_old(tmp_path: Path, monkeypatch: pytest
     now_s, clock = 1000.0, Clock()
     monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: now_s))
     takes = TakesFolder(tmp_path)
-    limits = FolderLimits(takes, clock)
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == []
+    watch = watch_of(takes, clock)
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
     stored(tmp_path / "lab/walk.lcmlog", 1, NOW_S - now_s)
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == ["lab/walk"]
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == ["lab/walk"]
     now_s = NOW_S
     clock.now_s += DAY_S - 1
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == ["lab/walk"]
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == ["lab/walk"]
     clock.now_s += 2
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == []
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
 
 
 # When the folder is checked ------------------------------------------------------------------

@@ -15,6 +15,7 @@ from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.outputs.takes.take_file import SourceFacts
 from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
@@ -43,14 +44,12 @@ class Rolling:
         self.clock = Clock()
         self.disk = Disk()
         self.path = folder / ".rolling" / "lab"
+        losses = Losses(logging.getLogger("gateway"), "lab to takes")
         self.segments = RollingSegments(
             self.path,
             keep_s,
-            description=SourceDescription("lab", "MOCAP_LAB"),
-            parameters=None,
-            disk=self.disk,
-            losses=Losses(logging.getLogger("gateway"), "lab to takes"),
-            monotonic=self.clock,
+            SourceFacts(SourceDescription("lab", "MOCAP_LAB"), None, self.disk, losses),
+            self.clock,
         )
         self.num_messages = 0
 

@@ -3,7 +3,7 @@
 import asyncio
 import math
 import socket
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NoReturn
@@ -26,10 +26,10 @@ from tests.support.clocks import Clock, run_in_virtual_time
 from tests.support.recording_output import events, frames, still_lab
 
 
-async def refused(call: Coroutine[Any, Any, Any], text: str) -> str:
-    """Await a call that is refused with this text; return the code of the error."""
+async def refused(text: str, call: Callable[..., Coroutine[Any, Any, Any]], *arguments: Any) -> str:
+    """Make a call that is refused with this text; return the code of the error."""
     with pytest.raises(QueryError, match=text) as caught:
-        await call
+        await call(*arguments)
     return caught.value.code
 
 
@@ -127,14 +127,14 @@ async def test_only_one_take_of_a_source_runs(tmp_path: Path) -> None:
     """What is not possible is refused with a reason, and harms neither a file nor the running take."""
     async with still_lab(tmp_path) as lab:
         takes = lab.takes
-        assert await refused(takes.stop("lab"), "no take of source 'lab' is running") == "nothing-yet"
+        assert await refused("no take of source 'lab' is running", takes.stop, "lab") == "nothing-yet"
         await takes.start("lab", "walk")
-        await refused(takes.start("lab", "run"), "take 'walk' of source 'lab' is running already")
+        await refused("take 'walk' of source 'lab' is running already", takes.start, "lab", "run")
         published = lab.publish()
         await takes.stop("lab")
-        await refused(takes.start("lab", "walk"), "there is a take 'walk' of this source already")
+        await refused("there is a take 'walk' of this source already", takes.start, "lab", "walk")
         await takes.start("lab", "run")
-        await refused(takes.start("hall"), "no source 'hall'")
+        await refused("no source 'hall'", takes.start, "hall")
     assert frames(lab.path("walk.lcmlog")) == [published]
 
 
@@ -144,8 +144,9 @@ async def test_names_that_are_no_names_of_files_are_refused(tmp_path: Path, name
     async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
         takes = lab.takes
-        for call in (takes.start("lab", name), takes.save("lab", 1, 0, name), takes.read("lab", name, 0)):
-            assert await refused(call, "cannot be the name of a take") == "bad-request"
+        for call, *arguments in ((takes.start, name), (takes.save, 1, 0, name), (takes.read, name, 0)):
+            text = "cannot be the name of a take"
+            assert await refused(text, call, "lab", *arguments) == "bad-request"
 
 
 async def test_names_may_have_letters_of_any_script_or_follow_from_source_and_time(tmp_path: Path) -> None:
@@ -187,8 +188,8 @@ async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
             pieces.append(piece.content)
         assert b"".join(pieces) == lab.path("walk.lcmlog").read_bytes()
         assert len(pieces) > 1
-        await refused(lab.takes.read("lab", "jump", 0), "has no take 'jump'")
-        await refused(lab.takes.read("lab", "walk", -1), "an offset of 0 or more")
+        await refused("has no take 'jump'", lab.takes.read, "lab", "jump", 0)
+        await refused("an offset of 0 or more", lab.takes.read, "lab", "walk", -1)
 
 
 async def test_a_take_that_ends_while_listed_has_ended(
@@ -202,7 +203,7 @@ async def test_a_take_that_ends_while_listed_has_ended(
 
         def end_and_read(folder: TakesFolder, path: Path, *, is_running: bool = False) -> StoredTake:
             if not ends:
-                ends.append(lab.takes.end("lab"))
+                ends.append(lab.takes.stop("lab"))
             return take_at(folder, path, is_running=is_running)
 
         monkeypatch.setattr(TakesFolder, "take_at", end_and_read)
@@ -221,7 +222,7 @@ async def test_a_take_that_starts_too_late_has_no_file(
     async with still_lab(tmp_path) as lab:
         with monkeypatch.context() as patch:
             patch.setattr(takes_module, "disk_result", too_late)
-            await refused(lab.takes.start("lab", "walk"), "did not respond")
+            await refused("did not respond", lab.takes.start, "lab", "walk")
         assert [*lab.path("").iterdir()] == []
         assert not lab.publishers["3d"].wanted
         assert lab.takes.running("lab") is None
@@ -291,7 +292,7 @@ async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
         await lab.takes.start("lab", "walk")
         published = [lab.publish()]
         lab.output.withdraw("lab")
-        await refused(lab.takes.stop("lab"), "no source 'lab'")
+        await refused("no source 'lab'", lab.takes.stop, "lab")
         lab.output.announce("lab")
         await lab.takes.start("lab", "run")
     assert frames(lab.path("walk.lcmlog")) == published
@@ -372,7 +373,7 @@ async def test_takes_can_be_saved_beside_a_running_one_up_to_a_limit(tmp_path: P
         for number in range(MAX_SAVES):
             published.append(lab.publish())
             await lab.takes.save("lab", 60, 30, f"fall {number}")
-        assert await refused(lab.takes.save("lab", 30, 60), "are being saved already") == "refused"
+        assert await refused("are being saved already", lab.takes.save, "lab", 30, 60) == "refused"
         await lab.takes.save("lab", 30, 0, "at once")
     assert frames(lab.path("walk.lcmlog")) == published[1:]
     assert all(frames(lab.path(f"fall {number}")) == published for number in range(MAX_SAVES))
@@ -382,13 +383,13 @@ async def test_saving_needs_something_that_is_kept(tmp_path: Path) -> None:
     """The peer learns whether to change the configuration, to wait, or to ask otherwise."""
     async with still_lab(tmp_path / "off") as lab:
         lab.publish()
-        assert await refused(lab.takes.save("lab", 60), "keep_last_s is 0") == "nothing-yet"
+        assert await refused("keep_last_s is 0", lab.takes.save, "lab", 60) == "nothing-yet"
     async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
         for last_s, after_s in ((0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0), (1.0, -1.0), (1.0, 3600.1)):
-            await refused(lab.takes.save("lab", last_s, after_s), "expected last above 0")
+            await refused("expected last above 0", lab.takes.save, "lab", last_s, after_s)
         await lab.takes.save("lab", 0.1, 3600, "fall")
-        await refused(lab.takes.start("lab", "fall"), "there is a take 'fall'")
+        await refused("there is a take 'fall'", lab.takes.start, "lab", "fall")
 
 
 async def test_a_publisher_that_closes_frees_its_channel(tmp_path: Path) -> None:
