@@ -129,6 +129,11 @@ class SourceRecording:
             segments.give_up()
             self._call(segments.close)
 
+    def end(self) -> None:
+        """End everything that is recorded."""
+        self.end_takes()
+        self.end_segments()
+
     @property
     def running_paths(self) -> set[Path]:
         """The paths, without extension, of the takes to which messages are added."""

@@ -258,8 +258,7 @@ class Takes:
         """End everything that is recorded of a source, and accept no takes of it."""
         recording = self._recordings.pop(source, None)
         if recording is not None:
-            recording.end_takes()
-            recording.end_segments()
+            recording.end()
 
     def _keep(self, recording: SourceRecording) -> None:
         """Begin rolling segments of a source if they are switched on."""
@@ -390,8 +389,7 @@ class Takes:
         writer = self._writer
         if writer is not None:
             for recording in self._recordings.values():
-                recording.end_takes()
-                recording.end_segments()
+                recording.end()
             if not writer.close(_CLOSE_S):
                 logger.warning(
                     "takes: the disk of %s does not respond; %d bytes are not written",
