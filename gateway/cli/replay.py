@@ -100,14 +100,14 @@ def replay(
     from gateway.cli.replay_run import ReplayRun
     from gateway.takes.files.reader import TakeReader
     from gateway.takes.replay.play_list import Selection
-    from gateway.takes.replay.replay import ZenohAddress, lcm_destination, zenoh_destination
+    from gateway.takes.replay.replay import lcm_destination, zenoh_destination
 
     set_up_log(LogLevel.WARNING)
     sys.setswitchinterval(_SWITCH_S)
     gc.freeze()  # or a full garbage collection looks through all modules, which takes 20 ms
     destinations = []
     if not lcm:
-        destinations.append(zenoh_destination(prefix, ZenohAddress(connect, listen, zenoh_config)))
+        destinations.append(zenoh_destination(prefix, connect, listen, zenoh_config))
     if not zenoh:
         destinations.append(lcm_destination(lcm_prefix(prefix), url))
     selection = Selection(

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
-from gateway.outputs.takes.disk import disk_problem
-from gateway.outputs.takes.folder import check_directory
+from gateway.outputs.takes.folder import check_directory, disk_problem
 from gateway.outputs.takes.settings import TAKES, TakesSettings
 
 _FEW_MINUTES: Final = 60.0

@@ -17,7 +17,6 @@ import rtc3d
 
 from gateway.errors import ProtocolError, QueryError, TakeError
 from gateway.messages.decode import decode
-from gateway.outputs.takes.disk import disk_problem
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.new_file import NewFiles, by_number, check_name, default_name, numbered
@@ -30,6 +29,16 @@ C3D_SUFFIX: Final = ".c3d"
 
 _FURTHER_C3D: Final = re.compile(r" \(\d+\)$|-\d+$")
 """What follows the name of the take in that of a further C3D file. Earlier gateways wrote "-2"."""
+
+_REMEDIES: Final = {
+    errno.ENOSPC: "make room on it, or lower takes.max_bytes",
+    errno.EDQUOT: "make room on it, or lower takes.max_bytes",
+    errno.EACCES: "let the gateway write there",
+    errno.EPERM: "let the gateway write there",
+    errno.EROFS: "mount it so that the gateway can write",
+    errno.ENOENT: "is the disk mounted? If so, create the folder, or start the gateway again",
+    errno.ENOTDIR: "choose a folder as takes.directory",
+}
 
 _LOCK: Final = ".rtc3d-gateway.lock"
 _TAIL_BYTES: Final = 256 * 1024
@@ -286,6 +295,17 @@ def add_c3d(take: Path, c3d_file: Path) -> Path:
             with c3d_file.open("rb") as original:
                 shutil.copyfileobj(original, copy, _COPIED_BYTES)
     return path
+
+
+def is_full(error: OSError) -> bool:
+    """Return whether room on the disk would help."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def disk_problem(path: Path, error: OSError) -> str:
+    """Return what is wrong with ``path``, and what to do."""
+    remedy = _REMEDIES.get(error.errno or 0, "check the disk")
+    return f"{path} cannot be written: {error.strerror or error}; {remedy}"
 
 
 def check_directory(directory: Path) -> None:

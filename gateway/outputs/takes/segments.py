@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import QueryError, TakeError
-from gateway.outputs.takes.disk import is_full
-from gateway.outputs.takes.folder import free_stem
+from gateway.outputs.takes.folder import free_stem, is_full
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader

@@ -81,9 +81,10 @@ class SourceRecording:
         self._update()
         return created
 
-    def cancel_take(self, take: TakeFile) -> None:
-        """Undo ``begin_take``, because nobody waits for the file any more."""
-        take.cancel()
+    def cancel_take(self, take: TakeFile, created: Future[None]) -> None:
+        """Undo ``begin_take``, which returned ``created``, because nobody waits for the file any more."""
+        created.cancel()
+        take.give_up()
         self._call(take.discard)
         if self.take is take:
             self.take = None

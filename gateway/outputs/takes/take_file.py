@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.outputs.parameters_message import published_again
-from gateway.outputs.takes.disk import Disk, is_full
-from gateway.outputs.takes.folder import free_stem, log_path
+from gateway.outputs.takes.disk import Disk
+from gateway.outputs.takes.folder import free_stem, is_full, log_path
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.takes.files.description import SourceDescription
@@ -131,7 +131,6 @@ class TakeFile(SourceWriter):
         self.utime = utime
         """When it was started, in µs since the Unix epoch."""
         self._has_free_name = has_free_name
-        self._is_cancelled = False
 
     @property
     def name(self) -> str:
@@ -145,19 +144,12 @@ class TakeFile(SourceWriter):
 
     def create(self) -> None:
         """Create the file. Raises OSError, and QueryError if there is such a take already."""
-        if self._is_cancelled:
-            return
         self.stem = free_stem(self.stem, has_free_name=self._has_free_name)
         self._log = self._begin_log(self.path, self.name, self.utime)
 
     def make_room(self, error: OSError) -> bool:
         """See TakeWriter."""
         return is_full(error) and self._delete_less_important()
-
-    def cancel(self) -> None:
-        """Do not create the file, because nobody waits for it any more. Any thread may call it."""
-        self._is_cancelled = True
-        self.give_up()
 
     def log_for(self, utime: int) -> LogFile:
         """See TakeWriter. If the file was removed, another one takes its place."""

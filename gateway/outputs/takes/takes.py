@@ -11,9 +11,8 @@ from typing import Any, Final, NamedTuple, TypeVar
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.takes.disk import Disk, Host, disk_result
+from gateway.outputs.takes.disk import Disk, FolderWatch, Host, disk_result
 from gateway.outputs.takes.folder import ROLLING, StoredTake, TakePiece, TakesFolder, add_c3d
-from gateway.outputs.takes.folder_limits import FolderWatch
 from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
@@ -105,7 +104,7 @@ class Takes:
             try:
                 await disk_result(created, take.path, self.disk)
             except QueryError:
-                recording.cancel_take(take)
+                recording.cancel_take(take, created)
                 raise
             logger.info("takes: recording %s", take.path)
             return StoredTake(take.name, 0, take.utime, 0.0, is_running=True, details=details)

@@ -50,6 +50,7 @@ class Event(NamedTuple):
 class Damage(NamedTuple):
     """Bytes of a file that belong to no readable event."""
 
+    file: Path
     offset: int
     num_bytes: int
 
@@ -115,7 +116,7 @@ class EventLogReader:
 
     def _add_damage(self, start: int, stop: int) -> None:
         if len(self.damage) < MAX_LISTED_DAMAGE:
-            self.damage.append(Damage(start, stop - start))
+            self.damage.append(Damage(self.path, start, stop - start))
         self.num_damaged += 1
         self.damaged_bytes += stop - start
 

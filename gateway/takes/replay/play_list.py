@@ -4,7 +4,6 @@ from bisect import bisect_right
 from collections.abc import Generator
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Final, NamedTuple
 
 from gateway.errors import TakeError
@@ -54,22 +53,14 @@ def take_length_us(reader: TakeReader, stop_us: int | None = None) -> int | None
     If the replay stops earlier, at ``stop_us``, that is the end.
     It is wrong if somebody has set the clock during the recording.
     """
-    last_utime = _last_utime(reader.logs[-1].path)
-    if last_utime is None:
+    log, last_utime = reader.logs[-1].path, reader.start_utime
+    try:
+        for event in EventLogReader(log).events(max(0, log.stat().st_size - _TAIL_BYTES)):
+            last_utime = event.utime
+    except (OSError, TakeError):
         return stop_us
     length_us = max(0, last_utime - reader.start_utime)
     return length_us if stop_us is None else min(length_us, stop_us)
-
-
-def _last_utime(log: Path) -> int | None:
-    try:
-        start = max(0, log.stat().st_size - _TAIL_BYTES)
-        utime = None
-        for event in EventLogReader(log).events(start):
-            utime = event.utime
-    except (OSError, TakeError):
-        return None
-    return utime
 
 
 _PARAMETERS: Final = "parameters"
@@ -137,13 +128,7 @@ def play_list(
             break
         if not is_begun:
             is_begun = True
-            yield from _before(start_us, parameters, message)
+            valid = [(name, xml) for name, xml in parameters.items() if xml is not message]
+            yield from (Entry(start_us, name, _PARAMETERS, xml) for name, xml in valid)
         if is_selected:
             yield Entry(position_us, source, key, message)
-
-
-def _before(start_us: int, parameters: dict[str, bytes], first: bytes) -> Generator[Entry]:
-    """Yield the parameters that are valid at the start, except the first message itself."""
-    for source, newest in parameters.items():
-        if newest is not first:
-            yield Entry(start_us, source, _PARAMETERS, newest)

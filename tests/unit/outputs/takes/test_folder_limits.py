@@ -8,10 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from gateway.outputs.takes import folder_limits
-from gateway.outputs.takes.disk import Host
+from gateway.outputs.takes import disk
+from gateway.outputs.takes.disk import FolderWatch, Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
-from gateway.outputs.takes.folder_limits import FolderWatch
 from tests.support.clocks import Clock
 from tests.support.recording_output import NoThread, settings_in
 from tests.unit.outputs.takes.test_folder import NOW_S, stored
@@ -21,7 +20,7 @@ DAY_S = 86_400.0
 
 @pytest.fixture
 def takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TakesFolder:
-    monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: NOW_S))
+    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: NOW_S))
     return TakesFolder(tmp_path)
 
 
@@ -141,7 +140,7 @@ def test_c3d_files_go_with_their_take_only(takes: TakesFolder, caplog: pytest.Lo
 def test_a_corrected_clock_makes_no_take_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer without a battery writes takes in 1970 until it has found a time server."""
     now_s, clock = 1000.0, Clock()
-    monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: now_s))
+    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: now_s))
     takes = TakesFolder(tmp_path)
     watch = watch_of(takes, clock)
     assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
@@ -229,7 +228,7 @@ def test_a_disk_that_does_not_respond_is_a_problem(watched: Watched) -> None:
 def test_the_limits_of_the_settings_are_applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Days and bytes mean what they say."""
     watched = Watched(tmp_path, max_age_days=2, max_bytes=1024 * 1024)
-    monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: NOW_S))
+    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: NOW_S))
     old = stored(tmp_path / "lab/a.lcmlog", 10, 2.1 * DAY_S)
     new = stored(tmp_path / "lab/b.lcmlog", 1024 * 1024 + 5, 1.9 * DAY_S)
     watched.check()
