@@ -238,7 +238,7 @@ class FileWriter(TakeWriter):
     """Writes the file of a recording, and counts what is not in it by channel. Any thread may read these."""
 
     def __init__(self, log: LogFile) -> None:
-        super().__init__(log)
+        super().__init__(log.path, log)
         self.problem = ""
         """What is wrong with the disk now; "" if it accepts messages."""
         self.lost: Counter[bytes] = Counter()
@@ -247,11 +247,6 @@ class FileWriter(TakeWriter):
         self.num_errors = 0
         """How often the disk stopped accepting messages."""
         self._file = log
-
-    @property
-    def path(self) -> Path:
-        """The path of the file."""
-        return self._file.path
 
     @property
     def is_in_place(self) -> bool:

@@ -86,20 +86,14 @@ class RollingSegments(SourceWriter):
         facts: SourceFacts,
         monotonic: Callable[[], float],
     ) -> None:
-        super().__init__(facts)
+        super().__init__(folder, facts)
         self._monotonic = monotonic
         self._keep_s = keep_s
-        self._folder = folder
         self._segments: deque[_Segment] = deque()
         self._log_began_s = 0.0
         self._num_segments = 0  # so far: no name is used twice
         self._saves: list[Save] = []
         self._written_s = 0.0  # when something was written before a problem of the disk
-
-    @property
-    def path(self) -> Path:
-        """The folder of the segments."""
-        return self._folder
 
     def kept_s(self) -> float:
         """Return how many seconds of the past could be saved now; a problem of the disk ends them."""
@@ -125,10 +119,10 @@ class RollingSegments(SourceWriter):
             self._end_segment()
         self._is_in_place = True
         if self._log is None:
-            for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing
+            for folder in (self.path.parent, self.path):  # not those above: their disk may be missing
                 folder.mkdir(exist_ok=True)
             name = f"{default_name(self.description.source)}-{self._num_segments:06}"
-            self._log = self._begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
+            self._log = self._begin_log(self.path / f"{name}{SUFFIX}", name, utime)
             self._num_segments += 1
             self._log_began_s = now_s
             for save in [*self._saves]:
@@ -253,5 +247,5 @@ class RollingSegments(SourceWriter):
         while self._segments:
             self._delete_oldest()
         with contextlib.suppress(OSError):
-            self._folder.rmdir()
+            self.path.rmdir()
         self.disk.ended()

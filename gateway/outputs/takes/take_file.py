@@ -39,8 +39,8 @@ class SourceFacts(NamedTuple):
 class SourceWriter(TakeWriter):
     """Writes the messages of one source. Each of its files begins with the source and its parameters."""
 
-    def __init__(self, facts: SourceFacts) -> None:
-        super().__init__()
+    def __init__(self, path: Path, facts: SourceFacts) -> None:
+        super().__init__(path)
         self.description, self._parameters, self.disk, self._losses, self.components = facts
         self.parameters_channel: bytes = self.description.channel("parameters")
         self.channels: dict[TakesPublisher, str] = {}
@@ -124,7 +124,7 @@ class TakeFile(SourceWriter):
         has_free_name: bool,
         delete_less_important: Callable[[], bool],
     ) -> None:
-        super().__init__(facts)
+        super().__init__(log_path(stem), facts)
         self._delete_less_important = delete_less_important
         self.stem = stem
         """The path without the extension; final after ``create``."""
@@ -137,14 +137,10 @@ class TakeFile(SourceWriter):
         """The name of the take."""
         return self.stem.name
 
-    @property
-    def path(self) -> Path:
-        """The path of the file."""
-        return log_path(self.stem)
-
     def create(self) -> None:
         """Create the file. Raises OSError, and QueryError if there is such a take already."""
         self.stem = free_stem(self.stem, has_free_name=self._has_free_name)
+        self.path = log_path(self.stem)
         self._log = self._begin_log(self.path, self.name, self.utime)
 
     def make_room(self, error: OSError) -> bool:

@@ -15,6 +15,7 @@ from gateway.errors import ProtocolError, TakeError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
+from gateway.messages.topics import unique_name
 from gateway.takes.files.event_log import Event, EventLogReader
 from gateway.takes.files.new_file import by_number
 
@@ -22,6 +23,7 @@ NAMED_WITHIN_EVENTS: Final = 50_000
 """Each source is named within this many events: by its description, or by its status once a second."""
 
 _POSE: Final = "_6D_"
+_MAX_NAME_LENGTH: Final = 1000
 
 
 class SourceNames:
@@ -68,11 +70,7 @@ class SourceNames:
         taken = set(self._names.values())
         if not name or name in taken:
             name = channels.lower()
-        number, candidate = 1, name
-        while candidate in taken:
-            number += 1
-            candidate = f"{name}_{number}"
-        self._names[channels] = candidate
+        self._names[channels] = unique_name(name, taken, _MAX_NAME_LENGTH)
 
 
 SUFFIX: Final = ".lcmlog"

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import closing
 from typing import Final, Protocol
@@ -14,9 +15,6 @@ from gateway.takes.replay.timeline import MAX_GAP_S, Jump, ReplayTimeline
 
 _BINS_PER_E: Final = 50
 """Bins of the lateness differ by 2 %."""
-
-_NUM_BINS: Final = 1400
-"""The last bin begins at e^28 µs, which is 16 days."""
 
 
 class Pace:
@@ -49,27 +47,26 @@ class Pace:
 
 
 class Lateness:
-    """How late messages were: a histogram of fixed size with bins of 2 %."""
+    """How late messages were: a histogram with bins of 2 %."""
 
     def __init__(self) -> None:
         self.num_messages = 0
         self.max_s = 0.0
-        self._counts = [0] * _NUM_BINS
+        self._counts: Counter[int] = Counter()  # by bin
 
     def add(self, late_s: float) -> None:
         """Count a message."""
         self.num_messages += 1
         self.max_s = max(self.max_s, late_s)
         late_us = late_s * 1e6
-        index = int(_BINS_PER_E * math.log(late_us)) + 1 if late_us > 1 else 0
-        self._counts[min(index, _NUM_BINS - 1)] += 1
+        self._counts[int(_BINS_PER_E * math.log(late_us)) + 1 if late_us > 1 else 0] += 1
 
     def quantile_s(self, fraction: float) -> float:
         """Return the lateness that this part of the messages does not exceed, within 2 %; 0.0 without any."""
         rest = fraction * self.num_messages
-        for index, count in enumerate(self._counts):
+        for index, count in sorted(self._counts.items()):
             rest -= count
-            if count and rest <= 0:
+            if rest <= 0:
                 return min(math.exp(index / _BINS_PER_E) * 1e-6, self.max_s)
         return self.max_s
 

@@ -297,16 +297,13 @@ class Sink(SourceWriter):
 
     def __init__(self, log: ScriptedLog) -> None:
         self.losses = Losses(logging.getLogger("gateway"), "lab to takes")
-        super().__init__(SourceFacts(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses))
+        facts = SourceFacts(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses)
+        super().__init__(Path("/takes/lab/walk.lcmlog"), facts)
         self.log = log
         self.utimes: list[int] = []
         self.waits = Waits()
         self._gives_up = self.waits
         self.newest_version: list[int | None] = []
-
-    @property
-    def path(self) -> Path:
-        return Path("/takes/lab/walk.lcmlog")
 
     def log_for(self, utime: int) -> LogFile:
         self.utimes.append(utime)
