@@ -55,12 +55,6 @@ class Damage(NamedTuple):
     num_bytes: int
 
 
-def encode_event(number: int, utime: int, channel: bytes, message: bytes) -> bytes:
-    """Return an event as in a file; ``utime`` is its time in µs since the Unix epoch."""
-    header = _HEADER.pack(SYNC, number, utime, len(channel), len(message))
-    return b"%b%b%b" % (header, channel, message)
-
-
 class EventLogReader:
     """Reads the events of one file, in their order; bytes that are damaged are skipped and counted.
 

@@ -8,7 +8,8 @@ import lcm
 import pytest
 
 from gateway.errors import TakeError
-from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, SYNC, EventBoundary, EventLogReader, encode_event
+from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, SYNC, EventBoundary, EventLogReader
+from tests.support.takes import encode_event
 
 HEADER_BYTES = 28
 MESSAGES = [(number, 1_000_000 + 5000 * number, b"MOCAP_LAB_3D", os.urandom(100)) for number in range(500)]
