@@ -208,13 +208,13 @@ async def _record(folder: Path, steps: list[tuple[str, int]]) -> dict[str, list[
         for number, (step, size) in enumerate(steps):
             match step:
                 case "start" if running is None:
-                    await lab.takes.start("lab", str(number))
+                    await lab.takes.start(str(number))
                     running = takes[str(number)] = [None] if has_parameters else []
                 case "stop" if running is not None:
-                    await lab.takes.stop("lab")
+                    await lab.takes.stop()
                     running = None
                 case "pause":
-                    await lab.takes.written()
+                    await lab.output.storage.written()
                 case "parameters":
                     xml = b"<!--" + b"x" * (size * 1000) + b"-->"
                     sent = lab.output.publish_parameters("lab", ServerParameters(xml, 1, number))

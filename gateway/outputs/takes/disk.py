@@ -1,4 +1,4 @@
-"""Whether the disk accepts what is written to it, and whether the folder of takes keeps its limits."""
+"""The folder of all takes: whether its disk accepts what is written, its limits, and the threads for it."""
 
 import asyncio
 import contextlib
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
-from gateway.errors import QueryError, TakeError
+from gateway.errors import OutputError, QueryError, TakeError
 from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.outputs.takes.folder import FileId, TakeEntry, TakesFolder, disk_problem
 from gateway.outputs.takes.settings import TakesSettings
@@ -202,3 +202,78 @@ class FolderWatch:
             self._noticed[entry.path] = entry.end_s, noticed_s
             ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
         return ages_s
+
+
+class Storage:
+    """What the takes of all sources share: their settings, their folder, its disk, and the threads for it.
+
+    Call it in the event loop; no call waits for the disk for long.
+    """
+
+    def __init__(self, settings: TakesSettings, max_queued_bytes: int, host: Host) -> None:
+        self.settings = settings
+        self.host = host
+        self.disk = Disk()
+        self.watch = FolderWatch(settings, host)
+        self.writer: WriterThread | None = None
+        """The thread that writes; None before ``open``."""
+        self.is_closed = False
+        self.server: Callable[[str], str] = lambda _source: ""
+        """Returns HOST:PORT of a source's server."""
+        self.copy_thread = host.thread("takes-copy")
+        self._read_thread = host.thread("takes-read")
+        self._max_queued_bytes = max_queued_bytes
+
+    @property
+    def folder(self) -> TakesFolder:
+        """The folder of the takes."""
+        return self.watch.folder
+
+    def open(self) -> None:
+        """Start to write."""
+        self.writer = self.host.writer("takes", self._max_queued_bytes)
+        self.writer.call(self.folder.recover)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong and what to do; "" if takes can be recorded."""
+        if self.is_closed:
+            return "the output takes is closed; start the gateway again"
+        if self.writer is None:
+            return "the output takes is not open; start it first"
+        return self.watch.problem or self.disk.problem
+
+    def started_writer(self) -> WriterThread:
+        """Return the thread that writes. Raises QueryError if the output is not open."""
+        if self.writer is None or self.is_closed:
+            raise QueryError(self.problem, code="disk")
+        return self.writer
+
+    def open_writer(self) -> WriterThread:
+        """Return the thread that writes. Raises QueryError if takes cannot be recorded now."""
+        writer, problem = self.started_writer(), self.problem
+        if problem and self.watch.is_checked:  # otherwise, creating the file shows it
+            raise QueryError(problem, code="disk")
+        return writer
+
+    async def read(self, call: Callable[[], _Result], path: Path) -> _Result:
+        """Return the result of ``call``, which reads ``path`` in a thread. Raises QueryError."""
+        return await disk_result(self._read_thread.submit(call), path)
+
+    async def written(self) -> None:
+        """Wait until everything that was published so far is in the files."""
+        await asyncio.wrap_future(self.started_writer().call(lambda: None))
+
+    def refusal(self) -> OutputError | None:
+        """Return the error for a message that is published while the output is not open."""
+        problem = self.problem
+        return OutputError(problem, cause="not open") if problem else None
+
+    def queue_full(self) -> OutputError:
+        """Return the error for a message that does not fit into the queue."""
+        waiting_mib = self._max_queued_bytes / 2**20
+        slow = (
+            f"the disk of {self.folder.directory} is too slow: {waiting_mib:.0f} MiB wait for it; "
+            "check what else writes to it"
+        )
+        return OutputError(self.problem or slow, cause="disk too slow")

@@ -10,6 +10,7 @@ import shutil
 import stat
 import threading
 from collections.abc import Collection
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -84,14 +85,16 @@ class TakePiece(NamedTuple):
     content: bytes
 
 
+@dataclass
 class TakeEntry:
-    """A take in the folder: a log or a folder of logs, and the C3D files of the same name."""
+    """A take in the folder: a log or a folder of logs, and the C3D files of the same name.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        """The path without the extension."""
-        self.logs: list[tuple[Path, os.stat_result]] = []
-        self.c3d_files: list[tuple[Path, os.stat_result]] = []
+    ``path`` is without the extension.
+    """
+
+    path: Path
+    logs: list[tuple[Path, os.stat_result]] = field(default_factory=list)
+    c3d_files: list[tuple[Path, os.stat_result]] = field(default_factory=list)
 
     @property
     def source(self) -> str:

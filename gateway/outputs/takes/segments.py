@@ -50,12 +50,12 @@ class Save:
         self.folder = folder
         self.name: str = folder.name
         """The name of the take."""
-        self._num_files = 0
+        self.num_files = 0
 
     def link(self, segment: Path) -> None:
         """Add a segment. Raises OSError."""
-        os.link(segment, self._path(self._num_files + 1))
-        self._num_files += 1
+        os.link(segment, self._path(self.num_files + 1))
+        self.num_files += 1
 
     def describe(self, description: SourceDescription) -> None:
         """Add a file that says what the take is about, after the first segment. Raises OSError."""
@@ -65,11 +65,6 @@ class Save:
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.name}-{number:03}{SUFFIX}"
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no further segment fits."""
-        return self._num_files >= _MAX_FILES
 
 
 class RollingSegments(SourceWriter):
@@ -225,7 +220,7 @@ class RollingSegments(SourceWriter):
         """Add the present segment to a take."""
         if self._log is None:
             return
-        if save.is_full:
+        if save.num_files >= _MAX_FILES:
             self._saves.remove(save)
             logger.warning("takes: %s ends, because it has %d files", save.folder, _MAX_FILES)
             return

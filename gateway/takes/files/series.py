@@ -333,7 +333,15 @@ class SeriesBuilder:
         """Append the content of messages."""
         heads, items = rows.heads, rows.items
         if self._component is ComponentType.EVENT:
-            heads, items = _one_row_per_event(rows)
+            counts = heads["num_items"].astype(np.int64)
+            heads = np.repeat(heads, counts)  # each event has a row of its own, in the order of the messages
+            heads["num_items"] = 1
+            events = np.empty((len(heads), 1), NATIVE_ITEM_DTYPES[ComponentType.EVENT])
+            starts = np.cumsum(counts) - counts
+            for num_items, values in items.items():
+                places = starts[counts == num_items][:, None] + np.arange(num_items)
+                events[places.ravel(), 0] = values.ravel()
+            items = {1: events}
         for name, column in self._columns.items():
             column.extend(heads[name])
         for num_items, values in items.items():
@@ -361,19 +369,6 @@ def regular_step(steps: Array) -> float | None:
         return None
     median = np.median(steps)
     return float(steps[abs(steps - median) <= median / 2].mean())
-
-
-def _one_row_per_event(rows: Rows) -> tuple[Array, dict[int, Array]]:
-    """Return heads and items so that each event has a row of its own, in the order of the messages."""
-    counts = rows.heads["num_items"].astype(np.int64)
-    heads = np.repeat(rows.heads, counts)
-    heads["num_items"] = 1
-    items = np.empty((len(heads), 1), NATIVE_ITEM_DTYPES[ComponentType.EVENT])
-    starts = np.cumsum(counts) - counts
-    for num_items, values in rows.items.items():
-        places = starts[counts == num_items][:, None] + np.arange(num_items)
-        items[places.ravel(), 0] = values.ravel()
-    return heads, {1: items}
 
 
 def _entries_of_rows(utime: Array, version: Array, parameters: Sequence[ParametersEntry]) -> Array:

@@ -5,6 +5,7 @@ import contextlib
 import json
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -94,12 +95,10 @@ async def require_silence(destinations: Sequence[Destination]) -> None:
         for destination in destinations:
             subscribe = destination.kind.subscribe
             if subscribe is not None:
-                request = destination.request
-                subscription = await WorkerThread(f"listen {destination.kind.name}").run(
-                    lambda subscribe=subscribe, request=request: subscribe(  # type: ignore[misc]
-                        request, lambda name, _message: heard.setdefault(name)
-                    )
+                listen = partial(
+                    subscribe, destination.request, lambda name, _message: heard.setdefault(name)
                 )
+                subscription = await WorkerThread(f"listen {destination.kind.name}").run(listen)
                 stack.callback(subscription.close)
         await asyncio.sleep(LISTENING_S)
     if heard:

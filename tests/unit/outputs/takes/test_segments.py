@@ -362,11 +362,11 @@ async def test_a_running_take_gets_the_room_of_the_segments(tmp_path: Path, smal
     async with still_lab(tmp_path, clock, keep_last_s=60) as lab:
         for _ in range(5):
             lab.publish(size=10_000)
-            await lab.takes.written()
+            await lab.output.storage.written()
             clock.now_s += 11
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         small_disk.num_bytes = sum(path.stat().st_size for path in lab.directory.rglob("*.lcmlog"))
         published = [lab.publish(size=2000) for _ in range(8)]
-        stopped = await lab.takes.stop("lab")
+        stopped = await lab.takes.stop()
         assert frames(lab.path("walk.lcmlog")) == published
         assert (stopped.num_lost, stopped.is_cut_off) == (0, False)
