@@ -100,12 +100,9 @@ def _fields(take: StoredTake) -> dict[str, Any]:
 
 def _action(options: Mapping[str, str]) -> str:
     """Return start, stop, save, read, or "" for the list. Raises QueryError for wrong options."""
-    if READ_OPTION in options and CONTROL_OPTION not in options:
-        action = READ_OPTION
-    else:
-        action = options.get(CONTROL_OPTION, "")
-        if CONTROL_OPTION in options and action not in {"start", "stop", "save"}:
-            raise QueryError(f"set={quoted(action)} is not accepted; accepted: start, stop, save")
+    action = options.get(CONTROL_OPTION, READ_OPTION if READ_OPTION in options else "")
+    if CONTROL_OPTION in options and action not in {"start", "stop", "save"}:
+        raise QueryError(f"set={quoted(action)} is not accepted; accepted: start, stop, save")
     for option in options.keys() - {CONTROL_OPTION}:
         if option not in _OPTIONS[action]:
             what = f"take with set={action}" if CONTROL_OPTION in options else "take"

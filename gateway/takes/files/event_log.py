@@ -130,9 +130,9 @@ class EventBoundary:
 
     def __init__(self) -> None:
         self._num_bytes = 0
-        self._complete_bytes = 0
-        self._header = bytearray()  # the beginning of one
-        self._left = 0  # of the present event, after its header
+        self._complete_bytes = 0  # also where the present event begins
+        self._header = bytearray()  # its beginning
+        self._end = 0  # of the present event, once its header is complete
         self._is_damaged = False
 
     @property
@@ -142,26 +142,22 @@ class EventBoundary:
 
     def feed(self, data: bytes) -> None:
         """Take the next bytes of the log."""
-        place = 0
-        while place < len(data) and not self._is_damaged:
-            if len(self._header) < _HEADER.size:
-                more = data[place : place + _HEADER.size - len(self._header)]
-                self._header += more
-                place += len(more)
+        start = self._num_bytes
+        self._num_bytes += len(data)
+        while not self._is_damaged:
+            missing = _HEADER.size - len(self._header)
+            if missing:
+                place = self._complete_bytes + len(self._header) - start
+                self._header += data[place : place + missing]
                 if len(self._header) < _HEADER.size:
                     break
                 fields = _plausible_header(self._header)
-                if fields is None:
-                    self._is_damaged = True
-                    break
-                self._left = fields[3] + fields[4]
-            taken = min(self._left, len(data) - place)
-            self._left -= taken
-            place += taken
-            if not self._left:
-                self._complete_bytes = self._num_bytes + place
-                self._header.clear()
-        self._num_bytes += len(data)
+                self._is_damaged = fields is None
+                self._end = self._complete_bytes + _HEADER.size + sum(fields[3:] if fields else ())
+            if self._end > self._num_bytes:
+                break
+            self._complete_bytes = self._end
+            self._header.clear()
 
 
 class _Window:

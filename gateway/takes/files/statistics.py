@@ -145,25 +145,26 @@ class SourceStatistics:
             statistics.add_messages(heads[:, 0].astype(np.int64), heads[:, 2].astype(np.int64))
 
     def _describe(self, key: str, message: Any) -> None:
-        if key == "parameters":
-            self._set_parameters(message)
-            return
-        if key == "end":
-            self.num_lost += message.messages_lost
-            self._num_open -= 1
-            return
-        if key == "details":
-            self.details = decoded_details(message)
-            return
-        if message.server:
-            _note(self.servers, message.server)
-        if message.gateway_version:
-            _note(self.gateway_versions, message.gateway_version)
-        if key == "take":
-            self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
-            self._num_open += has_end(message)
-        else:
-            self._count_drops(message)
+        match key:
+            case "parameters":
+                self._set_parameters(message)
+            case "end":
+                self.num_lost += message.messages_lost
+                self._num_open -= 1
+            case "details":
+                self.details = decoded_details(message)
+            case "take":
+                self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
+                self._num_open += has_end(message)
+            case _:
+                self._count_drops(message)
+        if key in {"take", "status"}:
+            for texts, text in (
+                (self.servers, message.server),
+                (self.gateway_versions, message.gateway_version),
+            ):
+                if text and text not in texts and len(texts) < _MAX_TEXTS:
+                    texts.append(text)
 
     def _count_drops(self, status: Any) -> None:
         """Add what was lost since the status before; the gateway counts from its own start."""
@@ -210,11 +211,6 @@ def _change_text(before: Parameters | None, after: Parameters) -> str:
         return "the server gives no parameters now"
     texts = [describe_renames(before, after), ", ".join(changed_sections(before, after))]
     return "; ".join(text for text in texts if text) or "the same"
-
-
-def _note(texts: list[str], text: str) -> None:
-    if text not in texts and len(texts) < _MAX_TEXTS:
-        texts.append(text)
 
 
 _MAX_SOURCES: Final = 100

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from gateway.errors import TakeError
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import DESCRIPTIONS, FIRST_PLACE, Place, TakeReader
-from gateway.takes.replay.timeline import ReplayTimeline, TimelineState
+from gateway.takes.replay.timeline import ReplayTimeline
 
 STEP_US: Final = 2_000_000
 """How far apart places are; a seek reads at most this much of the take before its target."""
@@ -19,7 +19,7 @@ class SeekPoint(NamedTuple):
     """A place in a take: the time there, and by source the newest parameters before it."""
 
     place: Place
-    timeline: TimelineState
+    timeline: ReplayTimeline
     parameters: dict[str, bytes]
 
 
@@ -117,7 +117,7 @@ def play_list(
     is_begun = False
     for utime, source, key, message in reader.messages(FIRST_PLACE if point is None else point.place):
         if index is not None and timeline.position_us >= index.next_us:
-            index.add(SeekPoint(reader.place, timeline.state, dict(parameters)))
+            index.add(SeekPoint(reader.place, ReplayTimeline().go_on(timeline), dict(parameters)))
         position_us = timeline.place(source, utime)
         is_selected = has(source, key)
         if is_selected and key == _PARAMETERS:
