@@ -316,19 +316,15 @@ class SourceTakes:
 
     def add_c3d(self, c3d_file: Path) -> None:
         """Link or copy a C3D file that arrives now beside the take to which it belongs, if there is one."""
-        take = self.take_of_c3d()
-        if take is not None:
-            self.storage.copy_thread.submit(partial(_add_c3d, take, c3d_file))
-
-    def take_of_c3d(self) -> Path | None:
-        """Return the path of the take to which a C3D file belongs that arrives now."""
+        ended, ended_s = self._newest_take or (None, 0.0)
         if self.take is not None:
-            return self.take.stem
-        for save in reversed(self.saves):
-            return save.folder
-        if self._newest_take is not None and self._monotonic() - self._newest_take[1] <= C3D_WAIT_S:
-            return self._newest_take[0]
-        return None
+            path: Path | None = self.take.stem
+        elif self.saves:
+            path = [*self.saves][-1].folder
+        else:
+            path = ended if self._monotonic() - ended_s <= C3D_WAIT_S else None
+        if path is not None:
+            self.storage.copy_thread.submit(partial(_add_c3d, path, c3d_file))
 
     # Messages.
 

@@ -153,7 +153,8 @@ class Player:
         self._index = SeekIndex() if is_watched else None  # with it, not each pass finds all damage
         self._max_gap_s = max_gap_s
         self._on_jump = on_jump
-        self._started_s = self._ended_s = 0.0
+        self.seconds = 0.0
+        """How long the thread ran; known after its end."""
         self._begun_s = 0.0  # when the present wait, or the present message, was to begin
         self._changed = threading.Condition()  # of the next five
         self.is_paused = False
@@ -172,11 +173,6 @@ class Player:
     def is_alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
-
-    @property
-    def seconds(self) -> float:
-        """How long the thread ran; call it after its end."""
-        return self._ended_s - self._started_s
 
     def pause(self, is_paused: bool) -> None:
         """Pause, or continue at the same place."""
@@ -219,7 +215,7 @@ class Player:
     # In the thread.
 
     def _run(self) -> None:
-        self._started_s = self._clock.now_s()
+        started_s = self._clock.now_s()
         try:
             start_us: int | None = self._selection.start_us
             while start_us is not None:
@@ -227,7 +223,7 @@ class Player:
         except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
             self.error = error
         finally:
-            self._ended_s = self._clock.now_s()
+            self.seconds = self._clock.now_s() - started_s
 
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""
