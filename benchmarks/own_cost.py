@@ -133,7 +133,7 @@ class _FedGateway:
         session = stream.session
         assert session is not None  # noqa: S101 - that was waited for
         if self._takes is not None:
-            await self._takes.takes.start("lab")
+            await self._takes.takes("lab").start()
         return session
 
     def run(self, loops: int, per_read: int, *, segments: bool = False) -> float:
@@ -159,7 +159,7 @@ class _FedGateway:
             for number, read in enumerate(reads):
                 feed(read)
                 if self._takes is not None and number % _WRITTEN_FRAMES == 0:
-                    await self._takes.takes.written()
+                    await self._takes.storage.written()
             took_s += time.process_time() - began_s
         return took_s
 

@@ -20,7 +20,7 @@ from gateway.outputs.lcm.connection import receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from gateway.takes.files.event_log import encode_event
+from tests.support.takes import encode_event
 
 TITLE: Final = "A replay of 4400 messages/s as recorded"
 MAX_LATENESS_MS: Final = 5.0

@@ -45,14 +45,14 @@ async def record(folder: Path) -> Path:
         running = asyncio.create_task(gateway.run(stop))
         # The walk begins a second after the gateway has requested it.
         await until(lambda: simulator.connections)
-        await output.takes.start(SOURCE, NAME)
+        await output.takes(SOURCE).start(NAME)
         [source] = gateway.sources
         await until(
             lambda: all(
                 status.frames_in and status.state is StreamState.NO_MEASUREMENT for status in source.statuses
             )
         )
-        await output.takes.stop(SOURCE)
+        await output.takes(SOURCE).stop()
         stop.set()
         await running
     return folder / SOURCE / f"{NAME}.lcmlog"

@@ -15,9 +15,8 @@ from gateway.errors import OutputError, ParametersError, QueryError
 from gateway.logs.safe_text import quoted, safe_lines, safe_text
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.messages.source_report import SourceReport
-from gateway.messages.topics import lcm_channel
+from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
 from gateway.outputs.kind import SubscriptionRequest
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters

@@ -82,14 +82,14 @@ def replay(
     from gateway.cli.replay_run import run_replay
     from gateway.takes.files.reader import TakeReader
     from gateway.takes.replay.play_list import Selection
-    from gateway.takes.replay.replay import ZenohAddress, lcm_destination, zenoh_destination
+    from gateway.takes.replay.replay import lcm_destination, zenoh_destination
 
     set_up_log(LogLevel.WARNING)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.freeze()  # or a full garbage collection looks through all modules, which takes 20 ms
     destinations = []
     if not lcm:
-        destinations.append(zenoh_destination(prefix, ZenohAddress(connect, listen, zenoh_config)))
+        destinations.append(zenoh_destination(prefix, connect, listen, zenoh_config))
     if not zenoh:
         destinations.append(lcm_destination(lcm_prefix(prefix), url))
     selection = Selection(
@@ -116,7 +116,7 @@ def lcm_prefix(prefix: str) -> str:
     """Return the prefix of LCM channels for one of Zenoh keys; raises BadParameter if there is none."""
     from pydantic import TypeAdapter, ValidationError
 
-    from gateway.outputs.lcm.settings import ChannelPrefix
+    from gateway.config.values import ChannelPrefix
 
     channels = re.sub(r"[^A-Z0-9]+", "_", prefix.upper())
     try:

@@ -12,8 +12,9 @@ from gateway.client.take_transfer import FetchedTake, Progress, TakeTransfer
 from gateway.client.transport import GatewaySubscriber, Query, Replies, Reply, Transport
 from gateway.client.zenoh_transport import ZenohTransport
 from gateway.errors import OutputError, QueryError
+from gateway.messages.topics import DEFAULT_LCM_PREFIX
 from gateway.outputs.contract import CONTROL_OPTION
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url, lcm_queries_url
+from gateway.outputs.lcm.settings import effective_lcm_url, lcm_queries_url
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.takes.files.description import NO_DETAILS, TakeDetails

@@ -68,6 +68,11 @@ not_empty: Final = _check(bool)
 
 _NUMBER: Final = partial(Field, strict=True, allow_inf_nan=False)
 
+ChannelPrefix = Annotated[
+    str,
+    Field(pattern=r"^[A-Za-z0-9_]{1,16}$"),
+    expects("1 to 16 of the letters A to Z and a to z, digits and '_'"),
+]
 Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 Seconds = Annotated[float, _NUMBER(ge=0.001, le=86400), expects("a number of seconds from 0.001 to 86400")]
 IntervalSeconds = Annotated[

@@ -2,8 +2,10 @@
 
 import re
 from collections.abc import Container
-from typing import NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import quote
+
+DEFAULT_LCM_PREFIX: Final = "MOCAP"
 
 MAX_CHANNEL_LENGTH = 63
 """LCM's ``publish`` refuses longer names."""

@@ -20,7 +20,7 @@ from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.lsl.settings import LSL
 from gateway.outputs.ros2.kind import ROS2
 from gateway.outputs.rtc3d.settings import RTC3D
-from gateway.outputs.takes.kind import TAKES
+from gateway.outputs.takes.settings import TAKES
 from gateway.outputs.vrpn.settings import VRPN
 from gateway.outputs.zenoh.kind import ZENOH
 

@@ -38,11 +38,6 @@ class RecordedSeries(Series):
         """How many of them were not written, because too many waited for the disk."""
         self.num_refused_bytes = 0
 
-    def refuse(self, message: bytes) -> None:
-        """Count a message that is not written."""
-        self.num_refused += 1
-        self.num_refused_bytes += len(message)
-
 
 class RecordedSource(Source):
     """A source of the recording. ``channels`` is the beginning of its channels in the file."""
@@ -57,19 +52,11 @@ class RecordedSource(Source):
         """What the file says of it; None before that, when its messages wait."""
 
     @property
-    def is_described(self) -> bool:
-        """Whether its description is in the file."""
-        return self.description is not None
-
-    @property
     def is_waiting(self) -> bool:
         """Whether something that the description needs is still to come."""
         is_complete = self.heard_s is not None and not super().is_waiting
-        return not (self.is_described or is_complete or time.monotonic() - self.found_s > _WAIT_S)
-
-    def stop_waiting(self) -> None:
-        """Describe the source by what is known now."""
-        self.found_s = -math.inf
+        is_late = time.monotonic() - self.found_s > _WAIT_S
+        return self.description is None and not (is_complete or is_late)
 
     @property
     def num_data(self) -> int:
@@ -129,12 +116,8 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         return RecordedSource(name, channels)
 
     def _new_series(self, source: RecordedSource, key: str, channel: str) -> RecordedSeries:
-        return RecordedSeries(source, key, channel, is_recorded=self._is_wanted(key))
-
-    def _is_wanted(self, key: str) -> bool:
-        if self._components is None or key == "parameters":
-            return True
-        return key.partition("/")[0] in self._components
+        is_wanted = self._components is None or key.partition("/")[0] in {*self._components, "parameters"}
+        return RecordedSeries(source, key, channel, is_recorded=is_wanted)
 
     def _take(self, series: RecordedSeries, message: bytes) -> None:
         if series.is_recorded:
@@ -144,26 +127,25 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         self, series: RecordedSeries, message: bytes, *, is_first: bool, is_made: bool
     ) -> None:
         source = series.source
-        if is_first and not source.is_described:
+        if is_first and source.description is None:
             source.first_parameters, source.has_made_first = message, is_made
         else:
             series.add(message)
             self._put(series, message)
 
     def _take_answer(self, source: RecordedSource, parameters: bytes) -> None:
-        if not source.is_described:
+        if source.description is None:
             source.parameters = source.first_parameters = parameters
             source.has_made_first = True
 
     def _put(self, series: RecordedSeries, message: bytes) -> None:
-        if self._is_starting or not series.source.is_described:
-            if self._held_bytes + len(message) > MAX_QUEUED_BYTES:
-                series.refuse(message)
-                return
+        must_wait = self._is_starting or series.source.description is None
+        if must_wait and self._held_bytes + len(message) <= MAX_QUEUED_BYTES:
             self._held.append((series, message))
             self._held_bytes += len(message)
-        elif self.file is None or not self._writer.record(self.file, series.channel, message):
-            series.refuse(message)
+        elif must_wait or self.file is None or not self._writer.record(self.file, series.channel, message):
+            series.num_refused += 1
+            series.num_refused_bytes += len(message)
 
     # Descriptions. One thread.
 
@@ -190,9 +172,12 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         with self._lock:
             self._is_starting = False
             for source in self.sources.values():
-                if source.heard_s is not None and not (source.is_described or source.is_waiting):
+                is_heard = source.heard_s is not None and source.description is None
+                if is_heard and not source.is_waiting:
                     self._describe(source)
-            self._release()
+            held, self._held, self._held_bytes = self._held, deque(), 0
+            for series, message in held:  # what has waited for the description of its source
+                self._put(series, message)
 
     def _describe(self, source: RecordedSource) -> None:
         assert self.file is not None  # noqa: S101 - see _begin
@@ -216,12 +201,6 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
             messages.append((series.channel, parameters))
         self._writer.call(functools.partial(self.file.write, messages))
 
-    def _release(self) -> None:
-        """Record what has waited for the description of its source."""
-        held, self._held, self._held_bytes = self._held, deque(), 0
-        for series, message in held:
-            self._put(series, message)
-
     # The end. One thread.
 
     def stop(self) -> None:
@@ -229,7 +208,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         with self._lock:
             self._is_closed = True
             for source in self.sources.values():
-                source.stop_waiting()
+                source.found_s = -math.inf  # describe it by what is known now
             heard = self._heard()
         if heard:
             self._begin(heard)
@@ -259,7 +238,7 @@ class FileWriter(TakeWriter):
     """Writes the file of a recording, and counts what is not in it by channel. Any thread may read these."""
 
     def __init__(self, log: LogFile) -> None:
-        super().__init__(log)
+        super().__init__(log.path, log)
         self.problem = ""
         """What is wrong with the disk now; "" if it accepts messages."""
         self.lost: Counter[bytes] = Counter()
@@ -268,11 +247,6 @@ class FileWriter(TakeWriter):
         self.num_errors = 0
         """How often the disk stopped accepting messages."""
         self._file = log
-
-    @property
-    def path(self) -> Path:
-        """The path of the file."""
-        return self._file.path
 
     @property
     def is_in_place(self) -> bool:
@@ -320,25 +294,28 @@ class Target:
     """
 
     def __init__(self, path: Path) -> None:
-        self._folder: Path | None = None
+        self._folder = path
         self._log: LogFile | None = None
-        if _is_dir(path):
+        if os.path.isdir(path):  # noqa: PTH112 - also False for a name that is too long: creating it says so
             if not os.access(path, os.W_OK | os.X_OK):
                 raise TakeError(f"no permission to write in the folder {path}; choose another one")
-            self._folder = path
-            return
-        if path.suffix not in {"", SUFFIX}:
+        elif path.suffix in {"", SUFFIX}:
+            self._log = _create(path.with_suffix(SUFFIX))
+        else:
             raise SelectionError(
                 f"{path}: recordings are LCM event logs; choose a name that ends with {SUFFIX}, "
                 "and convert it afterwards (rtc3d-gateway export)"
             )
-        self._log = _create(path.with_suffix(SUFFIX))
 
     def open(self, sources: Sequence[str]) -> LogFile:
         """Return the new file, named after the sources if it is in a folder. Raises TakeError."""
-        if self._log is None:
-            assert self._folder is not None  # noqa: S101 - there is one of both
-            self._log = _create_free(self._folder, default_name(_names(sources)))
+        name = default_name("+".join(sources) if len(sources) <= _MAX_NAMED else f"{len(sources)}-sources")
+        number = 0
+        while self._log is None:
+            number += 1
+            path = self._folder / f"{numbered(name, number)}{SUFFIX}"
+            if not os.path.lexists(path):
+                self._log = _create(path)
         return self._log
 
     def discard_empty(self) -> None:
@@ -347,27 +324,6 @@ class Target:
             with contextlib.suppress(OSError):
                 if not self._log.path.stat().st_size:
                     self._log.path.unlink()
-
-
-def _is_dir(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:
-        return False  # a name that is too long: creating it says so
-
-
-def _names(sources: Sequence[str]) -> str:
-    """Return up to three sources, joined by "+"; of more, only their number."""
-    return "+".join(sources) if len(sources) <= _MAX_NAMED else f"{len(sources)}-sources"
-
-
-def _create_free(folder: Path, name: str) -> LogFile:
-    number = 1
-    while True:
-        path = folder / f"{numbered(name, number)}{SUFFIX}"
-        if not os.path.lexists(path):
-            return _create(path)
-        number += 1
 
 
 def _create(path: Path) -> LogFile:

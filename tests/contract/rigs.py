@@ -179,7 +179,7 @@ class TakesRig:
 
     def subscribe(self) -> None:
         for source in sorted({topic.source for topic in self.names}):
-            asyncio.run(self.output.takes.start(source, "take"))
+            asyncio.run(self.output.takes(source).start("take"))
 
     def cut(self) -> None:
         file = self._folder.with_name("file")

@@ -35,9 +35,9 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.rtc3d.packets import PacketReader
     from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
     from gateway.takes import open_take
-    from gateway.takes.files.event_log import encode_event
     from gateway.takes.files.statistics import take_statistics
     from tests.support.configurations import load
+    from tests.support.takes import encode_event
 
 from tests.support.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
 

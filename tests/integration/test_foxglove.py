@@ -43,11 +43,11 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
             async with viewing(viewers.settings.port, *TOPICS) as viewer:
                 for name in FRAMES:
                     await viewer.wait_for(f"/lab/{name}")
-                await takes.takes.start("lab", "take")
+                await takes.takes("lab").start("take")
                 for name in ("markers", "analog"):
                     await viewer.wait_for(f"/lab/{name}", len(viewer.received[f"/lab/{name}"]) + 100)
                 await viewer.wait_for("/lab/events", len(viewer.received["/lab/events"]) + 1)
-                await takes.takes.stop("lab")
+                await takes.takes("lab").stop()
                 await viewer.wait_for("/lab/analog", len(viewer.received["/lab/analog"]) + 100)
                 schemas = viewer.topics
                 description = viewer.received["/lab/parameters"][0].content

@@ -24,7 +24,7 @@ from gateway.messages.encode import MESSAGE_TYPES
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes import open_take
-from gateway.takes.files.event_log import EventLogReader, encode_event
+from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.replay.play_list import Entry, SeekIndex, Selection, play_list
@@ -32,7 +32,15 @@ from gateway.takes.replay.timeline import ReplayTimeline
 from tests.support.recording_output import events as recorded_events
 from tests.support.recording_output import still_lab
 from tests.support.strategies import damaged
-from tests.support.takes import START_UTIME, Message, description, markers, parameters, write_take
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    encode_event,
+    markers,
+    parameters,
+    write_take,
+)
 from tests.support.vectors import COMPONENTS
 
 HEADER_BYTES = 28
@@ -200,13 +208,13 @@ async def _record(folder: Path, steps: list[tuple[str, int]]) -> dict[str, list[
         for number, (step, size) in enumerate(steps):
             match step:
                 case "start" if running is None:
-                    await lab.takes.start("lab", str(number))
+                    await lab.takes.start(str(number))
                     running = takes[str(number)] = [None] if has_parameters else []
                 case "stop" if running is not None:
-                    await lab.takes.stop("lab")
+                    await lab.takes.stop()
                     running = None
                 case "pause":
-                    await lab.takes.written()
+                    await lab.output.storage.written()
                 case "parameters":
                     xml = b"<!--" + b"x" * (size * 1000) + b"-->"
                     sent = lab.output.publish_parameters("lab", ServerParameters(xml, 1, number))

@@ -16,6 +16,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.source_takes import SourceTakes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.event_log import Event
 from gateway.takes.files.reader import TakeReader
@@ -53,13 +54,21 @@ class RecordingLab:
     ) -> None:
         self.directory = Path() if directory is None else directory
         self.output = TakesOutput(settings_in(directory, **settings), max_queued_bytes, host)
-        self.takes = self.output.takes
         self.publishers = {
             component.key: self.output.publisher(Topic("lab", (component.key,), lcm_type_name(kind)))
             for component, kind in MESSAGE_TYPES.items()
         }
         self.output.announce("lab")
         self._sequence = 0
+
+    @property
+    def takes(self) -> SourceTakes:
+        """The takes of the source."""
+        return self.output.takes("lab")
+
+    def is_recording(self) -> bool:
+        """Return whether a take is running."""
+        return self.takes.take is not None
 
     def publish(self, key: str = "3d", size: int = 0) -> bytes:
         """Publish the next message of a component, with ``size`` markers or events; return it."""

@@ -18,7 +18,7 @@ from gateway.rtc3d_server.measurement import exact_rate
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.files.description import SourceDescription, TakeDetails
-from gateway.takes.files.event_log import encode_event
+from gateway.takes.files.event_log import SYNC
 
 START_UTIME = 1_700_000_000_000_000
 
@@ -83,6 +83,12 @@ def details(subject: str = "", session: str = "", note: str = "", source: str = 
     )
     channel, message = about.beginning("take", START_UTIME)[1]
     return channel.decode(), message
+
+
+def encode_event(number: int, utime: int, channel: bytes, message: bytes) -> bytes:
+    """Return an event as in a file; ``utime`` is its time in µs since the Unix epoch."""
+    header = struct.pack(">4sqqii", SYNC, number, utime, len(channel), len(message))
+    return b"%b%b%b" % (header, channel, message)
 
 
 def log_bytes(messages: Iterable[Message]) -> bytes:

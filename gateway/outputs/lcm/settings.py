@@ -4,15 +4,14 @@ import os
 from typing import Annotated, Final
 from urllib.parse import urlsplit, urlunsplit
 
-from pydantic import AfterValidator, Field, TypeAdapter
+from pydantic import AfterValidator, TypeAdapter
 
 from gateway.config.section import Effective, expects
 from gateway.config.settings import OutputSettings
-from gateway.config.values import ByteLimit, Host, MaxRates, QueryRate, Switch
+from gateway.config.values import ByteLimit, ChannelPrefix, Host, MaxRates, QueryRate, Switch
 from gateway.config.words import join_or
+from gateway.messages.topics import DEFAULT_LCM_PREFIX
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
-
-DEFAULT_LCM_PREFIX: Final = "MOCAP"
 
 DEFAULT_LCM_URL: Final = f"udpm://{DEFAULT_GROUP}:{DEFAULT_PORT}?ttl=0"
 """LCM's own default, which stays on this host."""
@@ -38,11 +37,6 @@ def _lcm_url(text: str) -> str:
     return text
 
 
-ChannelPrefix = Annotated[
-    str,
-    Field(pattern=r"^[A-Za-z0-9_]{1,16}$"),
-    expects("1 to 16 of the letters A to Z and a to z, digits and '_'"),
-]
 LcmUrl = Annotated[
     str,
     AfterValidator(_lcm_url),

@@ -9,11 +9,11 @@ from typing import Final
 import lcm
 
 from gateway.logs.failures import FailureLog
-from gateway.messages.topics import lcm_channel
+from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.lcm.connection import open_lcm, receiving_url, reconnect
 from gateway.outputs.lcm.sender import RETRY_S
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+from gateway.outputs.lcm.settings import effective_lcm_url
 
 QUEUE_MESSAGES: Final = 10_000
 """With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""

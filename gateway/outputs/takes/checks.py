@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import Final
 
 from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
-from gateway.outputs.takes.disk import disk_problem
-from gateway.outputs.takes.folder import check_directory
-from gateway.outputs.takes.settings import TakesSettings
-
-CHECKS: Final = ("folder", "space", "links")
+from gateway.outputs.takes.folder import check_directory, disk_problem
+from gateway.outputs.takes.settings import TAKES, TakesSettings
 
 _FEW_MINUTES: Final = 60.0
 _GIB: Final = 1024**3
 
-_FOLDER, _SPACE, _LINKS = (Check("takes", name) for name in CHECKS)
+_FOLDER, _SPACE, _LINKS = (Check("takes", name) for name in TAKES.checks)
 
 
 def check_takes(
@@ -34,7 +31,7 @@ def check_takes(
         with _probe(directory):
             pass
     except OSError as error:
-        return failing_first(_FOLDER.problem(disk_problem(directory, error)), CHECKS[1:])
+        return failing_first(_FOLDER.problem(disk_problem(directory, error)), TAKES.checks[1:])
     writable = _FOLDER.passing(f"{directory} can be written")
     return [writable, _check_space(settings, loads), _check_links(settings)]
 

@@ -1,7 +1,6 @@
 """The key ``take`` of each source: peers start, stop, save, list and read takes with its options."""
 
 import re
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 from urllib.parse import unquote
@@ -11,7 +10,7 @@ from gateway.logs.safe_text import quoted
 from gateway.messages.decode import JSON, LOG, json_bytes
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, Answer
 from gateway.outputs.takes.folder import StoredTake
-from gateway.outputs.takes.takes import Takes
+from gateway.outputs.takes.source_takes import MAX_SAVED_S, SourceTakes
 from gateway.takes.files.description import MAX_DETAIL_CHARACTERS, TakeDetails
 from gateway.token_bucket import TokenBucket
 
@@ -20,9 +19,6 @@ MAX_LISTED: Final = 1000
 
 READS_PER_S: Final = 100.0
 """How many pieces of takes a second are read from the disk, for all peers."""
-
-MAX_SAVED_S: Final = 3600.0
-"""The most seconds that one command saves, of the past and of the future."""
 
 _OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "": (),
@@ -40,9 +36,9 @@ _ACCEPTED: Final = (
 
 
 class TakeCommand:
-    """The command ``take`` of the output: checks the options, and asks ``takes``."""
+    """The command ``take`` of the output: checks the options, and asks ``takes`` of the source."""
 
-    def __init__(self, takes: Takes, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, takes: Callable[[str], SourceTakes], monotonic: Callable[[], float]) -> None:
         self._takes = takes
         self._reads = TokenBucket(READS_PER_S, monotonic=monotonic)
 
@@ -51,12 +47,11 @@ class TakeCommand:
         action = _action(options)
         match action:
             case "start":
-                take = await self._takes.start(source, options.get("name", ""), _details(options))
+                take = await self._takes(source).start(options.get("name", ""), _details(options))
             case "stop":
-                take = await self._takes.stop(source)
+                take = await self._takes(source).stop()
             case "save":
-                take = await self._takes.save(
-                    source,
+                take = await self._takes(source).save(
                     _seconds(options, "last", MAX_SAVED_S, default=MAX_SAVED_S),
                     _seconds(options, "after", MAX_SAVED_S, default=0.0),
                     options.get("name", ""),
@@ -69,7 +64,7 @@ class TakeCommand:
         return Answer(json_bytes({"source": source, **_fields(take)}), JSON)
 
     async def _list(self, source: str) -> Answer:
-        found = await self._takes.list(source)
+        found = await self._takes(source).list()
         content = {
             "source": source,
             "running": None if found.running is None else _fields(found.running),
@@ -84,7 +79,7 @@ class TakeCommand:
             raise QueryError(
                 f"the gateway reads {READS_PER_S:g} pieces of takes a second; try again", code="rate"
             )
-        piece = await self._takes.read(source, name, offset)
+        piece = await self._takes(source).read(name, offset)
         return Answer(
             piece.content, LOG, {"name": piece.name, "bytes": piece.num_bytes, "offset": piece.offset}
         )
@@ -105,12 +100,9 @@ def _fields(take: StoredTake) -> dict[str, Any]:
 
 def _action(options: Mapping[str, str]) -> str:
     """Return start, stop, save, read, or "" for the list. Raises QueryError for wrong options."""
-    if READ_OPTION in options and CONTROL_OPTION not in options:
-        action = READ_OPTION
-    else:
-        action = options.get(CONTROL_OPTION, "")
-        if CONTROL_OPTION in options and action not in {"start", "stop", "save"}:
-            raise QueryError(f"set={quoted(action)} is not accepted; accepted: start, stop, save")
+    action = options.get(CONTROL_OPTION, READ_OPTION if READ_OPTION in options else "")
+    if CONTROL_OPTION in options and action not in {"start", "stop", "save"}:
+        raise QueryError(f"set={quoted(action)} is not accepted; accepted: start, stop, save")
     for option in options.keys() - {CONTROL_OPTION}:
         if option not in _OPTIONS[action]:
             what = f"take with set={action}" if CONTROL_OPTION in options else "take"

@@ -1,36 +1,25 @@
-"""Whether the disk accepts what is written to it."""
+"""The folder of all takes: whether its disk accepts what is written, its limits, and the threads for it."""
 
 import asyncio
-import errno
+import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
-from gateway.errors import QueryError, TakeError
+from gateway.errors import OutputError, QueryError, TakeError
 from gateway.logs.failures import HOLD_S, FailureLog
+from gateway.outputs.takes.folder import FileId, TakeEntry, TakesFolder, disk_problem
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.takes.files.writer_thread import WriterThread
 from gateway.workers import WorkerThread, result_of
 
-_REMEDIES: Final = {
-    errno.ENOSPC: "make room on it, or lower takes.max_bytes",
-    errno.EDQUOT: "make room on it, or lower takes.max_bytes",
-    errno.EACCES: "let the gateway write there",
-    errno.EPERM: "let the gateway write there",
-    errno.EROFS: "mount it so that the gateway can write",
-    errno.ENOENT: "is the disk mounted? If so, create the folder, or start the gateway again",
-    errno.ENOTDIR: "choose a folder as takes.directory",
-}
-
 logger = logging.getLogger(__name__)
-
-
-def is_full(error: OSError) -> bool:
-    """Return whether room on the disk would help."""
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 class Disk:
@@ -54,12 +43,6 @@ class Disk:
         """Note that something was written."""
         self.problem = ""
         self._failures.recovered("takes are written again")
-
-
-def disk_problem(path: Path, error: OSError) -> str:
-    """Return what is wrong with ``path``, and what to do."""
-    remedy = _REMEDIES.get(error.errno or 0, "check the disk")
-    return f"{path} cannot be written: {error.strerror or error}; {remedy}"
 
 
 _TIMEOUT_S: Final = 4.0
@@ -93,3 +76,204 @@ async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = N
         raise QueryError(disk_problem(path, error), code="disk") from error
     except TakeError as error:
         raise QueryError(str(error), code="disk") from error
+
+
+_SILENT_S: Final = 5.0
+"""How long a check of the folder may take; after that, the disk does not respond."""
+
+_REST: Final = 50
+"""After a check, the next one waits for this many times the duration of the check. After a problem, it does
+not wait: the former gateway with this folder may just be ending."""
+
+_DAY_S: Final = 86_400.0
+
+
+_FRESH_S: Final = 5.0
+"""A take that was written so recently is not deleted: it may have been started a moment ago."""
+
+
+class FolderWatch:
+    """Checks the folder of ``settings`` in a thread of its own, because its disk may not respond.
+
+    The same thread deletes the oldest takes beyond the limits.
+    """
+
+    def __init__(self, settings: TakesSettings, host: Host) -> None:
+        self._monotonic = host.monotonic
+        self.folder = TakesFolder(settings.effective_directory)
+        self.is_checked = False
+        """Whether it has been checked once."""
+        self.excess_bytes = 0
+        """By how much the folder was too large at the newest check, after deleting what may be deleted."""
+        self._problem = f"{self.folder.directory} is not checked yet; does its disk respond?"
+        self._thread = host.thread("takes-folder")
+        self._check: Future[None] | None = None
+        self._next_check_s = 0.0
+        # Of each take: when it was written last, and when that was noticed; None if it was there before.
+        self._noticed: dict[Path, tuple[float, float | None]] | None = None
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the folder and what to do; "" if takes can be recorded there."""
+        if self._thread.call_age_s > _SILENT_S:
+            return (
+                f"the disk of {self.folder.directory} does not respond; check it, and whether it is mounted"
+            )
+        return self._problem
+
+    def check(self, settings: TakesSettings, protected: AbstractSet[Path]) -> None:
+        """Check the folder and keep its limits, unless that was done a moment ago.
+
+        ``protected`` are the paths, without extension, of the takes that must not be deleted.
+        """
+        if (self._check is None or self._check.done()) and self._monotonic() >= self._next_check_s:
+            self._check = self._thread.submit(lambda: self._check_now(settings, protected))
+
+    def close(self) -> None:
+        """Let another gateway use the folder, once no check is in progress."""
+        self._thread.submit(self.folder.close)
+
+    # In the thread.
+
+    def _check_now(self, settings: TakesSettings, protected: AbstractSet[Path]) -> None:
+        began_s = self._monotonic()
+        problem, excess_bytes = self.folder.open(), 0
+        if not problem:
+            days = settings.max_age_days
+            try:
+                max_age_s = None if days is None else days * _DAY_S
+                excess_bytes = self.delete_old(settings.max_bytes, max_age_s, protected)
+            except OSError as error:
+                problem = disk_problem(self.folder.directory, error)
+        self._problem, self.excess_bytes, self.is_checked = problem, excess_bytes, True
+        ended_s = self._monotonic()  # with thousands of takes, every second would keep a disk busy
+        self._next_check_s = ended_s if problem else ended_s + _REST * (ended_s - began_s)
+
+    def delete_old(self, max_bytes: int, max_age_s: float | None, protected: AbstractSet[Path]) -> int:
+        """Delete the oldest takes beyond the limits, except the ``protected`` ones (paths without extension).
+
+        If there are none of those, the newest take of each source stays: it may be the one that has just
+        ended because of this limit. Returns how many bytes are still too many. Raises OSError.
+        """
+        entries = sorted(self.folder.entries(), key=lambda entry: entry.end_s)
+        newest = {} if protected else {entry.source: entry.path for entry in entries}
+        users: Counter[FileId] = Counter()
+        sizes = self.folder.rolling_sizes()
+        rolling = set(sizes)
+        for entry in entries:
+            sizes |= entry.sizes
+            users.update(entry.sizes.keys())
+        total = sum(sizes.values())
+        ages_s = self._ages_s(entries)
+        for entry in entries:
+            age_s = ages_s[entry.path]
+            if entry.path in protected or age_s < _FRESH_S:
+                continue
+            if max_age_s is not None and age_s > max_age_s:
+                reason = f"it is older than takes.max_age_days ({max_age_s / 86_400:g})"
+            elif total > max_bytes and entry.path not in newest.values():
+                reason = f"the folder has {total} bytes, and takes.max_bytes is {max_bytes}"
+            else:
+                continue
+            for path, _ in (*entry.logs, *entry.c3d_files):
+                path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a file, or a folder in which somebody has put other files
+                entry.path.rmdir()
+            logger.info("takes: deleted %s, the oldest one: %s", entry.path, reason)
+            for file, size in entry.sizes.items():
+                users[file] -= 1
+                if not users[file] and file not in rolling:
+                    total -= size
+        return max(0, total - max_bytes)
+
+    def _ages_s(self, entries: Sequence[TakeEntry]) -> dict[Path, float]:
+        """Return how long ago each take was written last.
+
+        The clock of the computer may have been corrected by years since then, so it counts only for takes
+        from before the first call.
+        """
+        now_s, monotonic_s = time.time(), self._monotonic()
+        former, self._noticed = self._noticed, {}
+        ages_s = {}
+        for entry in entries:
+            end_s, noticed_s = (former or {}).get(entry.path, (None, None))
+            if end_s != entry.end_s:
+                noticed_s = None if former is None else monotonic_s
+            self._noticed[entry.path] = entry.end_s, noticed_s
+            ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
+        return ages_s
+
+
+class Storage:
+    """What the takes of all sources share: their settings, their folder, its disk, and the threads for it.
+
+    Call it in the event loop; no call waits for the disk for long.
+    """
+
+    def __init__(self, settings: TakesSettings, max_queued_bytes: int, host: Host) -> None:
+        self.settings = settings
+        self.host = host
+        self.disk = Disk()
+        self.watch = FolderWatch(settings, host)
+        self.writer: WriterThread | None = None
+        """The thread that writes; None before ``open``."""
+        self.is_closed = False
+        self.server: Callable[[str], str] = lambda _source: ""
+        """Returns HOST:PORT of a source's server."""
+        self.copy_thread = host.thread("takes-copy")
+        self._read_thread = host.thread("takes-read")
+        self._max_queued_bytes = max_queued_bytes
+
+    @property
+    def folder(self) -> TakesFolder:
+        """The folder of the takes."""
+        return self.watch.folder
+
+    def open(self) -> None:
+        """Start to write."""
+        self.writer = self.host.writer("takes", self._max_queued_bytes)
+        self.writer.call(self.folder.recover)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong and what to do; "" if takes can be recorded."""
+        if self.is_closed:
+            return "the output takes is closed; start the gateway again"
+        if self.writer is None:
+            return "the output takes is not open; start it first"
+        return self.watch.problem or self.disk.problem
+
+    def started_writer(self) -> WriterThread:
+        """Return the thread that writes. Raises QueryError if the output is not open."""
+        if self.writer is None or self.is_closed:
+            raise QueryError(self.problem, code="disk")
+        return self.writer
+
+    def open_writer(self) -> WriterThread:
+        """Return the thread that writes. Raises QueryError if takes cannot be recorded now."""
+        writer, problem = self.started_writer(), self.problem
+        if problem and self.watch.is_checked:  # otherwise, creating the file shows it
+            raise QueryError(problem, code="disk")
+        return writer
+
+    async def read(self, call: Callable[[], _Result], path: Path) -> _Result:
+        """Return the result of ``call``, which reads ``path`` in a thread. Raises QueryError."""
+        return await disk_result(self._read_thread.submit(call), path)
+
+    async def written(self) -> None:
+        """Wait until everything that was published so far is in the files."""
+        await asyncio.wrap_future(self.started_writer().call(lambda: None))
+
+    def refusal(self) -> OutputError | None:
+        """Return the error for a message that is published while the output is not open."""
+        problem = self.problem
+        return OutputError(problem, cause="not open") if problem else None
+
+    def queue_full(self) -> OutputError:
+        """Return the error for a message that does not fit into the queue."""
+        waiting_mib = self._max_queued_bytes / 2**20
+        slow = (
+            f"the disk of {self.folder.directory} is too slow: {waiting_mib:.0f} MiB wait for it; "
+            "check what else writes to it"
+        )
+        return OutputError(self.problem or slow, cause="disk too slow")

@@ -10,6 +10,7 @@ import shutil
 import stat
 import threading
 from collections.abc import Collection
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +18,6 @@ import rtc3d
 
 from gateway.errors import ProtocolError, QueryError, TakeError
 from gateway.messages.decode import decode
-from gateway.outputs.takes.disk import disk_problem
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.new_file import NewFiles, by_number, check_name, default_name, numbered
@@ -30,6 +30,16 @@ C3D_SUFFIX: Final = ".c3d"
 
 _FURTHER_C3D: Final = re.compile(r" \(\d+\)$|-\d+$")
 """What follows the name of the take in that of a further C3D file. Earlier gateways wrote "-2"."""
+
+_REMEDIES: Final = {
+    errno.ENOSPC: "make room on it, or lower takes.max_bytes",
+    errno.EDQUOT: "make room on it, or lower takes.max_bytes",
+    errno.EACCES: "let the gateway write there",
+    errno.EPERM: "let the gateway write there",
+    errno.EROFS: "mount it so that the gateway can write",
+    errno.ENOENT: "is the disk mounted? If so, create the folder, or start the gateway again",
+    errno.ENOTDIR: "choose a folder as takes.directory",
+}
 
 _LOCK: Final = ".rtc3d-gateway.lock"
 _TAIL_BYTES: Final = 256 * 1024
@@ -75,14 +85,16 @@ class TakePiece(NamedTuple):
     content: bytes
 
 
+@dataclass
 class TakeEntry:
-    """A take in the folder: a log or a folder of logs, and the C3D files of the same name."""
+    """A take in the folder: a log or a folder of logs, and the C3D files of the same name.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        """The path without the extension."""
-        self.logs: list[tuple[Path, os.stat_result]] = []
-        self.c3d_files: list[tuple[Path, os.stat_result]] = []
+    ``path`` is without the extension.
+    """
+
+    path: Path
+    logs: list[tuple[Path, os.stat_result]] = field(default_factory=list)
+    c3d_files: list[tuple[Path, os.stat_result]] = field(default_factory=list)
 
     @property
     def source(self) -> str:
@@ -106,16 +118,6 @@ class TakeEntry:
         return {(status.st_dev, status.st_ino): status.st_size for _, status in files}
 
 
-class _Facts(NamedTuple):
-    """What the files of a take say; see StoredTake."""
-
-    begin_utime: int
-    seconds: float
-    num_lost: int
-    is_cut_off: bool
-    details: TakeDetails
-
-
 class TakesFolder:
     """The folder of the takes of all sources: DIRECTORY/SOURCE/NAME.lcmlog, or a folder NAME of saved logs.
 
@@ -128,7 +130,7 @@ class TakesFolder:
         self._lock: int | None = None
         self._is_closed = False
         self._opening = threading.Lock()
-        self._facts: dict[tuple[Path, int, int], _Facts] = {}  # of takes, by path, size and time
+        self._takes: dict[tuple[Path, int, int], StoredTake] = {}  # by path, size and time
 
     # The folder itself.
 
@@ -178,14 +180,21 @@ class TakesFolder:
                 os.close(lock)
 
     def recover(self) -> None:
-        """Keep the segments that a killed gateway has left behind as a take. Raises OSError."""
+        """Keep the segments that a killed gateway has left behind as a take, if the folder can be used."""
+        if not self.open():
+            try:
+                self._recover()
+            except OSError as error:
+                logger.warning("takes: %s", disk_problem(self.directory / ROLLING, error))
+
+    def _recover(self) -> None:
         rolling = self.directory / ROLLING
         for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
             segments = [path for path, _ in _files(folder) if path.suffix == SUFFIX]
             if segments:
-                take = new_folder(
-                    self.directory / folder.name / default_name(folder.name), has_free_name=True
-                )
+                stem = self.directory / folder.name / default_name(folder.name)
+                take = free_stem(stem, has_free_name=True)
+                take.mkdir()
                 for number, segment in enumerate(segments, start=1):
                     segment.replace(take / f"{take.name}-{number:03}{SUFFIX}")
                 logger.warning(
@@ -219,19 +228,14 @@ class TakesFolder:
         raise QueryError(f"there is no take {path} any more; somebody has removed it")
 
     def _stored(self, entry: TakeEntry, is_running: bool) -> StoredTake:
-        facts = self._facts_of(entry)
-        if is_running:
-            facts = facts._replace(is_cut_off=False)
-        return StoredTake(entry.path.name, entry.num_bytes, is_running=is_running, **facts._asdict())
-
-    def _facts_of(self, entry: TakeEntry) -> _Facts:
         newest_ns = max(status.st_mtime_ns for _, status in entry.logs)
         identity = (entry.path, entry.num_bytes, newest_ns)
-        if identity not in self._facts:
-            if len(self._facts) > _MAX_REMEMBERED:
-                self._facts.clear()
-            self._facts[identity] = _facts(entry)
-        return self._facts[identity]
+        if identity not in self._takes:
+            if len(self._takes) > _MAX_REMEMBERED:
+                self._takes.clear()
+            self._takes[identity] = _read_take(entry)
+        take = self._takes[identity]
+        return take._replace(is_running=True, is_cut_off=False) if is_running else take
 
     def read(self, source: str, name: str, offset: int) -> TakePiece:
         """Return a part of a take; its files are read as one. Raises OSError, QueryError."""
@@ -239,20 +243,16 @@ class TakesFolder:
         entries = _source_entries(self.directory / source, name)
         if not entries:
             raise QueryError(f"source {source!r} has no take {name!r}; take list shows which there are")
-        paths = [path for path, _ in entries[0].logs]
-        sizes = [status.st_size for _, status in entries[0].logs]
-        pieces, rest = [], MAX_PIECE_BYTES
-        start = offset
-        for each, size in zip(paths, sizes, strict=True):
-            if 0 <= start < size and rest > 0:
-                with each.open("rb") as file:
+        content, start = b"", offset
+        for path, status in entries[0].logs:
+            if start >= status.st_size:
+                start -= status.st_size
+            elif len(content) < MAX_PIECE_BYTES:
+                with path.open("rb") as file:
                     file.seek(start)
-                    pieces.append(file.read(min(rest, size - start)))
-                rest -= len(pieces[-1])
+                    content += file.read(min(MAX_PIECE_BYTES - len(content), status.st_size - start))
                 start = 0
-            else:
-                start -= size if start >= size else 0
-        return TakePiece(name, sum(sizes), offset, b"".join(pieces))
+        return TakePiece(name, entries[0].num_bytes, offset, content)
 
     def rolling_sizes(self) -> dict[FileId, int]:
         """Return the size of each file of the rolling segments. Raises OSError."""
@@ -264,19 +264,24 @@ class TakesFolder:
         return sizes
 
 
-def new_folder(folder: Path, *, has_free_name: bool) -> Path:
-    """Create a folder for a take, with a number if necessary and allowed. Raises OSError, QueryError."""
-    folder.parent.mkdir(exist_ok=True)
-    candidate, number = folder, 1
-    while True:
-        if not candidate.with_name(f"{candidate.name}{SUFFIX}").exists():
-            with contextlib.suppress(FileExistsError):
-                candidate.mkdir()
-                return candidate
+def log_path(stem: Path) -> Path:
+    """Return the path of a take that is one file; ``stem`` is without the extension."""
+    return stem.with_name(f"{stem.name}{SUFFIX}")
+
+
+def free_stem(stem: Path, *, has_free_name: bool) -> Path:
+    """Return where a new take goes, file or folder: with a number if necessary and allowed.
+
+    Creates the folder of the source. Raises OSError, QueryError.
+    """
+    stem.parent.mkdir(exist_ok=True)
+    candidate, number = stem, 1
+    while os.path.lexists(log_path(candidate)) or os.path.lexists(candidate):
         if not has_free_name:
-            raise QueryError(f"there is a take {folder.name!r} of this source already; choose another name")
+            raise QueryError(f"there is a take {stem.name!r} of this source already; choose another name")
         number += 1
-        candidate = folder.with_name(numbered(folder.name, number))
+        candidate = stem.with_name(numbered(stem.name, number))
+    return candidate
 
 
 def add_c3d(take: Path, c3d_file: Path) -> Path:
@@ -293,6 +298,17 @@ def add_c3d(take: Path, c3d_file: Path) -> Path:
             with c3d_file.open("rb") as original:
                 shutil.copyfileobj(original, copy, _COPIED_BYTES)
     return path
+
+
+def is_full(error: OSError) -> bool:
+    """Return whether room on the disk would help."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def disk_problem(path: Path, error: OSError) -> str:
+    """Return what is wrong with ``path``, and what to do."""
+    remedy = _REMEDIES.get(error.errno or 0, "check the disk")
+    return f"{path} cannot be written: {error.strerror or error}; {remedy}"
 
 
 def check_directory(directory: Path) -> None:
@@ -346,7 +362,7 @@ def _files(folder: Path) -> list[tuple[Path, os.stat_result]]:
     return sorted(files, key=lambda file: by_number(file[0]))
 
 
-def _facts(entry: TakeEntry) -> _Facts:
+def _read_take(entry: TakeEntry) -> StoredTake:
     """Read the beginning and the end of a take; all zero if it has no messages."""
     begin_utime = end_utime = num_lost = 0
     is_cut_off = False
@@ -371,7 +387,9 @@ def _facts(entry: TakeEntry) -> _Facts:
         else:
             take = _decoded(first.message, rtc3d.take_t)
             is_cut_off = is_cut_off or (take is not None and has_end(take))
-    return _Facts(begin_utime, max(0.0, (end_utime - begin_utime) / 1e6), num_lost, is_cut_off, details)
+    seconds = max(0.0, (end_utime - begin_utime) / 1e6)
+    name, num_bytes = entry.path.name, entry.num_bytes
+    return StoredTake(name, num_bytes, begin_utime, seconds, False, num_lost, is_cut_off, details)
 
 
 def _decoded(message: bytes, message_type: type[Any]) -> Any | None:

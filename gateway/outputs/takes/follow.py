@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import struct
-import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
@@ -12,8 +11,8 @@ from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.messages.encode import COUNT_OFFSET, ITEMS_OFFSET
 from gateway.outputs.contract import Publisher
 from gateway.outputs.takes.folder import StoredTake
+from gateway.outputs.takes.source_takes import SourceTakes
 from gateway.outputs.takes.take_file import TakeFile
-from gateway.outputs.takes.takes import Takes
 
 END_S: Final = 2.0
 """For how long the server must send No Data until a take of a measurement ends."""
@@ -28,13 +27,12 @@ logger = logging.getLogger(__name__)
 
 
 class TakeFollower:
-    """Starts and stops takes of one source as ``takes.settings.follow`` says.
+    """Starts and stops takes of one source as the setting ``follow`` says.
 
     It stops only a take that it started. If another take is running, that one goes on, and none is started.
     """
 
-    def __init__(self, source: str, takes: Takes, monotonic: Callable[[], float] = time.monotonic) -> None:
-        self._source = source
+    def __init__(self, takes: SourceTakes, monotonic: Callable[[], float]) -> None:
         self._takes = takes
         self._monotonic = monotonic
         self._take: TakeFile | None = None  # that was started here
@@ -42,28 +40,24 @@ class TakeFollower:
         self._since_s = monotonic()
         self._is_handled = False  # the present measurement has, or had, a take
         self._tasks: set[asyncio.Task[None]] = set()
-        self._failures = FailureLog(logger, source, HOLD_S)
-
-    @property
-    def _follow(self) -> str:
-        return self._takes.settings.follow
+        self._failures = FailureLog(logger, takes.source, HOLD_S)
 
     @property
     def needs_events(self) -> bool:
         """Whether events start and stop takes."""
-        return self._follow == "events"
+        return self._takes.storage.settings.follow == "events"
 
     async def follow_recording(self, *, start: bool, name: str) -> dict[str, Any]:
         """Start or stop a take with a recording on the server; return what to add to the peer's reply."""
-        if self._follow != "recording":
+        if self._takes.storage.settings.follow != "recording":
             return {}
         try:
             if start:
                 return {"take": (await self._begin(name)).name}
             if self.is_running:
-                return {"take": (await self._takes.end(self._source)).name}
+                return {"take": (await self._takes.announced().stop()).name}
         except QueryError as error:
-            logger.warning("%s: no take follows the recording: %s", self._source, error)
+            logger.warning("%s: no take follows the recording: %s", self._takes.source, error)
             return {"take_problem": str(error)}
         return {}
 
@@ -80,7 +74,7 @@ class TakeFollower:
         does not end it, or it would be split into several takes; but what does not come back for LOST_S has
         ended.
         """
-        if self._follow != "measurement":
+        if self._takes.storage.settings.follow != "measurement":
             return
         if self._is_measuring:
             if not self._is_handled:
@@ -91,7 +85,7 @@ class TakeFollower:
 
     def receive_event(self, event_id: int) -> None:
         """Start or stop a take at an event of the server. The same event can do both."""
-        settings = self._takes.settings
+        settings = self._takes.storage.settings
         if self.is_running:
             if event_id == settings.stop_event_id:
                 self._end_soon()
@@ -101,22 +95,22 @@ class TakeFollower:
     @property
     def is_running(self) -> bool:
         """Whether the take that was started here is still running."""
-        return self._take is not None and self._takes.running(self._source) is self._take
+        return self._take is not None and self._takes.take is self._take
 
     def _begin(self, name: str = "") -> Coroutine[Any, Any, StoredTake]:
         """Start a take at once; the coroutine waits for the disk. Raises QueryError."""
-        take = self._takes.begin(self._source, name, has_free_name=True)
-        self._take = self._takes.running(self._source)
+        take = self._takes.announced().start(name, has_free_name=True)
+        self._take = self._takes.take
         return take
 
     def _begin_soon(self) -> None:
         if self.is_running:
             return
-        running = self._takes.running(self._source)
+        running = self._takes.take
         if running is not None:
             self._is_handled = True
             logger.info(
-                "%s: take %r is running already, so no other one is started", self._source, running.name
+                "%s: take %r is running already, so no other one is started", self._takes.source, running.name
             )
             return
         try:
@@ -130,23 +124,23 @@ class TakeFollower:
     def _end_soon(self) -> None:
         if self.is_running:
             try:
-                self._run(self._takes.end(self._source))
+                self._run(self._takes.announced().stop())
             except QueryError as error:
                 self._failures.failed(f"the take is not stopped: {error}")
 
     def _run(self, call: Coroutine[Any, Any, StoredTake]) -> None:
-        task = asyncio.get_running_loop().create_task(self._log_failure(call))
+        async def log_failure() -> None:
+            try:
+                await call
+            except QueryError as error:
+                self._is_handled = False
+                self._failures.failed(f"a take is not started or stopped: {error}")
+            else:
+                self._failures.recovered("takes are started and stopped again")
+
+        task = asyncio.get_running_loop().create_task(log_failure())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-
-    async def _log_failure(self, call: Coroutine[Any, Any, StoredTake]) -> None:
-        try:
-            await call
-        except QueryError as error:
-            self._is_handled = False
-            self._failures.failed(f"a take is not started or stopped: {error}")
-        else:
-            self._failures.recovered("takes are started and stopped again")
 
 
 class EventPublisher:

@@ -46,7 +46,12 @@ class TakesPublisher:
         """
         writer = self._writer
         if writer is None or not self._targets:
-            self._check_open()
+            if self._is_closed:
+                name = "/".join((self.topic.source, *self.topic.path))
+                raise OutputError(f"takes: {name} is closed; ask for a new publisher", cause="closed")
+            refusal = self._refusal()
+            if refusal is not None:
+                raise refusal
             return
         is_refused = False
         for sink, channel in self._targets:
@@ -55,14 +60,6 @@ class TakesPublisher:
                 is_refused = True
         if is_refused:
             raise self._full()
-
-    def _check_open(self) -> None:
-        if self._is_closed:
-            name = "/".join((self.topic.source, *self.topic.path))
-            raise OutputError(f"takes: {name} is closed; ask for a new publisher", cause="closed")
-        refusal = self._refusal()
-        if refusal is not None:
-            raise refusal
 
     def close(self) -> None:
         """Stop recording."""

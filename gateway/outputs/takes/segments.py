@@ -4,7 +4,6 @@ import contextlib
 import logging
 import os
 import shutil
-import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -13,10 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import QueryError, TakeError
-from gateway.logs.losses import Losses
-from gateway.outputs.takes.disk import Disk, is_full
-from gateway.outputs.takes.folder import new_folder
-from gateway.outputs.takes.take_file import SourceWriter
+from gateway.outputs.takes.folder import free_stem, is_full
+from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.new_file import default_name
@@ -53,12 +50,12 @@ class Save:
         self.folder = folder
         self.name: str = folder.name
         """The name of the take."""
-        self._num_files = 0
+        self.num_files = 0
 
     def link(self, segment: Path) -> None:
         """Add a segment. Raises OSError."""
-        os.link(segment, self._path(self._num_files + 1))
-        self._num_files += 1
+        os.link(segment, self._path(self.num_files + 1))
+        self.num_files += 1
 
     def describe(self, description: SourceDescription) -> None:
         """Add a file that says what the take is about, after the first segment. Raises OSError."""
@@ -68,11 +65,6 @@ class Save:
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.name}-{number:03}{SUFFIX}"
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no further segment fits."""
-        return self._num_files >= _MAX_FILES
 
 
 class RollingSegments(SourceWriter):
@@ -86,27 +78,17 @@ class RollingSegments(SourceWriter):
         self,
         folder: Path,
         keep_s: float,
-        *,
-        description: SourceDescription,
-        parameters: bytes | None,
-        disk: Disk,
-        losses: Losses,
-        monotonic: Callable[[], float] = time.monotonic,
+        facts: SourceFacts,
+        monotonic: Callable[[], float],
     ) -> None:
-        super().__init__(description, parameters, disk, losses)
+        super().__init__(folder, facts)
         self._monotonic = monotonic
         self._keep_s = keep_s
-        self._folder = folder
         self._segments: deque[_Segment] = deque()
         self._log_began_s = 0.0
         self._num_segments = 0  # so far: no name is used twice
         self._saves: list[Save] = []
         self._written_s = 0.0  # when something was written before a problem of the disk
-
-    @property
-    def path(self) -> Path:
-        """The folder of the segments."""
-        return self._folder
 
     def kept_s(self) -> float:
         """Return how many seconds of the past could be saved now; a problem of the disk ends them."""
@@ -132,7 +114,11 @@ class RollingSegments(SourceWriter):
             self._end_segment()
         self._is_in_place = True
         if self._log is None:
-            self._log = self._new_log(utime)
+            for folder in (self.path.parent, self.path):  # not those above: their disk may be missing
+                folder.mkdir(exist_ok=True)
+            name = f"{default_name(self.description.source)}-{self._num_segments:06}"
+            self._log = self._begin_log(self.path / f"{name}{SUFFIX}", name, utime)
+            self._num_segments += 1
             self._log_began_s = now_s
             for save in [*self._saves]:
                 self._add_to_save(save)
@@ -140,8 +126,12 @@ class RollingSegments(SourceWriter):
             self._written_s = now_s
         return self._log
 
+    def make_room(self, error: OSError) -> bool:
+        """See TakeWriter."""
+        return is_full(error) and self.delete_less_important()
+
     def delete_less_important(self) -> bool:
-        """See SourceWriter: delete what has expired, otherwise the oldest segment."""
+        """Delete what has expired, otherwise the oldest segment. Return False if there is none."""
         num_segments = len(self._segments)
         self._delete_expired()
         if self._segments and len(self._segments) == num_segments:
@@ -151,14 +141,6 @@ class RollingSegments(SourceWriter):
     def waits_for_room(self, error: OSError) -> bool:
         """Do not wait for room: what waits would hold up the running takes, and take their room later."""
         return not is_full(error)
-
-    def _new_log(self, utime: int) -> LogFile:
-        for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing
-            folder.mkdir(exist_ok=True)
-        name = f"{default_name(self.description.source)}-{self._num_segments:06}"
-        log = self._begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
-        self._num_segments += 1
-        return log
 
     def _end_segment(self) -> None:
         log = self._close_log()
@@ -203,7 +185,8 @@ class RollingSegments(SourceWriter):
         """
         if self._log is None and not self._segments:
             raise QueryError("no messages are kept yet, so there is nothing to save", code="nothing-yet")
-        save = Save(new_folder(folder, has_free_name=has_free_name))
+        save = Save(free_stem(folder, has_free_name=has_free_name))
+        save.folder.mkdir()
         try:
             for segment in self._segments:
                 if segment.end_s >= since_s:
@@ -237,7 +220,7 @@ class RollingSegments(SourceWriter):
         """Add the present segment to a take."""
         if self._log is None:
             return
-        if save.is_full:
+        if save.num_files >= _MAX_FILES:
             self._saves.remove(save)
             logger.warning("takes: %s ends, because it has %d files", save.folder, _MAX_FILES)
             return
@@ -259,5 +242,5 @@ class RollingSegments(SourceWriter):
         while self._segments:
             self._delete_oldest()
         with contextlib.suppress(OSError):
-            self._folder.rmdir()
+            self.path.rmdir()
         self.disk.ended()

@@ -1,4 +1,4 @@
-"""The section ``takes`` of the configuration."""
+"""The section ``takes`` of the configuration, and the output in the registry."""
 
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
@@ -7,8 +7,9 @@ from pydantic import Field, model_validator
 
 from gateway.config.section import Effective, expects, validation_error
 from gateway.config.settings import OutputSettings, default_folder, folder_of
-from gateway.config.values import AbsoluteDirectory, Components, Switch
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, ChannelPrefix
+from gateway.config.values import AbsoluteDirectory, ChannelPrefix, Components, Switch
+from gateway.messages.topics import DEFAULT_LCM_PREFIX
+from gateway.outputs.kind import OutputKind, imported_late
 from gateway.rtc3d.components import WIRE_ORDER
 
 MAX_KEEP_S: Final = 3600.0
@@ -92,3 +93,14 @@ class TakesSettings(OutputSettings):
     def effective_directory(self) -> Path:
         """``directory``, or the default folder if it is None."""
         return folder_of(self.directory, "takes")
+
+
+TAKES: Final = OutputKind(
+    name="takes",
+    settings=TakesSettings,
+    create=imported_late("gateway.outputs.takes.output:TakesOutput"),
+    checks=("folder", "space", "links"),
+    run_checks=imported_late("gateway.outputs.takes.checks:check_takes"),
+    commands=("take",),
+    leaves_host=lambda _settings: False,
+)

@@ -2,18 +2,18 @@
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from gateway.errors import QueryError
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.outputs.parameters_message import published_again
-from gateway.outputs.takes.disk import Disk, is_full
+from gateway.outputs.takes.disk import Disk
+from gateway.outputs.takes.folder import free_stem, is_full, log_path
+from gateway.outputs.takes.publisher import TakesPublisher
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.takes.files.description import SourceDescription
-from gateway.takes.files.new_file import numbered
-from gateway.takes.files.reader import SUFFIX
 from gateway.takes.files.take_writer import Messages, TakeWriter, begin_log
 from gateway.takes.files.writer_thread import LogFile
 
@@ -23,39 +23,38 @@ _CHUNK_MESSAGES: Final = 512
 logger = logging.getLogger(__name__)
 
 
-class SourceWriter(TakeWriter):
-    """Writes the messages of one source. Each of its files begins with the source and its parameters.
+class SourceFacts(NamedTuple):
+    """What a source is, which of its components are recorded, and who learns of problems and losses.
 
-    ``parameters`` is the newest ``parameters_t``, or None; it follows what is written.
+    ``parameters`` is the newest ``parameters_t``, or None.
     """
 
-    def __init__(
-        self, description: SourceDescription, parameters: bytes | None, disk: Disk, losses: Losses
-    ) -> None:
-        super().__init__()
-        self.description = description
-        self.parameters_channel: bytes = description.channel("parameters")
-        self.disk = disk
+    description: SourceDescription
+    parameters: bytes | None
+    disk: Disk
+    losses: Losses
+    components: Collection[ComponentType] = WIRE_ORDER
+
+
+class SourceWriter(TakeWriter):
+    """Writes the messages of one source. Each of its files begins with the source and its parameters."""
+
+    def __init__(self, path: Path, facts: SourceFacts) -> None:
+        super().__init__(path)
+        self.description, self._parameters, self.disk, self._losses, self.components = facts
+        self.parameters_channel: bytes = self.description.channel("parameters")
+        self.channels: dict[TakesPublisher, str] = {}
+        """The channel of each publisher. Used in the event loop only."""
         self.num_refused = 0
         """How many messages the queue before the disk did not accept. Changed in the event loop only."""
-        self._parameters = parameters
         self._num_unwritten = 0  # how many messages the disk did not accept
         self._num_lost_before = 0  # before the present log
-        self._losses = losses
         self._is_in_place = True  # whether the present log had its path when this was checked last
 
     @property
     def num_lost(self) -> int:
         """How many messages were published, but are in no log."""
         return self.num_refused + self._num_unwritten
-
-    def make_room(self, error: OSError) -> bool:
-        """See TakeWriter."""
-        return is_full(error) and self.delete_less_important()
-
-    def delete_less_important(self) -> bool:
-        """Delete what is less important, because the disk is full. Return False if there is nothing."""
-        return False
 
     def succeeded(self) -> None:
         """See TakeWriter."""
@@ -120,62 +119,40 @@ class TakeFile(SourceWriter):
         self,
         stem: Path,
         utime: int,
+        facts: SourceFacts,
         *,
         has_free_name: bool,
-        description: SourceDescription,
-        parameters: bytes | None,
-        disk: Disk,
-        losses: Losses,
-        delete_less_important: Callable[[], bool] = lambda: False,
+        delete_less_important: Callable[[], bool],
     ) -> None:
-        super().__init__(description, parameters, disk, losses)
+        super().__init__(log_path(stem), facts)
         self._delete_less_important = delete_less_important
-        self._folder = stem.parent
-        self.name = stem.name
-        """The name of the take; final after ``create``."""
+        self.stem = stem
+        """The path without the extension; final after ``create``."""
         self.utime = utime
         """When it was started, in µs since the Unix epoch."""
         self._has_free_name = has_free_name
-        self._is_cancelled = False
 
     @property
-    def path(self) -> Path:
-        """The path of the file."""
-        return self._folder / f"{self.name}{SUFFIX}"
-
-    @property
-    def stem(self) -> Path:
-        """The path without the extension."""
-        return self._folder / self.name
+    def name(self) -> str:
+        """The name of the take."""
+        return self.stem.name
 
     def create(self) -> None:
         """Create the file. Raises OSError, and QueryError if there is such a take already."""
-        if self._is_cancelled:
-            return
-        self._folder.mkdir(exist_ok=True)
-        name, number = self.name, 1
-        while self.path.exists() or self.stem.exists():
-            if not self._has_free_name:
-                raise QueryError(f"there is a take {name!r} of this source already; choose another name")
-            number += 1
-            self.name = numbered(name, number)
+        self.stem = free_stem(self.stem, has_free_name=self._has_free_name)
+        self.path = log_path(self.stem)
         self._log = self._begin_log(self.path, self.name, self.utime)
 
-    def delete_less_important(self) -> bool:
-        """See SourceWriter."""
-        return self._delete_less_important()
-
-    def cancel(self) -> None:
-        """Do not create the file, because nobody waits for it any more. Any thread may call it."""
-        self._is_cancelled = True
-        self.give_up()
+    def make_room(self, error: OSError) -> bool:
+        """See TakeWriter."""
+        return is_full(error) and self._delete_less_important()
 
     def log_for(self, utime: int) -> LogFile:
         """See TakeWriter. If the file was removed, another one takes its place."""
         log = self._log
         assert log is not None  # noqa: S101 - see write
         if not self._is_in_place and not log.is_in_place():
-            self._folder.mkdir(exist_ok=True)
+            self.stem.parent.mkdir(exist_ok=True)
             self._log, removed = self._begin_log(self.path, self.name, utime), log
             removed.close()
             logger.warning(

@@ -85,7 +85,11 @@ class ComponentStatistics(MessageStatistics):
         self.server_restarts += int(restarts.server.sum())
         if len(self.sessions) <= _MAX_LAYOUTS:
             self.sessions.update(np.unique(columns["session"]).tolist())
-        self._add_steps(columns)
+        is_next = (np.diff(columns["sequence"]) == 1) & (np.diff(columns["session"]) == 0)
+        for name, (number, total_us) in self._steps.items():
+            steps = np.diff(columns[name])[is_next]
+            steps = steps[(steps > 0) & (steps <= _MAX_STEP_US)]
+            self._steps[name] = number + len(steps), total_us + int(steps.sum())
         self._add_items(rows)
 
     @property
@@ -119,13 +123,6 @@ class ComponentStatistics(MessageStatistics):
     def visibility(self) -> dict[str, float]:
         """In how much of the frames that have it each marker or tool is visible, 0 to 1, by label."""
         return {label: visible / frames for label, (visible, frames) in self._labelled.items()}
-
-    def _add_steps(self, columns: dict[str, Array]) -> None:
-        is_next = (np.diff(columns["sequence"]) == 1) & (np.diff(columns["session"]) == 0)
-        for name, (number, total_us) in self._steps.items():
-            steps = np.diff(columns[name])[is_next]
-            steps = steps[(steps > 0) & (steps <= _MAX_STEP_US)]
-            self._steps[name] = number + len(steps), total_us + int(steps.sum())
 
     def _add_items(self, rows: Rows) -> None:
         numbers = rows.heads["num_items"]
@@ -230,11 +227,8 @@ class ClockSteps:
                 self._pending.clear()
             self._pending.append((offset, utime))
             if len(self._pending) >= _CONFIRMING_WINDOWS:
-                self._confirm(*self._pending[0], before)
-
-    def _confirm(self, offset: int, utime: int, before: int) -> None:
-        self.num_steps += 1
-        if len(self.steps) < MAX_LISTED_STEPS:
-            self.steps.append(ClockStep(utime, offset - before))
-        self._offset_us = offset
-        self._pending.clear()
+                self.num_steps += 1
+                self._offset_us, step_utime = self._pending[0]
+                if len(self.steps) < MAX_LISTED_STEPS:
+                    self.steps.append(ClockStep(step_utime, self._offset_us - before))
+                self._pending.clear()

@@ -50,14 +50,9 @@ class Event(NamedTuple):
 class Damage(NamedTuple):
     """Bytes of a file that belong to no readable event."""
 
+    file: Path
     offset: int
     num_bytes: int
-
-
-def encode_event(number: int, utime: int, channel: bytes, message: bytes) -> bytes:
-    """Return an event as in a file; ``utime`` is its time in µs since the Unix epoch."""
-    header = _HEADER.pack(SYNC, number, utime, len(channel), len(message))
-    return b"%b%b%b" % (header, channel, message)
 
 
 class EventLogReader:
@@ -94,7 +89,7 @@ class EventLogReader:
                 for intact in window.intact_events():
                     has_events = True
                     yield intact
-            event = _event(window)
+            event = window.event()
             if event is None:
                 if damage_start is None:
                     damage_start = window.offset
@@ -115,7 +110,7 @@ class EventLogReader:
 
     def _add_damage(self, start: int, stop: int) -> None:
         if len(self.damage) < MAX_LISTED_DAMAGE:
-            self.damage.append(Damage(start, stop - start))
+            self.damage.append(Damage(self.path, start, stop - start))
         self.num_damaged += 1
         self.damaged_bytes += stop - start
 
@@ -135,9 +130,9 @@ class EventBoundary:
 
     def __init__(self) -> None:
         self._num_bytes = 0
-        self._complete_bytes = 0
-        self._header = bytearray()  # the beginning of one
-        self._left = 0  # of the present event, after its header
+        self._complete_bytes = 0  # also where the present event begins
+        self._header = bytearray()  # its beginning
+        self._end = 0  # of the present event, once its header is complete
         self._is_damaged = False
 
     @property
@@ -147,26 +142,22 @@ class EventBoundary:
 
     def feed(self, data: bytes) -> None:
         """Take the next bytes of the log."""
-        place = 0
-        while place < len(data) and not self._is_damaged:
-            if len(self._header) < _HEADER.size:
-                more = data[place : place + _HEADER.size - len(self._header)]
-                self._header += more
-                place += len(more)
+        start = self._num_bytes
+        self._num_bytes += len(data)
+        while not self._is_damaged:
+            missing = _HEADER.size - len(self._header)
+            if missing:
+                place = self._complete_bytes + len(self._header) - start
+                self._header += data[place : place + missing]
                 if len(self._header) < _HEADER.size:
                     break
                 fields = _plausible_header(self._header)
-                if fields is None:
-                    self._is_damaged = True
-                    break
-                self._left = fields[3] + fields[4]
-            taken = min(self._left, len(data) - place)
-            self._left -= taken
-            place += taken
-            if not self._left:
-                self._complete_bytes = self._num_bytes + place
-                self._header.clear()
-        self._num_bytes += len(data)
+                self._is_damaged = fields is None
+                self._end = self._complete_bytes + _HEADER.size + sum(fields[3:] if fields else ())
+            if self._end > self._num_bytes:
+                break
+            self._complete_bytes = self._end
+            self._header.clear()
 
 
 class _Window:
@@ -195,7 +186,7 @@ class _Window:
     def intact_events(self) -> Iterator[Event]:
         """Yield the next events, as far as each is in memory and another one follows directly.
 
-        This is the fast way through a log without damage; ``_event`` has all the rules.
+        This is the fast way through a log without damage; ``event`` has all the rules.
         """
         data, start = self._data, self._start
         to_offset = self.offset - start
@@ -233,18 +224,38 @@ class _Window:
             self._names[channel] = name
         return name
 
-    def header(self, ahead: int = 0) -> tuple[bytes, int, int, int, int] | None:
-        """Return the fields of a plausible header ``ahead`` bytes from here; None if there is none."""
-        if not self.has(ahead + _HEADER.size):
+    def event(self) -> Event | None:
+        """Return the event at the present place and move behind it; None, without moving, if damaged."""
+        header = self._header()
+        if header is None:
             return None
-        return _plausible_header(self._data, self._start + ahead)
+        _, number, utime, channel_bytes, message_bytes = header
+        size = _HEADER.size + channel_bytes + message_bytes
+        if not self.has(size):
+            return None
+        self.has(size + len(SYNC))
+        # What follows confirms the size. If it is no event, and one begins inside of this event, the end of
+        # this one is lost, or its size is wrong.
+        follows = self._data[self._start + size : self._start + size + len(SYNC)]
+        inside = -1 if SYNC.startswith(follows) else self._find_sync(len(SYNC), size)
+        while inside >= 0:
+            if self._header(inside) is not None:
+                return None
+            inside = self._find_sync(inside + 1, size)
+        message_start = self._start + size - message_bytes
+        try:
+            name = self._data[message_start - channel_bytes : message_start].decode()
+        except UnicodeDecodeError:
+            return None
+        event = Event(number, utime, name, self._data[message_start : self._start + size], self.offset)
+        self.move(size)
+        return event
 
-    def bytes(self, ahead: int, num_bytes: int) -> bytes:
-        """Return bytes that ``has`` has found."""
-        start = self._start + ahead
-        return self._data[start : start + num_bytes]
+    def _header(self, ahead: int = 0) -> tuple[bytes, int, int, int, int] | None:
+        """Return the fields of a plausible header ``ahead`` bytes from here; None if there is none."""
+        return _plausible_header(self._data, self._start + ahead) if self.has(ahead + _HEADER.size) else None
 
-    def find_sync(self, ahead: int, stop: int) -> int:
+    def _find_sync(self, ahead: int, stop: int) -> int:
         """Return how many bytes from here the next sync word begins; -1 if none begins before ``stop``."""
         self.has(stop + len(SYNC) - 1)
         found = self._data.find(SYNC, self._start + ahead, self._start + stop + len(SYNC) - 1)
@@ -290,32 +301,3 @@ def _plausible_header(data: bytes | bytearray, offset: int = 0) -> tuple[bytes, 
         sync == SYNC and 0 < channel_bytes <= MAX_CHANNEL_BYTES and 0 <= message_bytes <= MAX_MESSAGE_BYTES
     )
     return fields if is_plausible else None
-
-
-def _event(window: _Window) -> Event | None:
-    """Return the event at the present place and move behind it; None, without moving, if it is damaged."""
-    header = window.header()
-    if header is None:
-        return None
-    _, number, utime, channel_bytes, message_bytes = header
-    size = _HEADER.size + channel_bytes + message_bytes
-    if not window.has(size):
-        return None
-    channel = window.bytes(_HEADER.size, channel_bytes)
-    # What follows confirms the size. If it is no event, and one begins inside of this event, the end of this
-    # one is lost, or its size is wrong.
-    if window.has(size + 1) and window.bytes(size, len(SYNC)) != SYNC[: len(window.bytes(size, len(SYNC)))]:
-        inside = window.find_sync(len(SYNC), size)
-        while inside >= 0:
-            if window.header(inside) is not None:
-                return None
-            inside = window.find_sync(inside + 1, size)
-    try:
-        name = channel.decode()
-    except UnicodeDecodeError:
-        return None
-    event = Event(
-        number, utime, name, window.bytes(_HEADER.size + channel_bytes, message_bytes), window.offset
-    )
-    window.move(size)
-    return event

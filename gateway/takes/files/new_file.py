@@ -1,5 +1,6 @@
 """The names of takes, and new files that appear under their names when they are complete."""
 
+import contextlib
 import os
 import re
 import secrets
@@ -86,7 +87,11 @@ class NewFiles:
                 if error is None:
                     self._publish()
             finally:
-                self._remove_temporary()
+                for file in self._open:
+                    with contextlib.suppress(OSError):  # the rest of a file that is removed does not fit
+                        file.close()
+                for temporary in self._temporary:
+                    temporary.unlink(missing_ok=True)
         except OSError as failure:
             raise self._as_take_error(failure) from failure
         if isinstance(error, OSError):
@@ -117,15 +122,6 @@ class NewFiles:
             for path in done:
                 path.unlink(missing_ok=True)
             raise
-
-    def _remove_temporary(self) -> None:
-        for file in self._open:
-            try:
-                file.close()
-            except OSError:
-                continue  # the rest of a file that is removed does not fit on the disk
-        for temporary in self._temporary:
-            temporary.unlink(missing_ok=True)
 
     def _as_take_error(self, error: OSError) -> TakeError:
         path = self.paths[-1] if self.paths else error.filename

@@ -1,5 +1,6 @@
 """Reading a take: which source and which kind of message each event of its files belongs to."""
 
+import contextlib
 import itertools
 import stat
 from collections import Counter
@@ -14,6 +15,7 @@ from gateway.errors import ProtocolError, TakeError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
+from gateway.messages.topics import unique_name
 from gateway.takes.files.event_log import Event, EventLogReader
 from gateway.takes.files.new_file import by_number
 
@@ -21,6 +23,7 @@ NAMED_WITHIN_EVENTS: Final = 50_000
 """Each source is named within this many events: by its description, or by its status once a second."""
 
 _POSE: Final = "_6D_"
+_MAX_NAME_LENGTH: Final = 1000
 
 
 class SourceNames:
@@ -67,11 +70,7 @@ class SourceNames:
         taken = set(self._names.values())
         if not name or name in taken:
             name = channels.lower()
-        number, candidate = 1, name
-        while candidate in taken:
-            number += 1
-            candidate = f"{name}_{number}"
-        self._names[channels] = candidate
+        self._names[channels] = unique_name(name, taken, _MAX_NAME_LENGTH)
 
 
 SUFFIX: Final = ".lcmlog"
@@ -164,7 +163,21 @@ class TakeReader:
     @property
     def num_bytes(self) -> int:
         """The size of all files; 0 for a file that is gone."""
-        return sum(_size(log.path) for log in self.logs)
+        num_bytes = 0
+        for log in self.logs:
+            with contextlib.suppress(OSError):
+                num_bytes += log.path.stat().st_size
+        return num_bytes
+
+    @property
+    def num_damaged(self) -> int:
+        """How many places of the files could not be read; a file without any event is one."""
+        return sum(log.num_damaged for log in self.logs) + len(self.empty_files)
+
+    @property
+    def damaged_bytes(self) -> int:
+        """How many bytes belong to no readable event."""
+        return sum(log.damaged_bytes for log in self.logs)
 
     @property
     def source_names(self) -> list[str]:
@@ -200,9 +213,7 @@ class TakeReader:
             _, utime, channel, message, offset = event
             self._offset = offset
             identity = (channel, message[:8])
-            if identity not in routes:
-                self._add_route(identity)
-            route = routes[identity]
+            route = routes[identity] if identity in routes else self._route(identity)
             if route is None:
                 self.unknown[channel] += 1
             else:
@@ -222,10 +233,10 @@ class TakeReader:
         num_bytes = num_messages = 0
         for _, utime, channel, message, _ in self.events():
             identity = (channel, message[:8])
-            if identity in batches:
-                batch = batches[identity]
-            else:
-                batch = batches[identity] = self._new_batch(identity)
+            if identity not in batches:
+                route = self._route(identity)
+                batches[identity] = None if route is None else MessageBatch(*route)
+            batch = batches[identity]
             num_messages += 1
             num_bytes += len(message)
             if batch is None:
@@ -261,24 +272,21 @@ class TakeReader:
             f"{sum(self.unknown.values())} messages of other types, on channel {shown}{version}"
         )
 
-    def _new_batch(self, identity: tuple[str, bytes]) -> MessageBatch | None:
-        if identity not in self._routes:
-            self._add_route(identity)
-        route = self._routes[identity]
-        return None if route is None else MessageBatch(*route)
-
-    def _add_route(self, identity: tuple[str, bytes]) -> None:
-        """Find the source and the key of a channel; None if the type of its messages is unknown."""
+    def _route(self, identity: tuple[str, bytes]) -> tuple[str, str] | None:
+        """Return the source and the key of a channel; None if the type of its messages is unknown."""
         channel, fingerprint = identity
-        if len(self._routes) >= _MAX_ROUTES:
-            self._routes.clear()  # a log of damage, or of a program with millions of channels
-        kind = _type_of(fingerprint)
-        if kind is rtc3d.tool_pose_t:
-            self._routes[identity] = self._names.source_and_tool(channel)
-        elif kind in _KEYS:
-            self._routes[identity] = self._names.source(channel.rpartition("_")[0]), _KEYS[kind]
-        else:
-            self._routes[identity] = None
+        if identity not in self._routes:
+            if len(self._routes) >= _MAX_ROUTES:
+                self._routes.clear()  # a log of damage, or of a program with millions of channels
+            route: tuple[str, str] | None = None
+            with contextlib.suppress(ProtocolError):
+                kind = message_type(fingerprint)
+                if kind is rtc3d.tool_pose_t:
+                    route = self._names.source_and_tool(channel)
+                elif kind in _KEYS:
+                    route = self._names.source(channel.rpartition("_")[0]), _KEYS[kind]
+            self._routes[identity] = route
+        return self._routes[identity]
 
 
 def log_paths(path: Path) -> list[Path]:
@@ -312,20 +320,6 @@ def _first_utime(log: Path) -> int:
         return 0
 
 
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return 0
-
-
 def is_gateways_channel(channel: str) -> bool:
     """Return whether a channel is named as one of a gateway."""
     return channel.rpartition("_")[2].lower() in _KEYS.values()
-
-
-def _type_of(message: bytes) -> type[Any] | None:
-    try:
-        return message_type(message)
-    except ProtocolError:
-        return None

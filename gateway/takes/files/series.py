@@ -6,11 +6,14 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
+import rtc3d
 
 from gateway.descriptions.labels import Description, common, describe, event_labels
-from gateway.errors import TakeError
+from gateway.errors import ParametersError, TakeError
+from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.components import MISSING, ComponentType
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import Parameters, differ_in_statistics_only
+from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.files.component_rows import (
     HEAD,
     NATIVE_ITEM_DTYPES,
@@ -33,6 +36,35 @@ class ParametersEntry(NamedTuple):
     utime: int
     version: int
     parameters: Parameters
+
+
+def recorded_parameters(xml: bytes) -> Parameters | None:
+    """Return the parameters in recorded XML, without any section if it is empty; None if it is unreadable."""
+    try:
+        return parse_parameters(xml).parameters if xml else Parameters()
+    except ParametersError:
+        return None
+
+
+class ParametersHistory:
+    """The parameters of one source in a take. They are repeated in it every few seconds."""
+
+    def __init__(self) -> None:
+        self.newest: ParametersEntry | None = None
+        self.is_readable = True
+        """Whether the XML of ``newest`` could be read; otherwise, its parameters have no section."""
+        self._xml = b""
+
+    def add(self, message: rtc3d.parameters_t) -> ParametersEntry | None:
+        """Take the next message; return its content, None if it does not differ from the newest."""
+        xml, version = xml_bytes(message.xml), message.parameters_version
+        is_same_version = self.newest is not None and self.newest.version == version
+        if is_same_version and differ_in_statistics_only(self._xml, xml):
+            return None
+        parameters = recorded_parameters(xml)
+        self._xml, self.is_readable = xml, parameters is not None
+        self.newest = ParametersEntry(message.utime, version, parameters or Parameters())
+        return self.newest
 
 
 class Series:
@@ -175,7 +207,7 @@ class Series:
             )
         items = np.full((len(self), len(self.labels)), MISSING, np.float32 if not dtype.names else dtype)
         columns = {label: column for column, label in enumerate(self.labels)}
-        rows_of = self._rows_by_number()
+        rows_of = {number: np.flatnonzero(self._num_items == number) for number in self._recorded}
         for (entry, num_items), layout in self._layouts.items():
             rows = rows_of[num_items]
             chosen = self._entries[rows] == entry
@@ -282,10 +314,6 @@ class Series:
                 result[(self._entries == entry) & (self._num_items == num_items)] = number
         return result
 
-    def _rows_by_number(self) -> dict[int, Array]:
-        """Return the indices of the rows with each number of items."""
-        return {number: np.flatnonzero(self._num_items == number) for number in self._recorded}
-
     def _field(self, name: str) -> int:
         names = NATIVE_ITEM_DTYPES[self.component].names or ()
         if name not in names:
@@ -305,7 +333,15 @@ class SeriesBuilder:
         """Append the content of messages."""
         heads, items = rows.heads, rows.items
         if self._component is ComponentType.EVENT:
-            heads, items = _one_row_per_event(rows)
+            counts = heads["num_items"].astype(np.int64)
+            heads = np.repeat(heads, counts)  # each event has a row of its own, in the order of the messages
+            heads["num_items"] = 1
+            events = np.empty((len(heads), 1), NATIVE_ITEM_DTYPES[ComponentType.EVENT])
+            starts = np.cumsum(counts) - counts
+            for num_items, values in items.items():
+                places = starts[counts == num_items][:, None] + np.arange(num_items)
+                events[places.ravel(), 0] = values.ravel()
+            items = {1: events}
         for name, column in self._columns.items():
             column.extend(heads[name])
         for num_items, values in items.items():
@@ -333,19 +369,6 @@ def regular_step(steps: Array) -> float | None:
         return None
     median = np.median(steps)
     return float(steps[abs(steps - median) <= median / 2].mean())
-
-
-def _one_row_per_event(rows: Rows) -> tuple[Array, dict[int, Array]]:
-    """Return heads and items so that each event has a row of its own, in the order of the messages."""
-    counts = rows.heads["num_items"].astype(np.int64)
-    heads = np.repeat(rows.heads, counts)
-    heads["num_items"] = 1
-    items = np.empty((len(heads), 1), NATIVE_ITEM_DTYPES[ComponentType.EVENT])
-    starts = np.cumsum(counts) - counts
-    for num_items, values in rows.items.items():
-        places = starts[counts == num_items][:, None] + np.arange(num_items)
-        items[places.ravel(), 0] = values.ravel()
-    return heads, {1: items}
 
 
 def _entries_of_rows(utime: Array, version: Array, parameters: Sequence[ParametersEntry]) -> Array:

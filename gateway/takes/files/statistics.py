@@ -8,24 +8,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from gateway.descriptions.labels import describe, event_labels
-from gateway.errors import ParametersError, ProtocolError
+from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
-from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
-from gateway.rtc3d.parameters import (
-    Parameters,
-    changed_sections,
-    describe_renames,
-    differ_in_statistics_only,
-    sections_of,
-)
-from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.rtc3d.parameters import Parameters, changed_sections, describe_renames, sections_of
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.component_statistics import ClockSteps, ComponentStatistics, MessageStatistics
 from gateway.takes.files.description import NO_DETAILS, decoded_details, has_end
-from gateway.takes.files.event_log import MAX_LISTED_DAMAGE
+from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, Damage
 from gateway.takes.files.reader import DESCRIPTIONS, TakeReader
+from gateway.takes.files.series import ParametersHistory
 
 MAX_LISTED_CHANGES: Final = 100
 """How many changes of the parameters are listed; all are counted."""
@@ -73,7 +66,7 @@ class SourceStatistics:
         self._num_open = 0  # files that should have an end, and have none so far
         self._drops: dict[tuple[str, str], int] | None = None  # in the newest status
         self._parameters: dict[int, Parameters] = {}  # by version
-        self._newest: tuple[int, bytes, Parameters] | None = None  # version, XML, content
+        self._history = ParametersHistory()
         self._clock_key = ""
 
     @property
@@ -103,10 +96,11 @@ class SourceStatistics:
 
     def announced_hz(self, key: str) -> float | None:
         """Return the rate of a component in the newest parameters; None if they do not say it."""
-        if self._newest is None or key not in self.components:
+        newest = self._history.newest
+        if newest is None or key not in self.components:
             return None
         component = self.components[key]
-        return describe(component.component, self._newest[2], component.max_items or 0).rate_hz
+        return describe(component.component, newest.parameters, component.max_items or 0).rate_hz
 
     def add(self, key: str, messages: list[bytes]) -> None:
         """Take the next messages with this key."""
@@ -151,25 +145,26 @@ class SourceStatistics:
             statistics.add_messages(heads[:, 0].astype(np.int64), heads[:, 2].astype(np.int64))
 
     def _describe(self, key: str, message: Any) -> None:
-        if key == "parameters":
-            self._set_parameters(message)
-            return
-        if key == "end":
-            self.num_lost += message.messages_lost
-            self._num_open -= 1
-            return
-        if key == "details":
-            self.details = decoded_details(message)
-            return
-        if message.server:
-            _note(self.servers, message.server)
-        if message.gateway_version:
-            _note(self.gateway_versions, message.gateway_version)
-        if key == "take":
-            self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
-            self._num_open += has_end(message)
-        else:
-            self._count_drops(message)
+        match key:
+            case "parameters":
+                self._set_parameters(message)
+            case "end":
+                self.num_lost += message.messages_lost
+                self._num_open -= 1
+            case "details":
+                self.details = decoded_details(message)
+            case "take":
+                self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
+                self._num_open += has_end(message)
+            case _:
+                self._count_drops(message)
+        if key in {"take", "status"}:
+            for texts, text in (
+                (self.servers, message.server),
+                (self.gateway_versions, message.gateway_version),
+            ):
+                if text and text not in texts and len(texts) < _MAX_TEXTS:
+                    texts.append(text)
 
     def _count_drops(self, status: Any) -> None:
         """Add what was lost since the status before; the gateway counts from its own start."""
@@ -186,25 +181,17 @@ class SourceStatistics:
         self._drops = newest
 
     def _set_parameters(self, message: Any) -> None:
-        version, xml = message.parameters_version, xml_bytes(message.xml)
-        is_first = self._newest is None
-        before = Parameters()
-        if self._newest is not None:
-            before = self._newest[2]
-            if version == self._newest[0] and differ_in_statistics_only(self._newest[1], xml):
-                return
-        try:
-            parameters = parse_parameters(xml).parameters if xml else Parameters()
-        except ParametersError:
-            self.others["parameters"].malformed += 1
-            parameters = Parameters()
+        before, entry = self._history.newest, self._history.add(message)
+        if entry is None:
+            return
+        utime, version, parameters = entry
+        self.others["parameters"].malformed += not self._history.is_readable
         self._label(version)  # what came before, if versions start again
         self.num_parameters_changes += 1
         if len(self.parameters_changes) < MAX_LISTED_CHANGES:
-            text = _change_text(before, parameters, is_first=is_first)
-            self.parameters_changes.append(ParametersChange(message.utime, version, text))
+            text = _change_text(None if before is None else before.parameters, parameters)
+            self.parameters_changes.append(ParametersChange(utime, version, text))
         self.event_labels |= event_labels(parameters)
-        self._newest = version, xml, parameters
         self._parameters[version] = parameters
         if len(self._parameters) > _MAX_VERSIONS:
             oldest = next(iter(self._parameters))
@@ -217,8 +204,8 @@ class SourceStatistics:
                 component.set_labels(version, self._parameters[version])
 
 
-def _change_text(before: Parameters, after: Parameters, *, is_first: bool) -> str:
-    if is_first:
+def _change_text(before: Parameters | None, after: Parameters) -> str:
+    if before is None:
         return "first: " + (", ".join(sorted(sections_of(after))) or "none")
     if after == Parameters():
         return "the server gives no parameters now"
@@ -226,20 +213,7 @@ def _change_text(before: Parameters, after: Parameters, *, is_first: bool) -> st
     return "; ".join(text for text in texts if text) or "the same"
 
 
-def _note(texts: list[str], text: str) -> None:
-    if text not in texts and len(texts) < _MAX_TEXTS:
-        texts.append(text)
-
-
 _MAX_SOURCES: Final = 100
-
-
-class FileDamage(NamedTuple):
-    """Bytes of a file that belong to no readable event."""
-
-    file: Path
-    offset: int
-    num_bytes: int
 
 
 @dataclass
@@ -260,7 +234,7 @@ class TakeStatistics:
     unknown: dict[str, int] = field(default_factory=dict)
     num_damaged: int = 0
     damaged_bytes: int = 0
-    damage: list[FileDamage] = field(default_factory=list)
+    damage: list[Damage] = field(default_factory=list)
     """The first places of damage, at most MAX_LISTED_DAMAGE."""
     empty_files: dict[Path, str] = field(default_factory=dict)
     """Files of a folder without any event, and why."""
@@ -313,17 +287,8 @@ def take_statistics(path: Path, progress: Callable[[int, int], object] | None = 
             progress(reader.read_bytes, statistics.num_bytes)
     for source in statistics.sources.values():
         source.finish()
-    _add_damage(statistics, reader)
-    return statistics
-
-
-def _add_damage(statistics: TakeStatistics, reader: TakeReader) -> None:
-    statistics.unknown = dict(reader.unknown)
+    statistics.unknown, statistics.empty_files = dict(reader.unknown), dict(reader.empty_files)
     statistics.num_messages += sum(reader.unknown.values())
-    for log in reader.logs:
-        statistics.num_damaged += log.num_damaged
-        statistics.damaged_bytes += log.damaged_bytes
-        statistics.damage += [FileDamage(log.path, *damage) for damage in log.damage]
-    statistics.num_damaged += len(reader.empty_files)
-    statistics.empty_files = dict(reader.empty_files)
-    del statistics.damage[MAX_LISTED_DAMAGE:]
+    statistics.num_damaged, statistics.damaged_bytes = reader.num_damaged, reader.damaged_bytes
+    statistics.damage = [damage for log in reader.logs for damage in log.damage][:MAX_LISTED_DAMAGE]
+    return statistics

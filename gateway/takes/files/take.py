@@ -1,23 +1,19 @@
 """Reading a take into numpy arrays, for analysis and for conversion to other formats."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-import rtc3d
-
-from gateway.errors import ParametersError, ProtocolError, SelectionError
+from gateway.errors import ProtocolError, SelectionError
 from gateway.messages.decode import decode
-from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.rtc3d.parameters import Parameters, differ_in_statistics_only
-from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.files.reader import MessageBatch, TakeReader
-from gateway.takes.files.series import ParametersEntry, Series, SeriesBuilder
+from gateway.takes.files.series import ParametersEntry, ParametersHistory, Series, SeriesBuilder
 
 
 @dataclass
@@ -40,7 +36,7 @@ class TakeSource:
     forces: Series | None = None
     events: Series | None = None
     parameters: list[ParametersEntry] = field(default_factory=list)
-    malformed: dict[str, int] = field(default_factory=dict)
+    malformed: Counter[str] = field(default_factory=Counter)
 
     @property
     def series(self) -> dict[str, Series]:
@@ -105,11 +101,13 @@ def open_take(
     much memory as their part of the file. Damage is skipped and counted. Raises TakeError if there is
     no take, and SelectionError, a TakeError, if a source or component is not in it.
     """
-    wanted = _components(components)
+    unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
+    if unknown:
+        raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
     reader = TakeReader(Path(path))
     first_utime = -math.inf if from_s is None else reader.start_utime + from_s * 1e6
     end_utime = math.inf if to_s is None else reader.start_utime + to_s * 1e6
-    loader = _Loader(sources, wanted)
+    loader = _Loader(sources, COMPONENTS_BY_KEY.keys() if components is None else components)
     for batches in reader.batches():
         for batch in batches:
             loader.add(batch, first_utime, end_utime)
@@ -118,8 +116,7 @@ def open_take(
         if progress is not None:
             progress(reader.read_bytes, reader.num_bytes)
     take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
-    take.num_damaged = sum(log.num_damaged for log in reader.logs) + len(reader.empty_files)
-    take.damaged_bytes = sum(log.damaged_bytes for log in reader.logs)
+    take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
     take.unknown = dict(reader.unknown)
     missing = set(sources or ()) - take.sources.keys()
     if missing:
@@ -128,37 +125,33 @@ def open_take(
     return take
 
 
-def _components(keys: Collection[str] | None) -> frozenset[str]:
-    known = frozenset(COMPONENTS_BY_KEY)
-    unknown = set(keys or ()) - known
-    if unknown:
-        raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
-    return known if keys is None else frozenset(keys)
-
-
 class _Loader:
     """Collects the messages of a take."""
 
-    def __init__(self, sources: Collection[str] | None, components: frozenset[str]) -> None:
-        self._wanted = None if sources is None else frozenset(sources)
-        self._components = components
+    def __init__(self, sources: Collection[str] | None, components: Collection[str]) -> None:
+        self._wanted, self._components = sources, components
         self._sources: dict[str, TakeSource] = {}
-        self._xml: dict[str, bytes] = {}  # the newest parameters, by source
+        self._histories: dict[str, ParametersHistory] = {}  # by source
         self._builders: dict[tuple[str, str], SeriesBuilder] = {}
 
     def add(self, batch: MessageBatch, first_utime: float, end_utime: float) -> None:
         """Take messages in a range of time; parameters are taken from the whole take."""
         if self._wanted is not None and batch.source not in self._wanted:
             return
-        source = self._sources.get(batch.source)
-        if source is None:
-            source = self._sources[batch.source] = TakeSource(batch.source)
+        source = self._sources.setdefault(batch.source, TakeSource(batch.source))
         if batch.key in self._components:
             messages = batch.messages
             if not first_utime <= min(batch.utimes) <= max(batch.utimes) < end_utime:
                 times = zip(batch.utimes, messages, strict=True)
                 messages = [message for utime, message in times if first_utime <= utime < end_utime]
-            self._add_frames(source, batch.key, messages)
+            rows = decode_rows(COMPONENTS_BY_KEY[batch.key], messages)
+            if rows.malformed:
+                source.malformed[batch.key] += rows.malformed
+            builder = self._builders.get((source.name, batch.key))
+            if builder is None:
+                builder = SeriesBuilder(COMPONENTS_BY_KEY[batch.key])
+                self._builders[source.name, batch.key] = builder
+            builder.add(rows)
         elif batch.key in ("take", "details", "status", "parameters"):
             for message in batch.messages:
                 if batch.key in ("details", "parameters") or not source.server:
@@ -171,43 +164,20 @@ class _Loader:
             setattr(source, _FIELDS[key], builder.build(source.parameters, start_utime))
         return self._sources
 
-    def _add_frames(self, source: TakeSource, key: str, messages: list[bytes]) -> None:
-        rows = decode_rows(COMPONENTS_BY_KEY[key], messages)
-        if rows.malformed:
-            _count(source.malformed, key, rows.malformed)
-        builder = self._builders.get((source.name, key))
-        if builder is None:
-            builder = self._builders[source.name, key] = SeriesBuilder(COMPONENTS_BY_KEY[key])
-        builder.add(rows)
-
     def _describe(self, source: TakeSource, key: str, message: bytes) -> None:
         try:
             decoded = decode(message)
         except ProtocolError:
-            _count(source.malformed, key, 1)
+            source.malformed[key] += 1
             return
         if key == "parameters":
-            self._add_parameters(source, decoded)
+            history = self._histories.setdefault(source.name, ParametersHistory())
+            entry = history.add(decoded)
+            if entry is not None:
+                source.parameters.append(entry)
+                if not history.is_readable:
+                    source.malformed[key] += 1
         elif key == "details":
             source.details = decoded_details(decoded)
         else:
             source.server, source.gateway_version = decoded.server, decoded.gateway_version
-
-    def _add_parameters(self, source: TakeSource, decoded: rtc3d.parameters_t) -> None:
-        """Add the parameters if they differ from those before; they are repeated every few seconds."""
-        xml = xml_bytes(decoded.xml)
-        version = decoded.parameters_version
-        newest = source.parameters[-1] if source.parameters else None
-        if newest and newest.version == version and differ_in_statistics_only(self._xml[source.name], xml):
-            return
-        self._xml[source.name] = xml
-        try:
-            parameters = parse_parameters(xml).parameters if xml else Parameters()
-        except ParametersError:
-            _count(source.malformed, "parameters", 1)
-            parameters = Parameters()
-        source.parameters.append(ParametersEntry(decoded.utime, version, parameters))
-
-
-def _count(counts: dict[str, int], key: str, number: int) -> None:
-    counts[key] = counts.get(key, 0) + number

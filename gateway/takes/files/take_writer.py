@@ -38,16 +38,13 @@ class TakeWriter(ABC):
     called in that thread, except for ``give_up``.
     """
 
-    def __init__(self, log: LogFile | None = None) -> None:
+    def __init__(self, path: Path, log: LogFile | None = None) -> None:
+        self.path = path
+        """The file or folder that is written, for messages."""
         self.is_unsafe = False
         """Whether the disk reported that something written before may be lost."""
         self._log = log  # the present one
         self._gives_up = threading.Event()
-
-    @property
-    @abstractmethod
-    def path(self) -> Path:
-        """The file or folder that is written, for messages."""
 
     @abstractmethod
     def log_for(self, utime: int) -> LogFile:

@@ -4,13 +4,12 @@ from bisect import bisect_right
 from collections.abc import Generator
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Final, NamedTuple
 
 from gateway.errors import TakeError
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import DESCRIPTIONS, FIRST_PLACE, Place, TakeReader
-from gateway.takes.replay.timeline import ReplayTimeline, TimelineState
+from gateway.takes.replay.timeline import ReplayTimeline
 
 STEP_US: Final = 2_000_000
 """How far apart places are; a seek reads at most this much of the take before its target."""
@@ -20,7 +19,7 @@ class SeekPoint(NamedTuple):
     """A place in a take: the time there, and by source the newest parameters before it."""
 
     place: Place
-    timeline: TimelineState
+    timeline: ReplayTimeline
     parameters: dict[str, bytes]
 
 
@@ -54,22 +53,14 @@ def take_length_us(reader: TakeReader, stop_us: int | None = None) -> int | None
     If the replay stops earlier, at ``stop_us``, that is the end.
     It is wrong if somebody has set the clock during the recording.
     """
-    last_utime = _last_utime(reader.logs[-1].path)
-    if last_utime is None:
+    log, last_utime = reader.logs[-1].path, reader.start_utime
+    try:
+        for event in EventLogReader(log).events(max(0, log.stat().st_size - _TAIL_BYTES)):
+            last_utime = event.utime
+    except (OSError, TakeError):
         return stop_us
     length_us = max(0, last_utime - reader.start_utime)
     return length_us if stop_us is None else min(length_us, stop_us)
-
-
-def _last_utime(log: Path) -> int | None:
-    try:
-        start = max(0, log.stat().st_size - _TAIL_BYTES)
-        utime = None
-        for event in EventLogReader(log).events(start):
-            utime = event.utime
-    except (OSError, TakeError):
-        return None
-    return utime
 
 
 _PARAMETERS: Final = "parameters"
@@ -126,7 +117,7 @@ def play_list(
     is_begun = False
     for utime, source, key, message in reader.messages(FIRST_PLACE if point is None else point.place):
         if index is not None and timeline.position_us >= index.next_us:
-            index.add(SeekPoint(reader.place, timeline.state, dict(parameters)))
+            index.add(SeekPoint(reader.place, ReplayTimeline().go_on(timeline), dict(parameters)))
         position_us = timeline.place(source, utime)
         is_selected = has(source, key)
         if is_selected and key == _PARAMETERS:
@@ -137,13 +128,7 @@ def play_list(
             break
         if not is_begun:
             is_begun = True
-            yield from _before(start_us, parameters, message)
+            valid = [(name, xml) for name, xml in parameters.items() if xml is not message]
+            yield from (Entry(start_us, name, _PARAMETERS, xml) for name, xml in valid)
         if is_selected:
             yield Entry(position_us, source, key, message)
-
-
-def _before(start_us: int, parameters: dict[str, bytes], first: bytes) -> Generator[Entry]:
-    """Yield the parameters that are valid at the start, except the first message itself."""
-    for source, newest in parameters.items():
-        if newest is not first:
-            yield Entry(start_us, source, _PARAMETERS, newest)

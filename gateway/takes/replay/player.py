@@ -3,9 +3,9 @@
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import closing
-from functools import partial
 from typing import Final, Protocol
 
 from gateway.errors import SelectionError
@@ -15,9 +15,6 @@ from gateway.takes.replay.timeline import MAX_GAP_S, Jump, ReplayTimeline
 
 _BINS_PER_E: Final = 50
 """Bins of the lateness differ by 2 %."""
-
-_NUM_BINS: Final = 1400
-"""The last bin begins at e^28 µs, which is 16 days."""
 
 
 class Pace:
@@ -50,27 +47,26 @@ class Pace:
 
 
 class Lateness:
-    """How late messages were: a histogram of fixed size with bins of 2 %."""
+    """How late messages were: a histogram with bins of 2 %."""
 
     def __init__(self) -> None:
         self.num_messages = 0
         self.max_s = 0.0
-        self._counts = [0] * _NUM_BINS
+        self._counts: Counter[int] = Counter()  # by bin
 
     def add(self, late_s: float) -> None:
         """Count a message."""
         self.num_messages += 1
         self.max_s = max(self.max_s, late_s)
         late_us = late_s * 1e6
-        index = int(_BINS_PER_E * math.log(late_us)) + 1 if late_us > 1 else 0
-        self._counts[min(index, _NUM_BINS - 1)] += 1
+        self._counts[int(_BINS_PER_E * math.log(late_us)) + 1 if late_us > 1 else 0] += 1
 
     def quantile_s(self, fraction: float) -> float:
         """Return the lateness that this part of the messages does not exceed, within 2 %; 0.0 without any."""
         rest = fraction * self.num_messages
-        for index, count in enumerate(self._counts):
+        for index, count in sorted(self._counts.items()):
             rest -= count
-            if count and rest <= 0:
+            if rest <= 0:
                 return min(math.exp(index / _BINS_PER_E) * 1e-6, self.max_s)
         return self.max_s
 
@@ -157,10 +153,12 @@ class Player:
         self._index = SeekIndex() if is_watched else None  # with it, not each pass finds all damage
         self._max_gap_s = max_gap_s
         self._on_jump = on_jump
-        self._started_s = self._ended_s = 0.0
+        self.seconds = 0.0
+        """How long the thread ran; known after its end."""
         self._begun_s = 0.0  # when the present wait, or the present message, was to begin
         self._changed = threading.Condition()  # of the next five
-        self._is_paused = False
+        self.is_paused = False
+        """Whether the replay pauses; see ``pause``."""
         self._is_stopping = False
         self._seek_us: int | None = None
         self._rate: float | None = None  # to be changed to
@@ -176,28 +174,16 @@ class Player:
         """Whether the thread runs."""
         return self._thread.is_alive()
 
-    @property
-    def is_paused(self) -> bool:
-        """Whether the replay pauses."""
-        return self._is_paused
-
-    @property
-    def seconds(self) -> float:
-        """How long the thread ran; call it after its end."""
-        return self._ended_s - self._started_s
-
     def pause(self, is_paused: bool) -> None:
         """Pause, or continue at the same place."""
         with self._changed:
-            self._is_paused = is_paused
+            self.is_paused = is_paused
             self._notify()
 
     def seek(self, delta_us: int) -> None:
         """Continue at another place, this far from the present one."""
         with self._changed:
-            present_us = self.position_us if self._seek_us is None else self._seek_us
-            self._seek_us = max(self._selection.start_us, present_us + delta_us)
-            self._notify()
+            self.seek_to((self.position_us if self._seek_us is None else self._seek_us) + delta_us)
 
     def seek_to(self, position_us: int) -> None:
         """Continue at a position, in µs from the first message of the take."""
@@ -219,7 +205,7 @@ class Player:
 
     def _notify(self) -> None:
         is_waiting = self._seek_us is not None or self._rate is not None
-        self._must_attend = self._is_stopping or self._is_paused or is_waiting
+        self._must_attend = self._is_stopping or self.is_paused or is_waiting
         self._changed.notify()
 
     def join(self, timeout_s: float) -> None:
@@ -229,7 +215,7 @@ class Player:
     # In the thread.
 
     def _run(self) -> None:
-        self._started_s = self._clock.now_s()
+        started_s = self._clock.now_s()
         try:
             start_us: int | None = self._selection.start_us
             while start_us is not None:
@@ -237,11 +223,16 @@ class Player:
         except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
             self.error = error
         finally:
-            self._ended_s = self._clock.now_s()
+            self.seconds = self._clock.now_s() - started_s
 
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""
-        timeline = ReplayTimeline(self._max_gap_s, partial(self._report, start_us))
+
+        def report(jump: Jump) -> None:
+            if not self.num_passes and jump.position_us >= start_us:
+                self._on_jump(jump)
+
+        timeline = ReplayTimeline(self._max_gap_s, report)
         with closing(play_list(self._reader, self._selection, timeline, start_us, self._index)) as entries:
             is_complete = self._play(entries, start_us)
         with self._changed:
@@ -275,14 +266,10 @@ class Player:
             self._notify()
             return None if self._is_stopping else seek_us
 
-    def _report(self, start_us: int, jump: Jump) -> None:
-        if not self.num_passes and jump.position_us >= start_us:
-            self._on_jump(jump)
-
     def _play(self, entries: Generator[Entry], start_us: int) -> bool:
         """Publish messages when they are due; return False if something else is to be done before the end."""
         publish, pace = self._publication.publish, self._pace
-        preview_end_us = start_us + _PREVIEW_US if self._is_watched and self._is_paused else start_us
+        preview_end_us = start_us + _PREVIEW_US if self._is_watched and self.is_paused else start_us
         is_begun = False
         for position_us, source, key, message in entries:
             is_preview = position_us < preview_end_us
@@ -331,7 +318,7 @@ class Player:
         """Pause until the replay is to continue; return False if it is to stop or to go elsewhere."""
         began_s = self._clock.now_s()
         with self._changed:
-            while self._is_paused and not self._is_stopping and self._seek_us is None:
+            while self.is_paused and not self._is_stopping and self._seek_us is None:
                 self._clock.wait(self._changed, None)
             is_continued = not self._is_stopping and self._seek_us is None
             rate, self._rate = self._rate, None

@@ -29,6 +29,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.replies import XmlThread
+from gateway.takes.files.series import recorded_parameters
 
 _PARAMETERS_S: Final = 1.0
 """How long messages wait at most until the outputs have sent the parameters that describe them."""
@@ -153,12 +154,16 @@ class Publication:
             self.num_surplus += 1
             return
         before, xml = source.parameters, xml_bytes(recorded.xml)
+        if before is not None and before.xml == xml:
+            parsed = before.parsed
+        else:
+            parsed = recorded_parameters(xml) or Parameters()
         parameters = ServerParameters(
             xml,
             recorded.session,
             recorded.parameters_version,
             message=message,
-            parsed=before.parsed if before is not None and before.xml == xml else _parsed(xml),
+            parsed=parsed,
         )
         source.parameters, source.published_s = parameters, time.monotonic()
         is_new = before is None or before[:3] != parameters[:3]
@@ -187,14 +192,6 @@ class Publication:
         for output in self._outputs:
             for source in list(self.sources):
                 output.show_streaming(source, is_streaming)
-
-
-def _parsed(xml: bytes) -> Parameters:
-    """Return the parameters in recorded XML; none if it cannot be read."""
-    try:
-        return parse_parameters(xml).parameters
-    except ParametersError:
-        return Parameters()
 
 
 def _recorded_label(label: str, parameters: ServerParameters | None) -> str:

@@ -5,7 +5,7 @@ import contextlib
 import json
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -41,39 +41,30 @@ class Destination(NamedTuple):
     request: SubscriptionRequest
 
 
-@dataclass(frozen=True)
-class ZenohAddress:
-    """How to open Zenoh: connect to an endpoint as a client, listen on one, or as a file says."""
+def zenoh_destination(
+    prefix: str, connect: str | None, listen: str | None, config_file: Path | None
+) -> Destination:
+    """Return Zenoh as a destination: it connects to an endpoint as a client, listens, or as a file says.
 
-    connect: str | None = None
-    listen: str | None = None
-    config: Path | None = None
-
-
-def zenoh_destination(prefix: str, address: ZenohAddress) -> Destination:
-    """Return Zenoh as a destination. Raises ConfigError if Zenoh does not accept the file."""
+    Raises ConfigError if Zenoh does not accept the file.
+    """
     keys: dict[str, object] = {}
-    if address.connect is not None:
+    if connect is not None:
         keys = {
             "mode": "client",
-            "connect": {"endpoints": [address.connect]},
+            "connect": {"endpoints": [connect]},
             "scouting": {"multicast": {"enabled": False}},
         }
-    elif address.listen is not None:
-        keys = {"listen": {"endpoints": [address.listen]}}
-    settings = ZenohSettings(prefix=prefix, config=keys)
-    config = None if address.config is None else command_config(address.config)
-    if config is not None and address.connect is not None:
-        for name, value in (
-            ("mode", "client"),
-            ("connect/endpoints", [address.connect]),
-            ("scouting/multicast/enabled", False),
-        ):
-            config.insert_json5(name, json.dumps(value))
-    output = ZenohOutput(settings, config)
-    return Destination(
-        output, ZENOH, SubscriptionRequest(prefix=prefix, address=address.connect, config=address.config)
-    )
+    elif listen is not None:
+        keys = {"listen": {"endpoints": [listen]}}
+    config = None if config_file is None else command_config(config_file)
+    if config is not None and connect is not None:
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([connect]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+    output = ZenohOutput(ZenohSettings(prefix=prefix, config=keys), config)
+    request = SubscriptionRequest(prefix=prefix, address=connect, config=config_file)
+    return Destination(output, ZENOH, request)
 
 
 def lcm_destination(prefix: str, url: str | None) -> Destination:
@@ -104,12 +95,10 @@ async def require_silence(destinations: Sequence[Destination]) -> None:
         for destination in destinations:
             subscribe = destination.kind.subscribe
             if subscribe is not None:
-                request = destination.request
-                subscription = await WorkerThread(f"listen {destination.kind.name}").run(
-                    lambda subscribe=subscribe, request=request: subscribe(  # type: ignore[misc]
-                        request, lambda name, _message: heard.setdefault(name)
-                    )
+                listen = partial(
+                    subscribe, destination.request, lambda name, _message: heard.setdefault(name)
                 )
+                subscription = await WorkerThread(f"listen {destination.kind.name}").run(listen)
                 stack.callback(subscription.close)
         await asyncio.sleep(LISTENING_S)
     if heard:

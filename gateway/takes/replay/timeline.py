@@ -1,7 +1,7 @@
 """Where the messages of a take are in time, without steps of clocks and without long gaps."""
 
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 
 def time_text(duration_us: int) -> str:
@@ -33,14 +33,6 @@ class Jump(NamedTuple):
     is_skipped: bool
 
 
-class TimelineState(NamedTuple):
-    """What a timeline knows after a message, to go on from there."""
-
-    position_us: int
-    starts: dict[str, int]
-    newest_start: int
-
-
 class ReplayTimeline:
     """Gives each message a position: µs since the first one, as if nobody had set a clock meanwhile.
 
@@ -60,15 +52,11 @@ class ReplayTimeline:
         self._starts: dict[str, int] = {}  # by source: the time of the message that would be at position 0
         self._newest_start = 0  # the newest of these
 
-    @property
-    def state(self) -> TimelineState:
-        """What it knows now."""
-        return TimelineState(self.position_us, dict(self._starts), self._newest_start)
-
-    def go_on(self, state: TimelineState) -> None:
-        """Go on from a state."""
-        self.position_us, self._newest_start = state.position_us, state.newest_start
-        self._starts = dict(state.starts)
+    def go_on(self, other: Self) -> Self:
+        """Go on from where another one is."""
+        self.position_us, self._newest_start = other.position_us, other._newest_start
+        self._starts = dict(other._starts)
+        return self
 
     def place(self, source: str, utime: int) -> int:
         """Return the position of the next message; ``utime`` is its time in µs since the Unix epoch."""

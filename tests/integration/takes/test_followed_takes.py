@@ -10,7 +10,7 @@ from gateway.messages.decode import decode
 from gateway.outputs.takes import follow
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.outputs.takes.takes import Takes
+from gateway.outputs.takes.source_takes import SourceTakes
 from gateway.service.gateway import Gateway
 from gateway.takes.files.reader import TakeReader
 from tests.support.networks import free_endpoint
@@ -23,12 +23,12 @@ def takes_in(folder: Path, setting: str) -> TakesSettings:
     return TakesSettings.model_validate({"enabled": True, "directory": str(folder), "follow": setting})
 
 
-async def opened(gateway: Gateway) -> Takes:
+async def opened(gateway: Gateway) -> SourceTakes:
     """Wait until the gateway knows the parameters and records takes; return them."""
     await wait_until_cached(gateway)
     await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
-    [takes] = [output.output.takes for output in gateway.outputs if isinstance(output.output, TakesOutput)]
-    return takes
+    [output] = [output.output for output in gateway.outputs if isinstance(output.output, TakesOutput)]
+    return output.takes("lab")
 
 
 def frame_numbers(path: Path) -> list[int]:
@@ -49,18 +49,18 @@ async def test_each_measurement_has_one_take(tmp_path: Path, monkeypatch: pytest
         for first in (100, 200):
             for number in range(first, first + 20):
                 server.send(markers_frame(number))
-            await wait_until_async(lambda: takes.running("lab") is not None)
+            await wait_until_async(lambda: takes.take is not None)
             if first == 200:
-                before, former, server.has_measurement = takes.running("lab"), server.client, True
+                before, former, server.has_measurement = takes.take, server.client, True
                 assert former is not None
                 former.cut()
                 await wait_until_async(lambda: server.client is not former)  # noqa: B023
                 await wait_until_cached(gateway)
                 server.send(markers_frame(250))
                 await wait_until_async(lambda: sum(status.frames_in for status in source.statuses) >= 42)
-                assert takes.running("lab") is before
+                assert takes.take is before
             server.send(packet(4))
-            await wait_until_async(lambda: takes.running("lab") is None)
+            await wait_until_async(lambda: takes.take is None)
     first_take, second_take = sorted((tmp_path / "lab").iterdir(), key=lambda path: path.stat().st_mtime_ns)
     assert frame_numbers(first_take) == [*range(100, 120)]
     second = frame_numbers(second_take)

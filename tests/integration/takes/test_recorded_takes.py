@@ -18,7 +18,6 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.outputs.takes.takes import Takes
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
@@ -58,9 +57,9 @@ async def running(settings: Settings) -> AsyncIterator[Gateway]:
         yield gateway
 
 
-def takes_of(gateway: Gateway) -> Takes:
+def output_of(gateway: Gateway) -> TakesOutput:
     [output] = [output.output for output in gateway.outputs if isinstance(output.output, TakesOutput)]
-    return output.takes
+    return output
 
 
 def markers(take: Path) -> list[Any]:
@@ -94,8 +93,9 @@ async def test_a_running_take_survives_reloads(tmp_path: Path) -> None:
         Simulator(scene()) as server,
         running(site.settings(server.port, settings_in(first))) as gateway,
     ):
-        takes = takes_of(gateway)
-        await takes.start("lab", "walk")
+        output = output_of(gateway)
+        takes = output.takes("lab")
+        await takes.start("walk")
         await growth(walk)
         changed = site.settings(server.port, settings_in(first), byte_order="little")
         assert await gateway.reload(changed) == ["source lab changed"]
@@ -105,12 +105,12 @@ async def test_a_running_take_survives_reloads(tmp_path: Path) -> None:
         elsewhere = settings_in(second, components=["3d"], keep_last_s=10)
         other = site.settings(server.port, elsewhere, byte_order="little")
         assert await gateway.reload(other) == ["output takes changed"]
-        assert takes_of(gateway) is takes
+        assert output_of(gateway) is output
         await growth(walk)
-        await takes.stop("lab")
-        await takes.start("lab", "run")
+        await takes.stop()
+        await takes.start("run")
         await growth(run)
-        await takes.save("lab", 10, 0, "fall")
+        await takes.save(10, 0, "fall")
     sequences = [message.sequence for message in markers(walk)]
     assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
     assert len({message.session for message in markers(walk)}) > 1
@@ -124,13 +124,13 @@ async def test_a_take_ends_when_the_output_is_disabled_or_the_source_is_removed(
     site, settings = Site(), settings_in(tmp_path)
     walk, run, hall = (tmp_path / f"{name}.lcmlog" for name in ("lab/walk", "lab/run", "hall/walk"))
     async with Simulator(scene()) as server, running(site.settings(server.port, settings)) as gateway:
-        await takes_of(gateway).start("lab", "walk")
+        await output_of(gateway).takes("lab").start("walk")
         await growth(walk)
         assert await gateway.reload(site.settings(server.port, TakesSettings())) == ["output takes removed"]
         size = walk.stat().st_size
         assert await gateway.reload(site.settings(server.port, settings)) == ["output takes added"]
-        await wait_until_async(lambda: takes_of(gateway).problem == "")
-        await takes_of(gateway).start("lab", "run")
+        await wait_until_async(lambda: output_of(gateway).health().connected)
+        await output_of(gateway).takes("lab").start("run")
         await growth(run)
         first, *_ = TakeReader(run).messages()
         assert decode(first.message).server == f"127.0.0.1:{server.port}"
@@ -139,9 +139,9 @@ async def test_a_take_ends_when_the_output_is_disabled_or_the_source_is_removed(
         assert set(await gateway.reload(renamed)) == {"source lab removed", "source hall added"}
         assert walk.stat().st_size == size
         assert markers(walk)
-        await takes_of(gateway).written()
+        await output_of(gateway).storage.written()
         size = run.stat().st_size
-        await takes_of(gateway).start("hall", "walk")
+        await output_of(gateway).takes("hall").start("walk")
         await growth(hall)
         assert run.stat().st_size == size
 

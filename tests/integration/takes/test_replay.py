@@ -20,7 +20,6 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.takes.files.event_log import encode_event
 from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.support.commands import run_in_process
 from tests.support.gateway_process import PROGRAM
@@ -29,6 +28,7 @@ from tests.support.takes import (
     START_UTIME,
     Message,
     description,
+    encode_event,
     frame,
     log_bytes,
     markers,

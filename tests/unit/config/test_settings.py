@@ -5,10 +5,10 @@ import pytest
 from pydantic import TypeAdapter
 
 from gateway.config.settings import SourceSettings
-from gateway.config.values import SourceName, TransformSettings
+from gateway.config.values import ChannelPrefix, SourceName, TransformSettings
 from gateway.config.words import describe
 from gateway.messages import topics
-from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
+from gateway.outputs.lcm.settings import LcmSettings, lcm_queries_url
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
 from tests.support.configurations import MODEL, mistakes, source

@@ -40,14 +40,14 @@ async def test_an_idle_output_gets_and_counts_nothing(tmp_path: Path) -> None:
     assert not fan_out.has_subscribers([ComponentType.MARKERS]) or memory.has_subscriber
     memory.has_subscriber = False
     assert not fan_out.has_subscribers(WIRE_ORDER)
-    await takes.takes.start("lab", "walk")
+    await takes.takes("lab").start("walk")
     assert fan_out.has_subscribers([ComponentType.MARKERS])
     assert not fan_out.has_subscribers([ComponentType.ANALOG])
     before = len(memory.messages)
     for _ in range(3):
         publish()
     assert counts(fan_out) == {"3d": 3, "event": 3, "status": 3, "clock": 3}
-    await takes.takes.stop("lab")
+    await takes.takes("lab").stop()
     publish()
     assert counts(fan_out) == {"3d": 3, "event": 3, "status": 3, "clock": 3}
     recorded = {("3d",), ("event",), ("status",), ("clock",)}

@@ -15,11 +15,12 @@ from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
 from gateway.rtc3d_server.scene import NOT_YET_US
 from gateway.simulator.take_frames import RecordedFrames
 from gateway.simulator.take_scene import TakeScene
-from gateway.takes.files.event_log import SYNC, encode_event
+from gateway.takes.files.event_log import SYNC
 from tests.support.takes import (
     START_UTIME,
     Message,
     description,
+    encode_event,
     frame,
     log_bytes,
     markers,

@@ -7,9 +7,9 @@ from typing import Any, cast
 import pytest
 
 from gateway.errors import QueryError
-from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, TakeCommand
+from gateway.outputs.takes.control import MAX_LISTED, TakeCommand
 from gateway.outputs.takes.folder import StoredTake, TakePiece
-from gateway.outputs.takes.takes import SourceTakes
+from gateway.outputs.takes.source_takes import MAX_SAVED_S, TakeList
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from tests.support.clocks import Clock
 
@@ -40,30 +40,30 @@ class FakeTakes:
         async def call(*arguments: Any) -> Any:
             self.calls.append((name, *arguments))
             if name == "list":
-                return SourceTakes(WALK, [WALK] * self._num_takes, 59.9999)
-            return TakePiece("walk-1", 4096, arguments[2], b"\xed\xa1") if name == "read" else WALK
+                return TakeList(WALK, [WALK] * self._num_takes, 59.9999)
+            return TakePiece("walk-1", 4096, arguments[1], b"\xed\xa1") if name == "read" else WALK
 
         return call
 
 
 def command_of(takes: FakeTakes, clock: Clock | None = None) -> TakeCommand:
-    return TakeCommand(cast(Any, takes), clock or Clock())
+    return TakeCommand(lambda _source: cast(Any, takes), clock or Clock())
 
 
 @pytest.mark.parametrize(
     ("options", "call"),
     [
-        ({"set": "start"}, ("start", "lab", "", NO_DETAILS)),
-        ({"set": "start", "name": "walk-1"}, ("start", "lab", "walk-1", NO_DETAILS)),
+        ({"set": "start"}, ("start", "", NO_DETAILS)),
+        ({"set": "start", "name": "walk-1"}, ("start", "walk-1", NO_DETAILS)),
         (
             {"set": "start", "subject": "S01", "session": " pre ", "note": "50 %25%3B s=1 动作"},
-            ("start", "lab", "", TakeDetails("S01", "pre", "50 %; s=1 动作")),
+            ("start", "", TakeDetails("S01", "pre", "50 %; s=1 动作")),
         ),
-        ({"set": "stop"}, ("stop", "lab")),
-        ({"set": "save"}, ("save", "lab", MAX_SAVED_S, 0.0, "", NO_DETAILS)),
+        ({"set": "stop"}, ("stop",)),
+        ({"set": "save"}, ("save", MAX_SAVED_S, 0.0, "", NO_DETAILS)),
         (
             {"set": "save", "last": "120", "after": "1.5", "name": "fall", "subject": "S" * 64},
-            ("save", "lab", 120.0, 1.5, "fall", TakeDetails("S" * 64)),
+            ("save", 120.0, 1.5, "fall", TakeDetails("S" * 64)),
         ),
     ],
 )
@@ -80,7 +80,7 @@ async def test_without_options_the_takes_are_listed_up_to_a_limit() -> None:
     """The fields are those of the reference; an answer of any length would not fit into a message."""
     takes = FakeTakes()
     listed = json.loads((await command_of(takes)("lab", {})).payload)
-    assert takes.calls == [("list", "lab")]
+    assert takes.calls == [("list",)]
     counted = {"source": "lab", "num_takes": 1, "kept_s": 60.0}
     assert listed == counted | {"running": WALK_FIELDS, "takes": [WALK_FIELDS]}
     listed = json.loads((await command_of(FakeTakes(MAX_LISTED + 5))("lab", {})).payload)
@@ -94,7 +94,7 @@ async def test_a_piece_is_read_with_its_place_in_the_attachment(options: dict[st
     """With it, a peer knows when it has all."""
     takes = FakeTakes()
     answer = await command_of(takes)("lab", {"read": "walk-1"} | options)
-    assert takes.calls == [("read", "lab", "walk-1", offset)]
+    assert takes.calls == [("read", "walk-1", offset)]
     assert answer.payload == b"\xed\xa1"
     assert answer.attachment == {"name": "walk-1", "bytes": 4096, "offset": offset}
 

@@ -22,7 +22,7 @@ from gateway.outputs.takes import disk as disk_module
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.take_file import SourceWriter
+from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.take_writer import RETRY_S
 from gateway.takes.files.writer_thread import LogFile
@@ -49,16 +49,16 @@ async def test_a_full_disk_costs_nothing_if_it_has_room_again(
 ) -> None:
     """A full disk costs nothing if somebody makes room, and is logged once."""
     async with recording_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         with files_of_at_most(300_000):
             published = [lab.publish(size=1000) for _ in range(100)]
             await wait_until_async(lambda: not lab.output.health().connected)
             assert "walk.lcmlog cannot be written: File too large" in lab.output.health().problem
             with pytest.raises(QueryError, match="cannot be written") as refused:
-                await lab.takes.save("lab", 1)
+                await lab.takes.save(1)
             assert refused.value.code == "disk"
         await wait_until_async(lambda: lab.output.health().connected)
-        stopped = await lab.takes.stop("lab")
+        stopped = await lab.takes.stop()
     assert frames(lab.path("walk.lcmlog")) == published
     assert stopped.num_lost == 0
     assert len([each for each in caplog.messages if "cannot be written" in each]) == 1
@@ -80,23 +80,23 @@ async def test_a_save_that_nobody_waits_for_leaves_nothing_behind(
     monkeypatch.setattr(RollingSegments, "save", save)
     async with recording_lab(tmp_path, keep_last_s=60) as lab:
         lab.publish()
-        await lab.takes.written()
+        await lab.output.storage.written()
         if has_begun:
-            task = asyncio.create_task(lab.takes.save("lab", 60, 600, "fall"))
+            task = asyncio.create_task(lab.takes.save(60, 600, "fall"))
             await wait_until_async(begun.is_set)
             task.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await task
         else:
-            lab.takes._started_writer().call(free.wait)
+            lab.output.storage.started_writer().call(free.wait)
             monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.01)
             with pytest.raises(QueryError, match="did not respond"):
-                await lab.takes.save("lab", 60, 600, "fall")
+                await lab.takes.save(60, 600, "fall")
         free.set()
-        await lab.takes.written()
+        await lab.output.storage.written()
         assert begun.is_set() is has_begun
         assert [*lab.directory.glob("lab/*")] == []
-        segments = lab.takes.recording("lab").segments
+        segments = lab.takes.segments
         assert segments is not None
         assert segments._saves == []
 
@@ -104,7 +104,7 @@ async def test_a_save_that_nobody_waits_for_leaves_nothing_behind(
 async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take(tmp_path: Path) -> None:
     """Memory is bounded; what was accepted is in the take, and the caller counts the rest."""
     async with recording_lab(tmp_path, max_queued_bytes=MIB) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         accepted = []
         with files_of_at_most(300_000):
             accepted.append(lab.publish(size=20_000))
@@ -118,8 +118,8 @@ async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take
             assert causes == {"disk too slow"}
         await wait_until_async(lambda: lab.output.health().connected)
         accepted.append(lab.publish())
-        stopped = await lab.takes.stop("lab")
-        [listed] = (await lab.takes.list("lab")).takes
+        stopped = await lab.takes.stop()
+        [listed] = (await lab.takes.list()).takes
     assert frames(lab.path("walk.lcmlog")) == accepted
     assert stopped.num_lost == listed.num_lost == 12 - len(accepted) > 0
 
@@ -129,17 +129,17 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
     async with recording_lab(tmp_path) as lab:
         losses = Losses(logging.getLogger("gateway"), "lab to takes")
         lab.output.count_losses("lab", losses)
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         published = [lab.publish()]
         with files_of_at_most(100_000):
             published += [lab.publish(size=1000) for _ in range(100)]
             await wait_until_async(lambda: not lab.output.health().connected)
             assert len(frames(lab.path("walk.lcmlog"))) == 7  # of 16 kB; the eighth does not fit
-            stopped = await lab.takes.stop("lab")
+            stopped = await lab.takes.stop()
         assert lab.output.health().connected  # whether the problem persists is not known
-        await lab.takes.start("lab", "next")
+        await lab.takes.start("next")
         next_one = lab.publish()
-        await lab.takes.stop("lab")
+        await lab.takes.stop()
         assert lab.output.health().connected
     assert frames(lab.path("next.lcmlog")) == [next_one]
     found = frames(lab.path("walk.lcmlog"))
@@ -157,7 +157,7 @@ async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_pat
         (tmp_path / "disk").rename(tmp_path / "unmounted")
         await until_problem(lab, "No such file or directory; is the disk mounted?")
         with pytest.raises(QueryError, match="is the disk mounted") as refused:
-            await lab.takes.start("lab", "walk")
+            await lab.takes.start("walk")
         assert refused.value.code == "disk"
         (tmp_path / "disk").mkdir()
         (tmp_path / "disk/takes").write_text("no folder")
@@ -166,7 +166,7 @@ async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_pat
         (tmp_path / "disk").rmdir()
         (tmp_path / "unmounted").rename(tmp_path / "disk")
         await wait_until_async(lambda: not lab.output.health().problem)
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
     assert lab.path("walk.lcmlog").is_file()
 
 
@@ -174,7 +174,7 @@ async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: py
     """Without a setting, takes are where systemd lets the service write."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     async with recording_lab(None) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
     assert (tmp_path / "state" / "takes" / "lab" / "walk.lcmlog").is_file()
 
 
@@ -183,7 +183,7 @@ async def test_a_take_without_its_file_gets_a_new_one(
 ) -> None:
     """Messages must not go on into a file that has no name any more."""
     async with recording_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         lab.publish()
         await wait_until_async(lambda: len(frames(lab.path("walk.lcmlog"))) == 1)
         lab.path("walk.lcmlog").unlink()
@@ -194,7 +194,7 @@ async def test_a_take_without_its_file_gets_a_new_one(
 
         await wait_until_async(is_back)
         newest = lab.publish()
-        await lab.takes.stop("lab")
+        await lab.takes.stop()
     assert frames(lab.path("walk.lcmlog"))[-1] == newest
     assert any("was removed while it was recorded" in each for each in caplog.messages)
 
@@ -203,13 +203,13 @@ async def test_stopping_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pyte
     """The segments wait before the take does; the peer learns the reason instead of "no answer"."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path, keep_last_s=60) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         with files_of_at_most(100_000):
             for _ in range(100):
                 lab.publish(size=1000)
             await wait_until_async(lambda: not lab.output.health().connected)
             with pytest.raises(QueryError, match="cannot be written: File too large"):
-                await lab.takes.stop("lab")
+                await lab.takes.stop()
         await wait_until_async(lambda: lab.output.health().connected)
 
 
@@ -219,14 +219,14 @@ async def test_a_disk_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
         responds = threading.Event()
-        lab.takes._started_writer().call(responds.wait)
+        lab.output.storage.started_writer().call(responds.wait)
         with pytest.raises(QueryError, match="did not respond") as refused:
-            await lab.takes.start("lab", "walk")
+            await lab.takes.start("walk")
         assert refused.value.code == "disk"
         assert not lab.publishers["3d"].wanted
         responds.set()
-        await lab.takes.written()
-        await lab.takes.start("lab", "run")
+        await lab.output.storage.written()
+        await lab.takes.start("run")
     assert [path.name for path in lab.path("").glob("*.lcmlog")] == ["run.lcmlog"]
 
 
@@ -237,7 +237,7 @@ async def until_problem(lab: RecordingLab, text: str) -> None:
 async def test_the_end_of_the_output_ends_the_take(tmp_path: Path) -> None:
     """What was published before the end is in the file, written by the thread that ends, too."""
     async with recording_lab(tmp_path, keep_last_s=10) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         published = [lab.publish(size=1000) for _ in range(200)]
     assert frames(lab.path("walk.lcmlog")) == published
     assert not (tmp_path / ROLLING / "lab").exists()
@@ -297,16 +297,13 @@ class Sink(SourceWriter):
 
     def __init__(self, log: ScriptedLog) -> None:
         self.losses = Losses(logging.getLogger("gateway"), "lab to takes")
-        super().__init__(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses)
+        facts = SourceFacts(SourceDescription("lab", "MOCAP_LAB"), None, Disk(), self.losses)
+        super().__init__(Path("/takes/lab/walk.lcmlog"), facts)
         self.log = log
         self.utimes: list[int] = []
         self.waits = Waits()
         self._gives_up = self.waits
         self.newest_version: list[int | None] = []
-
-    @property
-    def path(self) -> Path:
-        return Path("/takes/lab/walk.lcmlog")
 
     def log_for(self, utime: int) -> LogFile:
         self.utimes.append(utime)

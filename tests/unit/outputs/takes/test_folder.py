@@ -7,7 +7,7 @@ import pytest
 
 from gateway.errors import QueryError
 from gateway.outputs.takes.folder import MAX_PIECE_BYTES, ROLLING, StoredTake, TakesFolder, add_c3d
-from gateway.takes.files.event_log import encode_event
+from tests.support.takes import encode_event
 from tests.unit.outputs.takes.test_segments import no_links
 
 NOW_S = 1_700_000_000.0

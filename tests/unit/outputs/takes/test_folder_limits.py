@@ -8,10 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from gateway.outputs.takes import folder_limits
-from gateway.outputs.takes.disk import Host
+from gateway.outputs.takes import disk
+from gateway.outputs.takes.disk import FolderWatch, Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
-from gateway.outputs.takes.folder_limits import FolderLimits, FolderWatch
 from tests.support.clocks import Clock
 from tests.support.recording_output import NoThread, settings_in
 from tests.unit.outputs.takes.test_folder import NOW_S, stored
@@ -21,14 +20,18 @@ DAY_S = 86_400.0
 
 @pytest.fixture
 def takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TakesFolder:
-    monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: NOW_S))
+    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: NOW_S))
     return TakesFolder(tmp_path)
+
+
+def watch_of(takes: TakesFolder, clock: Clock | None = None) -> FolderWatch:
+    return FolderWatch(settings_in(takes.directory), Host(clock or Clock()))
 
 
 def excess(takes: TakesFolder, max_bytes: int, *protected: str) -> int:
     """Apply a limit; return how many bytes are still too many."""
     paths = {takes.directory / name for name in protected}
-    return FolderLimits(takes).delete_old(max_bytes=max_bytes, max_age_s=None, protected=paths)
+    return watch_of(takes).delete_old(max_bytes, None, paths)
 
 
 def left(
@@ -36,11 +39,11 @@ def left(
     max_bytes: int,
     *protected: str,
     max_age_s: float | None = None,
-    limits: FolderLimits | None = None,
+    watch: FolderWatch | None = None,
 ) -> list[str]:
     """Apply the limits; return the takes that are left, as SOURCE/NAME."""
     paths = {takes.directory / name for name in protected}
-    (limits or FolderLimits(takes)).delete_old(max_bytes=max_bytes, max_age_s=max_age_s, protected=paths)
+    (watch or watch_of(takes)).delete_old(max_bytes, max_age_s, paths)
     return sorted(f"{entry.source}/{entry.path.name}" for entry in takes.entries())
 
 
@@ -137,17 +140,17 @@ def test_c3d_files_go_with_their_take_only(takes: TakesFolder, caplog: pytest.Lo
 def test_a_corrected_clock_makes_no_take_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A computer without a battery writes takes in 1970 until it has found a time server."""
     now_s, clock = 1000.0, Clock()
-    monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: now_s))
+    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: now_s))
     takes = TakesFolder(tmp_path)
-    limits = FolderLimits(takes, clock)
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == []
+    watch = watch_of(takes, clock)
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
     stored(tmp_path / "lab/walk.lcmlog", 1, NOW_S - now_s)
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == ["lab/walk"]
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == ["lab/walk"]
     now_s = NOW_S
     clock.now_s += DAY_S - 1
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == ["lab/walk"]
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == ["lab/walk"]
     clock.now_s += 2
-    assert left(takes, 1000, max_age_s=DAY_S, limits=limits) == []
+    assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
 
 
 # When the folder is checked ------------------------------------------------------------------
@@ -225,7 +228,7 @@ def test_a_disk_that_does_not_respond_is_a_problem(watched: Watched) -> None:
 def test_the_limits_of_the_settings_are_applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Days and bytes mean what they say."""
     watched = Watched(tmp_path, max_age_days=2, max_bytes=1024 * 1024)
-    monkeypatch.setattr(folder_limits, "time", SimpleNamespace(time=lambda: NOW_S))
+    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: NOW_S))
     old = stored(tmp_path / "lab/a.lcmlog", 10, 2.1 * DAY_S)
     new = stored(tmp_path / "lab/b.lcmlog", 1024 * 1024 + 5, 1.9 * DAY_S)
     watched.check()

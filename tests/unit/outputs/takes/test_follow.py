@@ -40,7 +40,7 @@ class Followed:
 
     @property
     def running(self) -> str:
-        take = self.lab.takes.running("lab")
+        take = self.lab.takes.take
         return "" if take is None else take.name
 
     async def settled(self) -> None:
@@ -49,7 +49,7 @@ class Followed:
     async def names(self) -> list[str]:
         """Return the names of the takes when the disk has them all, the oldest first."""
         await self.settled()
-        return sorted(take.name for take in (await self.lab.takes.list("lab")).takes)
+        return sorted(take.name for take in (await self.lab.takes.list()).takes)
 
 
 @asynccontextmanager
@@ -104,7 +104,7 @@ async def test_a_short_gap_does_not_split_a_take(measured: Followed, gap: bool |
 async def test_a_stopped_take_is_not_started_again_before_the_next_measurement(measured: Followed) -> None:
     """The user has stopped it on purpose."""
     measured.show(True)
-    await measured.lab.takes.stop("lab")
+    await measured.lab.takes.stop()
     measured.wait(1.0)
     measured.show(None)
     measured.show(True)
@@ -126,7 +126,7 @@ async def test_a_source_that_is_added_again_begins_anew(measured: Followed) -> N
 async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.LogCaptureFixture) -> None:
     """What a peer has started, only a peer stops."""
     caplog.set_level(logging.INFO)
-    await measured.lab.takes.start("lab", "of a peer")
+    await measured.lab.takes.start("of a peer")
     measured.show(True)
     assert "take 'of a peer' is running already, so no other one is started" in caplog.text
     measured.show(False, END_S + 0.1)
@@ -147,7 +147,7 @@ async def test_a_take_that_cannot_start_is_tried_again(
     [warning] = [record for record in caplog.records if "a take is not started" in record.message]
     assert warning.levelno == logging.WARNING
     folder.unlink()
-    measured.lab.takes.disk.succeeded()
+    measured.lab.output.storage.disk.succeeded()
     measured.wait(1.0)
     assert len(await measured.names()) == 1
 
@@ -167,10 +167,10 @@ async def test_a_take_follows_a_recording_under_the_same_name(tmp_path: Path) ->
         assert await stop() == {}
         assert await start(name="walk") == {"take": "walk-2"}
         assert "'walk-2' of source 'lab' is running already" in (await start(name="run"))["take_problem"]
-        await lab.takes.stop("lab")
-        await lab.takes.start("lab", "of a peer")
+        await lab.takes.stop()
+        await lab.takes.start("of a peer")
         assert await stop() == {}
-        assert lab.takes.running("lab") is not None
+        assert lab.is_recording()
 
 
 @pytest.mark.parametrize("setting", ["none", "measurement"])
@@ -178,7 +178,7 @@ async def test_without_the_setting_no_take_follows_a_recording(tmp_path: Path, s
     """Nothing is recorded that was not asked for."""
     async with still_lab(tmp_path, follow=setting) as lab:
         assert await lab.output.follow_recording("lab", start=True, name="walk") == {}
-        assert lab.takes.running("lab") is None
+        assert not lab.is_recording()
 
 
 # Events --------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.outputs.takes.take_file import SourceFacts
 from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
@@ -43,14 +44,12 @@ class Rolling:
         self.clock = Clock()
         self.disk = Disk()
         self.path = folder / ".rolling" / "lab"
+        losses = Losses(logging.getLogger("gateway"), "lab to takes")
         self.segments = RollingSegments(
             self.path,
             keep_s,
-            description=SourceDescription("lab", "MOCAP_LAB"),
-            parameters=None,
-            disk=self.disk,
-            losses=Losses(logging.getLogger("gateway"), "lab to takes"),
-            monotonic=self.clock,
+            SourceFacts(SourceDescription("lab", "MOCAP_LAB"), None, self.disk, losses),
+            self.clock,
         )
         self.num_messages = 0
 
@@ -363,11 +362,11 @@ async def test_a_running_take_gets_the_room_of_the_segments(tmp_path: Path, smal
     async with still_lab(tmp_path, clock, keep_last_s=60) as lab:
         for _ in range(5):
             lab.publish(size=10_000)
-            await lab.takes.written()
+            await lab.output.storage.written()
             clock.now_s += 11
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         small_disk.num_bytes = sum(path.stat().st_size for path in lab.directory.rglob("*.lcmlog"))
         published = [lab.publish(size=2000) for _ in range(8)]
-        stopped = await lab.takes.stop("lab")
+        stopped = await lab.takes.stop()
         assert frames(lab.path("walk.lcmlog")) == published
         assert (stopped.num_lost, stopped.is_cut_off) == (0, False)

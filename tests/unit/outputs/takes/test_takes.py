@@ -3,7 +3,7 @@
 import asyncio
 import math
 import socket
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,10 +15,10 @@ from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
-from gateway.outputs.takes import takes as takes_module
+from gateway.outputs.takes import source_takes as takes_module
 from gateway.outputs.takes.folder import StoredTake, TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
-from gateway.outputs.takes.takes import MAX_SAVES
+from gateway.outputs.takes.source_takes import MAX_SAVES
 from gateway.takes import open_take
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from gateway.takes.files.statistics import take_statistics
@@ -26,10 +26,10 @@ from tests.support.clocks import Clock, run_in_virtual_time
 from tests.support.recording_output import events, frames, still_lab
 
 
-async def refused(call: Coroutine[Any, Any, Any], text: str) -> str:
-    """Await a call that is refused with this text; return the code of the error."""
+async def refused(text: str, call: Callable[..., Any], *arguments: Any) -> str:
+    """Make a call that is refused with this text; return the code of the error."""
     with pytest.raises(QueryError, match=text) as caught:
-        await call
+        await call(*arguments)
     return caught.value.code
 
 
@@ -37,9 +37,9 @@ async def test_a_take_has_everything_that_is_published_between_start_and_stop(tm
     """No message more or less, in LCM's own format, and the peer learns what is on the disk."""
     async with still_lab(tmp_path) as lab:
         lab.publish()
-        started = await lab.takes.start("lab", "walk 1")
+        started = await lab.takes.start("walk 1")
         published = [lab.publish(key) for _ in range(50) for key in ("3d", "event")]
-        stopped = await lab.takes.stop("lab")
+        stopped = await lab.takes.stop()
         lab.publish()
         path = lab.path("walk 1.lcmlog")
         assert frames(path) == published
@@ -53,10 +53,10 @@ async def test_a_take_has_everything_that_is_published_between_start_and_stop(tm
 async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_path: Path) -> None:
     """A file explains itself: whoever reads it needs no other one."""
     async with still_lab(tmp_path) as lab:
-        lab.takes.server = lambda source: f"{source}:3020"
+        lab.output.storage.server = lambda source: f"{source}:3020"
         lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
         lab.output.publish_parameters("lab", ServerParameters(b"<new/>\0", 1, 5))
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         lab.publish()
         lab.output.publish_parameters("lab", ServerParameters(b"<changed/>", 1, 6))
         lab.publish()
@@ -76,12 +76,12 @@ async def test_what_a_take_is_about_is_in_its_file_and_its_list(tmp_path: Path) 
     """A year later, nobody knows whose steps these were; the file and the list say it."""
     about = TakeDetails("S01", "baseline", "left knee; 50 %")
     async with still_lab(tmp_path) as lab:
-        started = await lab.takes.start("lab", "walk", about)
+        started = await lab.takes.start("walk", about)
         lab.publish()
-        await lab.takes.stop("lab")
-        await lab.takes.start("lab", "silent")
-        await lab.takes.stop("lab")
-        listed = {take.name: take.details for take in (await lab.takes.list("lab")).takes}
+        await lab.takes.stop()
+        await lab.takes.start("silent")
+        await lab.takes.stop()
+        listed = {take.name: take.details for take in (await lab.takes.list()).takes}
     assert started.details == about
     assert listed == {"walk": about, "silent": NO_DETAILS}
     path = lab.path("walk.lcmlog")
@@ -93,7 +93,7 @@ async def test_what_a_take_is_about_is_in_its_file_and_its_list(tmp_path: Path) 
 async def test_parameters_stay_in_order_although_long_ones_are_encoded_elsewhere(tmp_path: Path) -> None:
     """Short parameters that overtake long ones would be replaced by what they have replaced."""
     async with still_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         before = lab.publish()
         long = lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 100_000 + b"-->", 1, 1))
         short = lab.output.publish_parameters("lab", ServerParameters(b"<short/>", 1, 2))
@@ -110,15 +110,15 @@ async def test_parameters_stay_in_order_although_long_ones_are_encoded_elsewhere
 async def test_parameters_that_do_not_fit_into_the_queue_follow_later(tmp_path: Path) -> None:
     """Without them, the labels of all that follows would be wrong; and they follow once only."""
     async with still_lab(tmp_path, max_queued_bytes=2000) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 5000 + b"-->", 1, 1))
         lab.output.maintain()
         lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 1500 + b"-->", 1, 2))
         lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 1501 + b"-->", 1, 3))
-        await lab.takes.written()
+        await lab.output.storage.written()
         for _ in range(3):
             lab.output.maintain()
-            await lab.takes.written()
+            await lab.output.storage.written()
     found = [decode(event.message).parameters_version for event in events(lab.path("walk.lcmlog"))[1:]]
     assert found == [2, 3]
 
@@ -127,14 +127,14 @@ async def test_only_one_take_of_a_source_runs(tmp_path: Path) -> None:
     """What is not possible is refused with a reason, and harms neither a file nor the running take."""
     async with still_lab(tmp_path) as lab:
         takes = lab.takes
-        assert await refused(takes.stop("lab"), "no take of source 'lab' is running") == "nothing-yet"
-        await takes.start("lab", "walk")
-        await refused(takes.start("lab", "run"), "take 'walk' of source 'lab' is running already")
+        assert await refused("no take of source 'lab' is running", takes.stop) == "nothing-yet"
+        await takes.start("walk")
+        await refused("take 'walk' of source 'lab' is running already", takes.start, "run")
         published = lab.publish()
-        await takes.stop("lab")
-        await refused(takes.start("lab", "walk"), "there is a take 'walk' of this source already")
-        await takes.start("lab", "run")
-        await refused(takes.start("hall"), "no source 'hall'")
+        await takes.stop()
+        await refused("there is a take 'walk' of this source already", takes.start, "walk")
+        await takes.start("run")
+        await refused("no source 'hall'", lab.output.takes, "hall")
     assert frames(lab.path("walk.lcmlog")) == [published]
 
 
@@ -144,8 +144,9 @@ async def test_names_that_are_no_names_of_files_are_refused(tmp_path: Path, name
     async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
         takes = lab.takes
-        for call in (takes.start("lab", name), takes.save("lab", 1, 0, name), takes.read("lab", name, 0)):
-            assert await refused(call, "cannot be the name of a take") == "bad-request"
+        for call, *arguments in ((takes.start, name), (takes.save, 1, 0, name), (takes.read, name, 0)):
+            text = "cannot be the name of a take"
+            assert await refused(text, call, *arguments) == "bad-request"
 
 
 async def test_names_may_have_letters_of_any_script_or_follow_from_source_and_time(tmp_path: Path) -> None:
@@ -154,8 +155,8 @@ async def test_names_may_have_letters_of_any_script_or_follow_from_source_and_ti
     async with still_lab(tmp_path) as lab:
         names = []
         for name in (*given, "", "", ""):
-            names.append((await lab.takes.start("lab", name)).name)
-            await lab.takes.stop("lab")
+            names.append((await lab.takes.start(name)).name)
+            await lab.takes.stop()
         assert names[:4] == given
         assert all(name.startswith("lab-20") for name in names[4:])
         assert {path.stem for path in lab.path("").iterdir()} == set(names)
@@ -165,16 +166,16 @@ async def test_names_may_have_letters_of_any_script_or_follow_from_source_and_ti
 async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
     """The list tells which takes are complete; reading one gives the bytes on the disk."""
     async with still_lab(tmp_path, Clock(), keep_last_s=60) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         for _ in range(100):
             lab.publish(size=1000)
-        await lab.takes.stop("lab")
-        await lab.takes.save("lab", 60, 0, "fall")
+        await lab.takes.stop()
+        await lab.takes.save(60, 0, "fall")
         lab.publish()
-        saving = await lab.takes.save("lab", 60, 30, "long fall")
+        saving = await lab.takes.save(60, 30, "long fall")
         assert (saving.is_running, saving.is_cut_off) == (True, False)
-        await lab.takes.start("lab", "run")
-        found = await lab.takes.list("lab")
+        await lab.takes.start("run")
+        found = await lab.takes.list()
         assert found.running is not None
         assert (found.running.name, found.running.is_running) == ("run", True)
         assert not any(take.is_cut_off for take in [found.running, *found.takes])
@@ -182,13 +183,13 @@ async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
         assert running == {"walk": False, "fall": False, "long fall": True, "run": True}
         [walk] = [take for take in found.takes if take.name == "walk"]
         pieces: list[bytes] = []
-        while (piece := await lab.takes.read("lab", "walk", sum(map(len, pieces)))).content:
+        while (piece := await lab.takes.read("walk", sum(map(len, pieces)))).content:
             assert piece.num_bytes == walk.num_bytes
             pieces.append(piece.content)
         assert b"".join(pieces) == lab.path("walk.lcmlog").read_bytes()
         assert len(pieces) > 1
-        await refused(lab.takes.read("lab", "jump", 0), "has no take 'jump'")
-        await refused(lab.takes.read("lab", "walk", -1), "an offset of 0 or more")
+        await refused("has no take 'jump'", lab.takes.read, "jump", 0)
+        await refused("an offset of 0 or more", lab.takes.read, "walk", -1)
 
 
 async def test_a_take_that_ends_while_listed_has_ended(
@@ -196,17 +197,17 @@ async def test_a_take_that_ends_while_listed_has_ended(
 ) -> None:
     """The disk is read without blocking the event loop, so anything may have changed since."""
     async with still_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         take_at = TakesFolder.take_at
         ends: list[Coroutine[Any, Any, StoredTake]] = []
 
         def end_and_read(folder: TakesFolder, path: Path, *, is_running: bool = False) -> StoredTake:
             if not ends:
-                ends.append(lab.takes.end("lab"))
+                ends.append(lab.takes.stop())
             return take_at(folder, path, is_running=is_running)
 
         monkeypatch.setattr(TakesFolder, "take_at", end_and_read)
-        assert (await lab.takes.list("lab")).running is None
+        assert (await lab.takes.list()).running is None
         assert (await ends[0]).name == "walk"
 
 
@@ -221,11 +222,11 @@ async def test_a_take_that_starts_too_late_has_no_file(
     async with still_lab(tmp_path) as lab:
         with monkeypatch.context() as patch:
             patch.setattr(takes_module, "disk_result", too_late)
-            await refused(lab.takes.start("lab", "walk"), "did not respond")
+            await refused("did not respond", lab.takes.start, "walk")
         assert [*lab.path("").iterdir()] == []
         assert not lab.publishers["3d"].wanted
-        assert lab.takes.running("lab") is None
-        await lab.takes.start("lab", "walk")
+        assert not lab.is_recording()
+        await lab.takes.start("walk")
 
 
 async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
@@ -233,7 +234,7 @@ async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
     async with still_lab(tmp_path, components=["event"], prefix="HALL") as lab:
         pose = lab.output.publisher(Topic("lab", ("6d", "3d"), "rtc3d.tool_pose_t"))
         status = lab.output.publisher(Topic("lab", ("status",), "rtc3d.status_t"))
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         wanted = [publisher.wanted for publisher in (*lab.publishers.values(), pose, status)]
         assert wanted == [*([False] * 4), *([True] * 3)]
         lab.publish("3d")
@@ -241,7 +242,7 @@ async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
         pose.publish(event)
         late = lab.output.publisher(Topic("lab", ("6d", "3D"), "rtc3d.tool_pose_t"))
         late.publish(event)
-        await lab.takes.stop("lab")
+        await lab.takes.stop()
         assert not status.wanted
     channels = [event.channel for event in events(lab.path("walk.lcmlog"))]
     assert channels == ["HALL_LAB_TAKE", "HALL_LAB_EVENT", "HALL_LAB_6D_3D", "HALL_LAB_6D_3D_2"]
@@ -270,14 +271,14 @@ async def test_a_c3d_file_gets_the_name_of_its_take(
         lab.publish()
         match before:
             case "running" | "stopped":
-                await lab.takes.start("lab", "walk")
+                await lab.takes.start("walk")
             case "being saved":
-                await lab.takes.save("lab", 10, 600, "earlier")
-                await lab.takes.save("lab", 10, 600, "walk")
+                await lab.takes.save(10, 600, "earlier")
+                await lab.takes.save(10, 600, "walk")
             case _:
-                await lab.takes.save("lab", 10, 0, "walk")
+                await lab.takes.save(10, 0, "walk")
         if before == "stopped":
-            await lab.takes.stop("lab")
+            await lab.takes.stop()
         clock.now_s += after_s
         lab.output.announce_file("lab", ServerFile(file, 3))
         found = [path for path in lab.path("").iterdir() if path.suffix == ".c3d"]
@@ -288,12 +289,12 @@ async def test_a_c3d_file_gets_the_name_of_its_take(
 async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
     """A source of the same name that is added later has nothing to do with it."""
     async with still_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         published = [lab.publish()]
         lab.output.withdraw("lab")
-        await refused(lab.takes.stop("lab"), "no source 'lab'")
+        await refused("no source 'lab'", lab.output.takes, "lab")
         lab.output.announce("lab")
-        await lab.takes.start("lab", "run")
+        await lab.takes.start("run")
     assert frames(lab.path("walk.lcmlog")) == published
 
 
@@ -314,15 +315,15 @@ def test_a_saved_take_goes_on_from_the_command_on(tmp_path: Path, monkeypatch: p
         monkeypatch.setattr(RollingSegments, "save", save_slowly)
         async with still_lab(tmp_path, clock, keep_last_s=60) as lab:
             published = [lab.publish()]
-            saved = await lab.takes.save("lab", 60, 5, "fall")
+            saved = await lab.takes.save(60, 5, "fall")
             assert saved.is_running
             published.append(lab.publish())
             await asyncio.sleep(2.9)
-            assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [True]
+            assert [take.is_running for take in (await lab.takes.list()).takes] == [True]
             await asyncio.sleep(0.2)
             lab.publish()
-            assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [False]
-            await lab.takes.written()
+            assert [take.is_running for take in (await lab.takes.list()).takes] == [False]
+            await lab.output.storage.written()
             assert frames(lab.path("fall")) == published
 
     run_in_virtual_time(save())
@@ -330,18 +331,19 @@ def test_a_saved_take_goes_on_from_the_command_on(tmp_path: Path, monkeypatch: p
 
 def test_a_save_that_was_ended_does_not_end_again(tmp_path: Path) -> None:
     """Its timer would claim a C3D file that arrives long after the take."""
+    file = tmp_path / "lab-1.c3d"
+    file.write_bytes(b"c3d")
 
     async def save_and_end() -> None:
         async with still_lab(tmp_path, keep_last_s=60) as lab:
             lab.publish()
-            saved = await lab.takes.save("lab", 60, 30, "fall")
-            recording = lab.takes.recording("lab")
-            recording.end_takes()
-            assert not recording.saves
-            await asyncio.sleep(59)
-            assert recording.take_of_c3d() == lab.path(saved.name)
-            await asyncio.sleep(2)
-            assert recording.take_of_c3d() is None
+            await lab.takes.save(60, 30, "fall")
+            lab.takes.end_takes()
+            assert not lab.takes.saves
+            for wait_s in (59, 2):
+                await asyncio.sleep(wait_s)
+                lab.output.announce_file("lab", ServerFile(file, 3))
+            assert [path.name for path in lab.path("").glob("*.c3d")] == ["fall.c3d"]
 
     run_in_virtual_time(save_and_end())
 
@@ -353,13 +355,13 @@ async def test_the_seconds_that_are_saved_are_counted_from_the_command_on(tmp_pa
         published = []
         for _ in range(30):
             published.append(lab.publish())
-            await lab.takes.written()
+            await lab.output.storage.written()
             clock.now_s += 1
-        assert (await lab.takes.list("lab")).kept_s == 30.0
-        await lab.takes.save("lab", 1, 0, "some")
-        await lab.takes.save("lab", math.inf, 0, "all")
+        assert (await lab.takes.list()).kept_s == 30.0
+        await lab.takes.save(1, 0, "some")
+        await lab.takes.save(math.inf, 0, "all")
         lab.publish()
-        await lab.takes.written()
+        await lab.output.storage.written()
         assert frames(lab.path("some")) == published[20:]
         assert frames(lab.path("all")) == published
 
@@ -368,12 +370,12 @@ async def test_takes_can_be_saved_beside_a_running_one_up_to_a_limit(tmp_path: P
     """Each has its own part of what is published; more than the limit would link every segment too often."""
     async with still_lab(tmp_path, keep_last_s=60) as lab:
         published = [lab.publish()]
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         for number in range(MAX_SAVES):
             published.append(lab.publish())
-            await lab.takes.save("lab", 60, 30, f"fall {number}")
-        assert await refused(lab.takes.save("lab", 30, 60), "are being saved already") == "refused"
-        await lab.takes.save("lab", 30, 0, "at once")
+            await lab.takes.save(60, 30, f"fall {number}")
+        assert await refused("are being saved already", lab.takes.save, 30, 60) == "refused"
+        await lab.takes.save(30, 0, "at once")
     assert frames(lab.path("walk.lcmlog")) == published[1:]
     assert all(frames(lab.path(f"fall {number}")) == published for number in range(MAX_SAVES))
 
@@ -382,19 +384,19 @@ async def test_saving_needs_something_that_is_kept(tmp_path: Path) -> None:
     """The peer learns whether to change the configuration, to wait, or to ask otherwise."""
     async with still_lab(tmp_path / "off") as lab:
         lab.publish()
-        assert await refused(lab.takes.save("lab", 60), "keep_last_s is 0") == "nothing-yet"
+        assert await refused("keep_last_s is 0", lab.takes.save, 60) == "nothing-yet"
     async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
         for last_s, after_s in ((0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0), (1.0, -1.0), (1.0, 3600.1)):
-            await refused(lab.takes.save("lab", last_s, after_s), "expected last above 0")
-        await lab.takes.save("lab", 0.1, 3600, "fall")
-        await refused(lab.takes.start("lab", "fall"), "there is a take 'fall'")
+            await refused("expected last above 0", lab.takes.save, last_s, after_s)
+        await lab.takes.save(0.1, 3600, "fall")
+        await refused("there is a take 'fall'", lab.takes.start, "fall")
 
 
 async def test_a_publisher_that_closes_frees_its_channel(tmp_path: Path) -> None:
     """A tool whose label comes back continues on the channel that it had."""
     async with still_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
+        await lab.takes.start("walk")
         for _ in range(2):
             pose = lab.output.publisher(Topic("lab", ("6d", "probe"), "rtc3d.tool_pose_t"))
             pose.publish(bytes(16))
@@ -407,8 +409,8 @@ async def test_whoever_publishes_learns_when_messages_are_wanted(tmp_path: Path)
     async with still_lab(tmp_path) as lab:
         seen: list[bool] = []
         lab.output.watch_wanted("lab", lambda: seen.append(lab.publishers["3d"].wanted))
-        await lab.takes.start("lab", "walk")
-        await lab.takes.stop("lab")
+        await lab.takes.start("walk")
+        await lab.takes.stop()
         assert seen == [True, False]
 
 
@@ -416,7 +418,7 @@ async def test_the_end_of_the_gateway_forgets_the_timers_of_saves(tmp_path: Path
     """They would fire while the output closes in another thread."""
     async with still_lab(tmp_path, keep_last_s=60) as lab:
         lab.publish()
-        await lab.takes.save("lab", 60, 600, "fall")
-        [timer] = lab.takes.recording("lab").saves.values()
+        await lab.takes.save(60, 600, "fall")
+        [timer] = lab.takes.saves.values()
         await lab.output.stop_queries()
         assert timer.cancelled()

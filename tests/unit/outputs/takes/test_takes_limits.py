@@ -42,21 +42,21 @@ async def test_a_take_ends_when_the_folder_is_full_and_nothing_can_be_deleted(tm
     folder_thread = FolderThread("takes-folder")
     lab = RecordingLab(tmp_path, host=host_with(folder_thread), max_bytes=MIB)
     lab.output.start()
-    await lab.takes.start("lab", "walk")
+    await lab.takes.start("walk")
     while lab.path("walk.lcmlog").stat().st_size <= MIB:
         lab.publish(size=1000)
-        await lab.takes.written()
+        await lab.output.storage.written()
     lab.output.maintain()
-    assert lab.takes.running("lab") is not None
+    assert lab.is_recording()
     folder_thread.is_stuck = True
     lab.output.maintain()
-    assert lab.takes.running("lab") is None
-    [loss] = lab.takes.recording("lab").losses.report()
+    assert not lab.is_recording()
+    [loss] = lab.takes.losses.report()
     assert (loss.cause, loss.messages, loss.frames) == ("folder full", 1, 0)
     assert "walk ends, because the folder" in loss.text
-    await lab.takes.start("lab", "run")
+    await lab.takes.start("run")
     lab.output.maintain()  # what was too much is known from before
-    assert lab.takes.running("lab") is not None
+    assert lab.is_recording()
     lab.output.close()
 
 
@@ -67,7 +67,7 @@ async def test_the_older_half_of_the_segments_makes_room_if_no_take_does(tmp_pat
         for _ in range(8):
             for _ in range(10):
                 lab.publish(size=1000)
-            await lab.takes.written()
+            await lab.output.storage.written()
             clock.now_s += 10
         segments = tmp_path / ROLLING / "lab"
         before = sorted(segments.iterdir())
@@ -98,21 +98,21 @@ async def test_a_reload_keeps_segments_that_fit(
     async with still_lab(tmp_path / "takes", clock, keep_last_s=60) as lab:
         for _ in range(25):
             lab.publish()
-            await lab.takes.written()
+            await lab.output.storage.written()
             clock.now_s += 1
         before = [*(tmp_path / "takes" / ROLLING / "lab").iterdir()]
         if "directory" in changes:
             changes = {"directory": str(tmp_path / "other")}
         base = settings_in(tmp_path / "takes", keep_last_s=60)
-        lab.takes.change(type(base).model_validate(base.model_dump() | changes))
-        await lab.takes.written()
+        lab.output.take_over(TakesOutput(type(base).model_validate(base.model_dump() | changes)))
+        await lab.output.storage.written()
         other = TakesFolder(tmp_path / "takes")
         assert (other.open() == "") is ("directory" in changes)  # nobody else may use a folder that is in use
         other.close()
-        assert (await lab.takes.list("lab")).kept_s == kept_s
+        assert (await lab.takes.list()).kept_s == kept_s
         assert all(not path.exists() for path in before) is (kept_s == 0.0)
         lab.publish("event")
-        await lab.takes.written()
+        await lab.output.storage.written()
         folders = [tmp_path / "takes" / ROLLING / "lab", tmp_path / "other" / ROLLING / "lab"]
         num_segments = sum(len(log_paths(folder)) for folder in folders if folder.exists())
         assert (num_segments > 0) is (changes.get("keep_last_s") != 0.0)
@@ -132,7 +132,7 @@ async def test_the_segments_of_a_killed_gateway_are_listed_after_the_start(tmp_p
     (tmp_path / ROLLING / "lab").mkdir(parents=True)
     segment = write_take(tmp_path / ROLLING / "lab" / "x-000001.lcmlog", [markers(1)])
     async with still_lab(tmp_path, keep_last_s=60) as lab:
-        assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [False]
+        assert [take.is_running for take in (await lab.takes.list()).takes] == [False]
         assert not segment.exists()
 
 
@@ -143,7 +143,7 @@ async def test_a_take_can_start_before_the_folder_was_checked(tmp_path: Path) ->
     lab = RecordingLab(tmp_path, host=host_with(folder_thread))
     lab.output.start()
     assert not lab.output.health().connected
-    assert (await lab.takes.start("lab", "walk")).is_running
+    assert (await lab.takes.start("walk")).is_running
     lab.output.close()
 
 
@@ -152,14 +152,14 @@ async def test_running_takes_are_not_deleted_however_old_they_are(tmp_path: Path
     clock = Clock()
     async with still_lab(tmp_path, clock, max_age_days=1, keep_last_s=60) as lab:
         lab.publish()
-        await lab.takes.start("lab", "walk")
-        await lab.takes.save("lab", 60, 600, "fall")
+        await lab.takes.start("walk")
+        await lab.takes.save(60, 600, "fall")
         lab.output.maintain()
         clock.now_s += 3 * 86_400
         lab.output.maintain()
         assert lab.path("walk.lcmlog").exists()
         assert [*lab.path("fall").iterdir()]
-        await lab.takes.stop("lab")
+        await lab.takes.stop()
         lab.output.maintain()
         clock.now_s += 3 * 86_400
         lab.output.maintain()

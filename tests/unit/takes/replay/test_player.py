@@ -12,7 +12,6 @@ from gateway.errors import OutputError, TakeError
 from gateway.outputs.contract import Output, ServerParameters
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
-from gateway.takes.files.event_log import encode_event
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.replay.play_list import Selection
 from gateway.takes.replay.player import Player
@@ -22,6 +21,7 @@ from tests.support.takes import (
     START_UTIME,
     Message,
     description,
+    encode_event,
     frame,
     log_bytes,
     markers,

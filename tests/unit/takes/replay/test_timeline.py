@@ -8,7 +8,7 @@ import pytest
 from gateway.takes.files.reader import FIRST_PLACE, TakeReader
 from gateway.takes.replay.play_list import STEP_US, SeekIndex, SeekPoint, Selection, play_list
 from gateway.takes.replay.player import Lateness, Pace
-from gateway.takes.replay.timeline import Jump, ReplayTimeline, TimelineState, time_text
+from gateway.takes.replay.timeline import Jump, ReplayTimeline, time_text
 from tests.support.takes import markers, parameters, write_take
 
 START = 1_700_000_000_000_000
@@ -111,7 +111,9 @@ def test_sources_may_have_clocks_that_differ(difference: int) -> None:
 
 
 def point(position_us: int) -> SeekPoint:
-    return SeekPoint(FIRST_PLACE, TimelineState(position_us, {}, 0), {})
+    timeline = ReplayTimeline()
+    timeline.position_us = position_us
+    return SeekPoint(FIRST_PLACE, timeline, {})
 
 
 @pytest.mark.parametrize(
