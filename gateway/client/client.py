@@ -1,5 +1,6 @@
 """A client of running gateways, the same on Zenoh and on LCM."""
 
+import contextlib
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -135,10 +136,7 @@ class GatewayClient:
     # What gateways publish.
 
     def subscribe(
-        self,
-        sources: Collection[str],
-        components: Collection[str] | None,
-        reception: Reception[Any, Any],
+        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
     ) -> GatewaySubscriber:
         """Subscribe to these sources (all, if empty) and components (None: all).
 
@@ -175,10 +173,14 @@ class GatewayClient:
         received: dict[str, dict[str, Any]] = {}
         problems = replies.problems
         for reply in replies.received:
-            try:
-                received[reply.source] = _content(reply)
-            except QueryError as error:
-                problems.append(error)
+            content = None
+            with contextlib.suppress(ValueError, RecursionError):
+                content = json.loads(reply.content)
+            if isinstance(content, dict):
+                received[reply.source] = content
+            else:
+                text = f"source {reply.source!r}: the reply about takes cannot be read"
+                problems.append(QueryError(text, code="unreadable"))
         if source is None and received:
             expected = {"disabled", "nothing-yet"} if options.get(CONTROL_OPTION) == "stop" else {"disabled"}
             problems = [problem for problem in problems if problem.code not in expected]
@@ -195,16 +197,6 @@ def _open(address: GatewayAddress) -> Transport:
     except OutputError as error:
         raise QueryError(str(error), code="no-gateway") from error
     return ZenohTransport(session, address.prefix or DEFAULT_ZENOH_PREFIX)
-
-
-def _content(reply: Reply) -> dict[str, Any]:
-    try:
-        content = json.loads(reply.content)
-    except (ValueError, RecursionError):
-        content = None
-    if not isinstance(content, dict):
-        raise QueryError(f"source {reply.source!r}: the reply about takes cannot be read", code="unreadable")
-    return content
 
 
 def _described(name: str | None, details: TakeDetails) -> dict[str, str]:

@@ -3,11 +3,10 @@
 from collections.abc import Iterable
 from typing import Final
 
-import rtc3d
-
+from gateway.client.series import FINGERPRINTS
 from gateway.errors import ProtocolError
 from gateway.logs.safe_text import safe_text
-from gateway.messages.decode import decode, message_type
+from gateway.messages.decode import decode
 from gateway.messages.source_report import SourceReport, source_report
 
 MAX_SOURCES: Final = 1000
@@ -69,9 +68,8 @@ class FoundSources:
 
     def add(self, source: SourceReport) -> None:
         """Add a source, or replace what an earlier status said about it."""
-        identity = (
-            (source.name, source.gateway) if source.gateway else (source.name, source.server, source.host)
-        )
+        where = (source.gateway,) if source.gateway else (source.server, source.host)
+        identity = (source.name, *where)
         if identity in self._sources or len(self._sources) < MAX_SOURCES:
             self._sources[identity] = source
         else:
@@ -83,20 +81,12 @@ def read_status(message: bytes, name: str, gateway: str = "") -> SourceReport:
 
     The message may come from anybody, and from another version of the gateway.
     """
-    try:
-        if len(message) > MAX_STATUS_BYTES:
-            problem = f"its status is too long: {len(message)} bytes"
-        elif _is_status(message):
+    problem = "its status is of another version of rtc3d-gateway"
+    if len(message) > MAX_STATUS_BYTES:
+        problem = f"its status is too long: {len(message)} bytes"
+    elif message.startswith(FINGERPRINTS["status"]):
+        try:
             return source_report(decode(message), name, gateway)
-        else:
-            problem = "its status is of another version of rtc3d-gateway"
-    except ProtocolError as error:
-        problem = f"its status cannot be read: {error}"
+        except ProtocolError as error:
+            problem = f"its status cannot be read: {error}"
     return SourceReport(safe_text(name), gateway, problem)
-
-
-def _is_status(message: bytes) -> bool:
-    try:
-        return message_type(message) is rtc3d.status_t
-    except ProtocolError:
-        return False

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import IO, Final, NamedTuple
 
-from gateway.client.transport import Query, Reply, Transport
+from gateway.client.transport import Query, Replies, Reply, Transport
 from gateway.errors import QueryError
 from gateway.outputs.contract import READ_OPTION
 from gateway.takes.files.event_log import EventBoundary
@@ -23,15 +23,6 @@ class FetchedTake(NamedTuple):
     is_complete: bool
 
 
-class _Piece(NamedTuple):
-    """A part of a take of ``source`` that has ``num_bytes`` in all; ``gateway`` is the id of who sent it."""
-
-    source: str
-    content: bytes
-    num_bytes: int
-    gateway: str
-
-
 class TakeTransfer:
     """The transfer of one take, of ``source`` or of the only one that has it (None)."""
 
@@ -46,33 +37,31 @@ class TakeTransfer:
 
         A take can grow meanwhile: the copy ends where it ended when the copy began.
         """
-        first = self._first_piece()
-        total = first.num_bytes
+        first = piece = self._first_piece()
+        total: int = first.facts["bytes"]
         boundary = EventBoundary()
-        done, piece = 0, first
-        while done < total:
+        done = 0
+        while True:
             content = piece.content[: total - done]
-            if not content:
-                raise self._changed()
+            if piece.facts["bytes"] < total or (done < total and not content):
+                raise QueryError(
+                    f"take {self._name!r} became shorter while it was copied: it was deleted or replaced; "
+                    "try again",
+                    code="unreadable",
+                )
+            if done == total:
+                break
             file.write(content)
             boundary.feed(content)
             done += len(content)
             progress(done, total)
             piece = self._next_piece(first, done)
-            if piece.num_bytes < total:
-                raise self._changed()
-        if piece.num_bytes == total:
+        if piece.facts["bytes"] == total:
             return FetchedTake(first.source, total, True)
         file.truncate(boundary.complete_bytes)
         return FetchedTake(first.source, boundary.complete_bytes, False)
 
-    def _changed(self) -> QueryError:
-        return QueryError(
-            f"take {self._name!r} became shorter while it was copied: it was deleted or replaced; try again",
-            code="unreadable",
-        )
-
-    def _first_piece(self) -> _Piece:
+    def _first_piece(self) -> Reply:
         """Return the first piece, from the only source that has the take."""
         pieces, problems = self._ask(self._source, 0)
         if len(pieces) > 1:
@@ -83,7 +72,7 @@ class TakeTransfer:
             raise _most_telling(problems)
         return pieces[0]
 
-    def _next_piece(self, first: _Piece, offset: int) -> _Piece:
+    def _next_piece(self, first: Reply, offset: int) -> Reply:
         """Return the piece at ``offset`` from the gateway that sent the first one."""
         problems: list[QueryError] = []
         for _ in range(ATTEMPTS):
@@ -95,26 +84,20 @@ class TakeTransfer:
                 break
         raise _most_telling(problems)
 
-    def _ask(self, source: str | None, offset: int) -> tuple[list[_Piece], list[QueryError]]:
+    def _ask(self, source: str | None, offset: int) -> Replies[list[Reply]]:
+        """Return the pieces at ``offset``: replies whose facts have the size of the take as ``bytes``."""
         query = Query("take", "takes", options={READ_OPTION: self._name, "offset": str(offset)})
         replies = self._transport.ask(query, source, self._timeout_s)
         pieces = []
         for reply in replies.received:
-            piece = self._piece(reply, offset)
-            if piece is None:
+            facts, num_bytes = reply.facts, reply.facts.get("bytes")
+            is_right = (facts.get("name"), facts.get("offset")) == (self._name, offset)
+            if is_right and isinstance(num_bytes, int) and num_bytes >= 0:
+                pieces.append(reply)
+            else:
                 text = f"source {reply.source!r}: a piece of take {self._name!r} cannot be read"
                 replies.problems.append(QueryError(text, code="unreadable"))
-            else:
-                pieces.append(piece)
-        return pieces, replies.problems
-
-    def _piece(self, reply: Reply, offset: int) -> _Piece | None:
-        """Return the piece in a reply; None if it is not the one that was asked for."""
-        facts, num_bytes = reply.facts, reply.facts.get("bytes")
-        is_right = (facts.get("name"), facts.get("offset")) == (self._name, offset)
-        if is_right and isinstance(num_bytes, int) and num_bytes >= 0:
-            return _Piece(reply.source, reply.content, num_bytes, reply.gateway)
-        return None
+        return Replies(pieces, replies.problems)
 
 
 def _most_telling(problems: list[QueryError]) -> QueryError:

@@ -5,10 +5,11 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from gateway.client.found_sources import FoundSources
-from gateway.client.reception import Reception
+from gateway.client.reception import MAX_SERIES, Reception
+from gateway.client.series import Series, Source
 from gateway.errors import QueryError
 from gateway.outputs.discovery import DISCOVERY_S
 
@@ -102,18 +103,76 @@ class TimeLimits:
         )
 
 
-class GatewaySubscriber(Protocol):
-    """A subscriber that hands what it receives to a Reception."""
+class GatewaySubscriber(ABC):
+    """Hands what gateways publish to a Reception, sorted by source and key.
+
+    An address is what a message arrives under: its key on Zenoh, or its channel on LCM.
+    """
+
+    def __init__(self, prefix: str, reception: Reception[Any, Any]) -> None:
+        self._prefix = prefix
+        self._reception = reception
+        self._series: dict[str, Series | None] = {}  # by address; None: left out
+
+    # In the threads that receive.
+
+    def _receive(self, address: str, message: bytes, sample: Any = None) -> None:
+        """Take a message; ``sample`` is that of Zenoh."""
+        try:
+            series = self._series.get(address) or self._find_series(address, message)
+            if series is not None:
+                self._take(series, message, sample)
+        except Exception as defect:  # noqa: BLE001 - the other messages are received
+            self._reception.failed(defect)
+
+    def _find_series(self, address: str, message: bytes) -> Series | None:
+        """Return the series of an address without messages so far; None, counted, if it cannot be."""
+        if address in self._series:
+            self._reception.ignore(beyond_limit=True)
+            return None
+        identified = self._identify(address, message)
+        if identified is None:
+            return None
+        source, key, channel = identified
+        series: Series | None = None if source is None else self._reception.series(source, key, channel)
+        if len(self._series) < 2 * MAX_SERIES:
+            self._series[address] = series
+        if series is None:
+            self._reception.ignore(beyond_limit=True)
+        return series
+
+    @abstractmethod
+    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
+        """Return the source (None if there are too many), the key and the channel of a series.
+
+        Returns None for what is left out; that of others is counted.
+        """
+
+    @abstractmethod
+    def _take(self, series: Series, message: bytes, sample: Any) -> None:
+        """Hand a message to the reception."""
+
+    # In one other thread.
 
     def tick(self) -> None:
-        """Query what is not known yet of new sources. Called often, in one thread."""
+        """Query what is not known yet of new sources. Call it often."""
+        for source in self._reception.sources_now:
+            if source.is_waiting and source.begin_query():
+                self._query(source)
 
-    def query_takes(self, source: Any) -> None:
+    @abstractmethod
+    def _query(self, source: Source) -> None:
+        """Query the parameters and the status of a source, if they are not known."""
+
+    @abstractmethod
+    def query_takes(self, source: Source) -> None:
         """Query which take the gateway of a source records; see Source.running_take."""
 
+    @abstractmethod
     def silence(self) -> str:
         """Return that no gateway is found, or none with these sources; "" if one is. It may take 1 s."""
 
+    @abstractmethod
     def close(self) -> None:
         """Unsubscribe. It may block while a peer does not read."""
 
@@ -134,10 +193,7 @@ class Transport(ABC):
 
     @abstractmethod
     def subscribe(
-        self,
-        sources: Collection[str],
-        components: Collection[str] | None,
-        reception: Reception[Any, Any],
+        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
     ) -> GatewaySubscriber:
         """See GatewayClient. Closing the subscriber closes this connection."""
 

@@ -7,9 +7,9 @@ from functools import partial
 from typing import Final
 
 from gateway.config.settings import OutputSettings, Settings
-from gateway.doctor.gateway_checks import CHECKS as GATEWAY_CHECKS
+from gateway.doctor import gateway_checks, source_checks
 from gateway.doctor.gateway_checks import HealthReport, address_text, check_gateway, read_health
-from gateway.doctor.source_checks import CHECKS, SourceChecks
+from gateway.doctor.source_checks import SourceChecks
 from gateway.errors import ConfigError
 from gateway.outputs.findings import NO_CONFIGURATION, Check, Finding, MessageLoad, as_sentence
 from gateway.outputs.kind import OPENS, OutputKind
@@ -26,7 +26,7 @@ def check_output(
     loads: Sequence[MessageLoad],
     seconds: float,
 ) -> list[Finding]:
-    """Run the checks of one output; blocks for about ``seconds``.
+    """Run the checks of one output, or check that it opens, as in the gateway. Blocks for about ``seconds``.
 
     ``sources`` are the names of all sources, ``loads`` the messages that they make.
     """
@@ -35,17 +35,12 @@ def check_output(
         return [Check(kind.name, check).not_tested(reason) for check in kind.checks]
     if kind.run_checks is not None:
         return kind.run_checks(settings, sources, loads, seconds)
-    return [_check_opens(kind, settings, seconds)]
-
-
-def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> Finding:
-    """Check that the output opens, as in the gateway, within ``seconds``; then close it."""
     check = Check(kind.name, OPENS)
     default_remedy = f"Correct {kind.name} in the configuration."
     try:
         output = kind.create(settings)
     except ConfigError as error:
-        return check.failing(str(error), default_remedy)
+        return [check.failing(str(error), default_remedy)]
     output.start()
     deadline_s = time.monotonic() + seconds
     while not output.health().connected and time.monotonic() < deadline_s:
@@ -54,8 +49,8 @@ def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> 
     health = output.health()
     output.close()
     if health.connected:
-        return check.passing("the output opens")
-    return check.problem(health.problem, default_remedy)
+        return [check.passing("the output opens")]
+    return [check.problem(health.problem, default_remedy)]
 
 
 _FILE: Final = Check("configuration", "file")
@@ -106,8 +101,8 @@ def run_checks_without_settings(error: ConfigError) -> Iterator[Finding]:
     """Yield ``error`` as a finding, and run the checks that need no settings."""
     yield _FILE.failing(str(error), "Correct these lines; config/gateway.yaml explains every key.")
     subjects = {
-        "running gateway": GATEWAY_CHECKS,
-        "source": CHECKS,
+        "running gateway": gateway_checks.CHECKS,
+        "source": source_checks.CHECKS,
         **{name: kind.checks for name, kind in OUTPUTS.items()},
     }
     for subject, checks in subjects.items():

@@ -1,14 +1,17 @@
 """Checks of the running gateway, by its own health page: streams, outputs, and what was lost."""
 
 import asyncio
+import contextlib
 import http.client
 import json
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
 from gateway.config.settings import MetricsSettings
+from gateway.doctor.frame_checks import START
 from gateway.logs.losses import counts_text, route_name
 from gateway.outputs.findings import Check, Finding
 from gateway.outputs.listen_address import from_this_computer, host_in_url
@@ -17,7 +20,6 @@ from gateway.workers import WorkerThread
 
 _TIMEOUT_S: Final = 3.0
 _MAX_PAGE_BYTES: Final = 4 << 20
-_DISCONNECTED: Final = {StreamState.WAITING.value, StreamState.CONNECTING.value}
 
 
 class RunningStream(BaseModel):
@@ -33,11 +35,6 @@ class RunningStream(BaseModel):
     last_frame_age_s: float | None
     limitations: list[str]
     problem: str
-
-    @property
-    def name(self) -> str:
-        """The name in texts: "lab (3d 6d)"."""
-        return f"{self.source} ({self.stream})"
 
 
 class RunningOutput(BaseModel):
@@ -80,11 +77,6 @@ class HealthReport(BaseModel):
     outputs: list[RunningOutput]
     losses: list[RunningLoss]
 
-    def connected_hosts(self, port: int) -> set[str]:
-        """Return the hosts of the servers on ``port`` to which the gateway is connected."""
-        servers = [each.server.rpartition(":") for each in self.streams if each.state not in _DISCONNECTED]
-        return {host for host, _, server_port in servers if server_port == str(port)}
-
 
 class NoReport(NamedTuple):
     """Why there is no health page. If something answers on the address, it may be a gateway in trouble."""
@@ -105,9 +97,7 @@ async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
     where = address_text(metrics)
     try:
         async with asyncio.timeout(2 * _TIMEOUT_S):  # includes looking up a host name
-            page = await WorkerThread("health page").run(
-                lambda: _get(from_this_computer(metrics.host), metrics.port)
-            )
+            page = await WorkerThread("health page").run(partial(_get, metrics))
     except ConnectionRefusedError:
         return NoReport(f"no gateway runs here: nothing listens on {where}", False)
     except TimeoutError:
@@ -122,13 +112,11 @@ async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
         return NoReport(f"the program on {where} is not a gateway of this version", True)
 
 
-def _get(host: str, port: int) -> bytes:
-    connection = http.client.HTTPConnection(host, port, timeout=_TIMEOUT_S)
-    try:
+def _get(metrics: MetricsSettings) -> bytes:
+    host = from_this_computer(metrics.host)
+    with contextlib.closing(http.client.HTTPConnection(host, metrics.port, timeout=_TIMEOUT_S)) as connection:
         connection.request("GET", "/healthz")
         return connection.getresponse().read(_MAX_PAGE_BYTES)
-    finally:
-        connection.close()
 
 
 CHECKS: Final = ("health", "stream", "output", "loss")
@@ -164,7 +152,12 @@ def check_gateway(
     for stream in report.streams:
         yield from _check_stream(stream, connects=connects)
     for output in report.outputs:
-        yield _check_output(output.output, output.problem)
+        name, problem = output.output, output.problem
+        yield (
+            _OUTPUT.problem(f"{name}: {problem}", f"See the checks of {name} below.")
+            if problem
+            else _OUTPUT.passing(f"{name}: connected")
+        )
     if not report.losses:
         yield _LOSS.passing("nothing has been lost since the gateway started")
     for loss in report.losses:
@@ -192,30 +185,21 @@ def _no_gateway(report: NoReport, *, connects: bool) -> Finding:
 
 
 def _check_stream(stream: RunningStream, *, connects: bool) -> Iterator[Finding]:
+    name = f"{stream.source} ({stream.stream})"
     age = f", the newest {stream.last_frame_age_s:.1f} s ago" if stream.last_frame_age_s is not None else ""
-    found = (
-        f"{stream.name}: {stream.state}, {stream.frame_rate_hz:.1f} Hz from {stream.server}; "
-        f"{stream.frames} frames so far{age}"
-    )
     if stream.problem:
         remedy = (
             f"The checks of {stream.source} below look for the reason."
             if connects
             else "Check the server and the network. Without --no-connect, doctor looks for the reason."
         )
-        yield _STREAM.failing(f"{stream.name}: {stream.state}: {stream.problem}", remedy)
+        yield _STREAM.failing(f"{name}: {stream.state}: {stream.problem}", remedy)
     elif stream.state == StreamState.NO_MEASUREMENT.value:
-        yield _STREAM.failing(
-            f"{stream.name}: {stream.server} reports that no measurement is running",
-            "Start a measurement on the server; the gateway then streams automatically.",
-        )
+        yield _STREAM.failing(f"{name}: {stream.server} reports that no measurement is running", START)
     else:
-        yield _STREAM.passing(found)
+        yield _STREAM.passing(
+            f"{name}: {stream.state}, {stream.frame_rate_hz:.1f} Hz from {stream.server}; "
+            f"{stream.frames} frames so far{age}"
+        )
     for limitation in stream.limitations:
-        yield _STREAM.note(f"{stream.name}: {limitation}")
-
-
-def _check_output(name: str, problem: str) -> Finding:
-    if problem:
-        return _OUTPUT.problem(f"{name}: {problem}", f"See the checks of {name} below.")
-    return _OUTPUT.passing(f"{name}: connected")
+        yield _STREAM.note(f"{name}: {limitation}")

@@ -65,9 +65,7 @@ FRAME_KEY: Final = "frame"
 
 
 def frame_answer(
-    frame: CoordinateFrame,
-    names: Mapping[str, Mapping[str, Mapping[str, str]]],
-    options: Mapping[str, str],
+    frame: CoordinateFrame, names: Mapping[str, Mapping[str, Mapping[str, str]]], options: Mapping[str, str]
 ) -> Answer:
     """Return the frame, and the names that outputs have given to items, as JSON.
 
@@ -128,15 +126,6 @@ class FilePayload:
             raise QueryError(text, code="nothing-yet") from error
 
 
-class _MessageJson:
-    """A message and its JSON text."""
-
-    def __init__(self, message: bytes) -> None:
-        self.message = message
-        self.payload = JsonPayload(lambda: json_text(decode(message)).encode(), JSON_RATIO * len(message))
-        self.begun_s = time.monotonic()
-
-
 class NewestJson:
     """The JSON texts of the newest messages, one for each key: a message is converted once for all peers.
 
@@ -144,23 +133,24 @@ class NewestJson:
     """
 
     def __init__(self) -> None:
-        self._newest: dict[str, _MessageJson] = {}
+        self._newest: dict[str, tuple[bytes, JsonPayload, float]] = {}
+        """The message, its text, and when somebody first asked for it."""
 
     def of(self, key: str, message: bytes) -> tuple[bytes, JsonPayload]:
         """Return the text of ``message``, or of the one before it, together with its message.
 
         Raises QueryError if the message is too long.
         """
-        newest = self._newest.get(key)
-        if newest is None or not (newest.message == message or _is_waiting(newest)):
-            if len(message) > MAX_JSON_SOURCE_BYTES:
-                raise QueryError(
-                    f"a frame of {len(message)} bytes is too long for JSON; ask without format=json",
-                    code="refused",
-                )
-            newest = self._newest[key] = _MessageJson(message)
-        return newest.message, newest.payload
-
-
-def _is_waiting(newest: _MessageJson) -> bool:
-    return not newest.payload.is_made and time.monotonic() - newest.begun_s < _UNMADE_S
+        if key in self._newest:
+            newest, payload, asked_s = self._newest[key]
+            is_waiting = not payload.is_made and time.monotonic() - asked_s < _UNMADE_S
+            if newest == message or is_waiting:
+                return newest, payload
+        if len(message) > MAX_JSON_SOURCE_BYTES:
+            raise QueryError(
+                f"a frame of {len(message)} bytes is too long for JSON; ask without format=json",
+                code="refused",
+            )
+        payload = JsonPayload(lambda: json_text(decode(message)).encode(), JSON_RATIO * len(message))
+        self._newest[key] = message, payload, time.monotonic()
+        return message, payload

@@ -19,12 +19,7 @@ from gateway.rtc3d.parameters import (
     statistics_xml,
     without_statistics,
 )
-from gateway.rtc3d.parameters_xml import (
-    MAX_XML_BYTES,
-    ParsedParameters,
-    extract_sections,
-    parse_parameters,
-)
+from gateway.rtc3d.parameters_xml import MAX_XML_BYTES, ParsedParameters, extract_sections, parse_parameters
 from gateway.stream.replies import XmlThread
 
 Sections = tuple[str, ...]
@@ -147,12 +142,9 @@ def read_parameters(xml: bytes, before: ServerAnswer | None) -> Reading:
 
 def _with_statistics(parsed: ParsedParameters, xml: bytes) -> ParsedParameters:
     """Return parsed parameters with the statistics of ``xml``, which is the same otherwise."""
-    statistics = statistics_xml(xml)
-    old = parsed.parameters.general
-    if not statistics or old is None:
-        return parsed
-    new = parse_parameters(statistics).parameters.general
-    if new is None:
+    statistics, old = statistics_xml(xml), parsed.parameters.general
+    new = parse_parameters(statistics).parameters.general if statistics else None
+    if old is None or new is None:
         return parsed
     general = replace(old, frames_sent=new.frames_sent, frames_per_s=new.frames_per_s)
     return parsed._replace(parameters=replace(parsed.parameters, general=general))

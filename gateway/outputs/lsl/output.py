@@ -139,11 +139,9 @@ class LslOutput(FrameOutput):
     # In the thread that sends.
 
     def _restart(self) -> None:
-        self._processes.restart(self._reopen)
-
-    def _reopen(self) -> None:
-        for publisher in list(self._publishers.values()):
-            publisher.streams.reopen()
+        if self._processes.restart():
+            for publisher in list(self._publishers.values()):
+                publisher.streams.reopen()
 
     def _start_sending(self) -> None:
         with self._lock:

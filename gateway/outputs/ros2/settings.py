@@ -1,4 +1,4 @@
-"""The section ``ros2`` of the configuration.
+"""The section ``ros2`` of the configuration, and the output in the registry.
 
 A topic consists of parts between slashes: ASCII letters, digits and single underscores, without a digit or an
 underscore at the beginning. (A part with a leading underscore is hidden from ``ros2 topic list``.)
@@ -15,6 +15,7 @@ from gateway.config.section import expects
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
 from gateway.messages.topics import unique_name
+from gateway.outputs.kind import OutputKind, imported_late
 
 _MAX_LABEL_CHARS: Final = 48
 MAX_PART_CHARS: Final = 63
@@ -94,8 +95,7 @@ Distribution = Annotated[
 ]
 Reliability = Annotated[Literal["best_effort", "reliable"], expects("best_effort or reliable")]
 Durability = Annotated[
-    Literal["volatile"],
-    expects("volatile; transient_local would keep old poses for nodes that start later"),
+    Literal["volatile"], expects("volatile; transient_local would keep old poses for nodes that start later")
 ]
 Depth = Annotated[int, Field(strict=True, ge=1, le=10_000), expects("a whole number from 1 to 10000")]
 
@@ -126,3 +126,13 @@ class Ros2Settings(OutputSettings):
 
     depth: Depth = 10
     """The depth of the history that the publishers announce (keep last)."""
+
+
+ROS2: Final = OutputKind(
+    name="ros2",
+    settings=Ros2Settings,
+    create=imported_late("gateway.outputs.ros2.output:Ros2Output"),
+    checks=("router", "gateway", "nodes", "types"),
+    run_checks=imported_late("gateway.outputs.ros2.checks:check_ros2"),
+    leaves_host=imported_late("gateway.outputs.ros2.checks:leaves_host"),
+)
