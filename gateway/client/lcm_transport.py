@@ -230,11 +230,15 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._requester = requester
         self._take_requests: dict[str, Any] = {}
         """The newest request for the takes of each source, by the beginning of its channels."""
-        pattern = _pattern(prefix, [*self._names], components)
+        channels = "|".join(map(re.escape, self._names)) or f"{re.escape(prefix)}_.+"
+        keys = ".+"
+        if components is not None:
+            wanted = {*components, "status", "parameters"}
+            keys = "|".join("6D(_.+)?" if name == "6d" else name.upper() for name in wanted)
+        pattern = f"({channels})_({keys})"
         self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
     def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
-        """See GatewaySubscriber."""
         if address.endswith(("_REQUEST", "_REPLY", "_RECONNECTED")):
             return None
         key = _KEYS_BY_FINGERPRINT.get(message[:8])
@@ -272,12 +276,11 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         def take(reply: Any) -> None:
             if reply.error_code in BUSY_CODES:
                 return
-            age_s = min(max(0.0, reply.age_s), 1e9)
             parameters = None
             if not reply.error:
-                parameters = self._reception.parameters_message(
-                    source, xml_bytes(reply.xml), None, reply.parameters_version, age_s
-                )
+                xml, age_s = xml_bytes(reply.xml), min(max(0.0, reply.age_s), 1e9)
+                version = reply.parameters_version
+                parameters = self._reception.parameters_message(source, xml, None, version, age_s)
             self._reception.answered(source, parameters)
 
         if not source.has_answer:
@@ -310,17 +313,6 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         """See GatewaySubscriber."""
         self._subscriber.close()
         self._requester.close()
-
-
-def _pattern(prefix: str, channels: Collection[str], components: Collection[str] | None) -> str:
-    """Return the regular expression of the channels to subscribe to."""
-    sources = "|".join(map(re.escape, channels)) or f"{re.escape(prefix)}_.+"
-    if components is None:
-        return f"({sources})_.+"
-    names = "|".join(
-        "6D(_.+)?" if name == "6d" else name.upper() for name in {*components, "status", "parameters"}
-    )
-    return f"({sources})_({names})"
 
 
 class LcmRequester:

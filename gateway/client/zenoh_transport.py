@@ -234,7 +234,6 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         return self._reception.source(name, lcm_channel(DEFAULT_LCM_PREFIX, name), is_known=True)
 
     def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:  # noqa: ARG002 - overrides
-        """See GatewaySubscriber."""
         name, _, path = address.removeprefix(f"{self._prefix}/").partition("/")
         if path in _NO_KEYS or is_json_key(path):
             return None
@@ -247,7 +246,6 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         return source, path, "" if source is None else lcm_channel(source.channels, *names)
 
     def _take(self, series: Series, message: bytes, sample: zenoh.Sample) -> None:
-        """See GatewaySubscriber."""
         if series.key != "parameters":
             self._reception.receive(series, message)
         elif len(message) > MAX_XML_BYTES:
@@ -268,8 +266,6 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         )
 
     def _query(self, source: Source) -> None:
-        """See GatewaySubscriber."""
-
         def take_parameters(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 if len(reply.ok.payload) <= MAX_XML_BYTES:
