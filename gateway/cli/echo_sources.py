@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.found_sources import FoundSources
+from gateway.client.transport import FoundSources
 from gateway.config.words import join_or
 from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from gateway.client.found_sources import FoundSources
+    from gateway.client.transport import FoundSources
 
 
 @with_options

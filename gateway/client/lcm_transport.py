@@ -15,18 +15,18 @@ from typing import Any, Final
 
 import rtc3d
 
-from gateway.client.found_sources import FoundSources, read_status
-from gateway.client.reception import Reception
-from gateway.client.series import FINGERPRINTS, POSE, Series, Source
+from gateway.client.reception import FINGERPRINTS, POSE, Reception, Series, Source
 from gateway.client.transport import (
     BUSY_CODES,
     RETRY_S,
+    FoundSources,
     GatewaySubscriber,
     Query,
     Replies,
     Reply,
     TimeLimits,
     Transport,
+    read_status,
 )
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text

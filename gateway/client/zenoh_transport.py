@@ -9,12 +9,11 @@ from urllib.parse import unquote
 
 import zenoh
 
-from gateway.client.found_sources import FoundSources
-from gateway.client.reception import MAX_XML_BYTES, Reception
-from gateway.client.series import POSE, Series, Source
+from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
 from gateway.client.transport import (
     BUSY_CODES,
     RETRY_S,
+    FoundSources,
     GatewaySubscriber,
     Query,
     Replies,

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from functools import partial
 from itertools import chain
 from typing import Final
@@ -16,7 +16,6 @@ from gateway.doctor.frame_checks import (
     check_receive_buffer,
     check_visibility,
 )
-from gateway.doctor.gateway_checks import HealthReport
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.logs.safe_text import quoted
@@ -24,7 +23,6 @@ from gateway.messages.summary import described_items
 from gateway.outputs.findings import Check, Finding, MessageLoad, Result, as_sentence, failing_first
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.state import StreamState
 from gateway.stream.tcp import is_address, look_up
 
 CHECKS: Final = (
@@ -49,14 +47,14 @@ _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} 
 class SourceChecks:
     """Runs the checks of one source, once. Create it in a running event loop.
 
-    ``running`` is the health page of the running gateway; None if there is none.
+    ``connected`` are the servers, as HOST:PORT, to which the running gateway is connected.
     """
 
-    def __init__(self, source: SourceSettings, seconds: float, running: HealthReport | None = None) -> None:
+    def __init__(self, source: SourceSettings, seconds: float, connected: Iterable[str] = ()) -> None:
         self._source = source
         self._seconds = seconds
         self._server = f"{source.host}:{source.port}"
-        self._running = running
+        self._connected = connected
         self._addresses: frozenset[str] = frozenset()  # of the source's host, as far as they are known
         self._streams: list[ObservedStream] = []
 
@@ -110,11 +108,7 @@ class SourceChecks:
 
     async def _gateway_is_connected(self) -> bool:
         """Return whether the running gateway is connected to this server, perhaps by another host name."""
-        servers = [
-            stream.server.rpartition(":")
-            for stream in (self._running.streams if self._running else ())
-            if stream.state not in {StreamState.WAITING.value, StreamState.CONNECTING.value}
-        ]
+        servers = [server.rpartition(":") for server in self._connected]
         hosts = {host for host, _, port in servers if port == str(self._source.port)}
         if self._source.host in hosts:
             return True

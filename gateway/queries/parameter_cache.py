@@ -16,7 +16,7 @@ from functools import partial
 from gateway.config.settings import SourceSettings
 from gateway.errors import GatewayError, ParametersError, QueryError, ReplyTimeoutError, ServerError
 from gateway.logs.failures import FailureLog
-from gateway.queries.server_answer import (
+from gateway.queries.answers import (
     QueryHistory,
     Reading,
     Sections,

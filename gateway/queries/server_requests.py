@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 from gateway.config.settings import SourceSettings
 from gateway.errors import CommandError, GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
 from gateway.logs.failures import DefectLog
-from gateway.queries.server_answer import QueryHistory
+from gateway.queries.answers import QueryHistory
 from gateway.rtc3d.commands import Command, ControlRecording, recording_duration_s, recording_options
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text

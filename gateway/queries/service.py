@@ -17,7 +17,7 @@ from gateway.messages.encode import NOT_PUBLISHED, Stamp, encode_message
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
-from gateway.queries.answers import JsonPayload, NewestJson, message_answer, schema_answer
+from gateway.queries.answers import JsonPayload, NewestJson, QueryHistory, message_answer, schema_answer
 from gateway.queries.parameter_cache import Announce, ParameterCache
 from gateway.queries.questions import (
     RECORDING,
@@ -28,7 +28,6 @@ from gateway.queries.questions import (
     parse_question,
     parse_questions,
 )
-from gateway.queries.server_answer import QueryHistory
 from gateway.queries.server_requests import RecordingAccess, Recordings, ServerRequests, StreamAccess
 from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType

@@ -5,8 +5,7 @@ import time
 from collections import deque
 from typing import Any, Final, NamedTuple
 
-from gateway.client.reception import Reception
-from gateway.client.series import Series, Source
+from gateway.client.reception import Reception, Series, Source
 from gateway.descriptions.labels import EventText, event_text
 from gateway.display.live.component import LiveComponent
 from gateway.errors import ParametersError, ProtocolError

@@ -9,8 +9,7 @@ import rtc3d
 
 from gateway.client import reception
 from gateway.client import series as subscriber_series
-from gateway.client.reception import MAX_SOURCES
-from gateway.client.series import FINGERPRINTS
+from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
