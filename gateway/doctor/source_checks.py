@@ -144,9 +144,10 @@ class SourceChecks:
             return frozenset(await look_up(host))
 
     async def _check_tcp(self) -> Finding:
-        plans = self._source.streams == "auto"
-        requested = [StreamSettings()] if plans else self._source.streams
-        self._streams = [ObservedStream(self._source, stream, plans=plans) for stream in requested]
+        if self._source.streams == "auto":
+            self._streams = [ObservedStream(self._source, StreamSettings(), plans=True)]
+        else:
+            self._streams = [ObservedStream(self._source, stream) for stream in self._source.streams]
         try:
             for stream in self._streams:
                 await stream.session.connect()

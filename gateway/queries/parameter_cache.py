@@ -341,18 +341,20 @@ class ParameterCache:
         """Request some sections; if the server does not send single ones, return ``everything``."""
         answer = replace(everything, sections=sections)
         if self._sends_sections:
-            command = SendParameters(sections)
+            command, connection = SendParameters(sections), self._any_connection()
             try:
-                xml = (await self._requests.send(command, connection=self._any_connection())).body
-                session, version = self._requests.session, self.version
-                parsed = await self._xml_thread.process(xml, parse_parameters)
-                answer = ServerAnswer(sections, xml, parsed, session, version)
-            except ParametersError as error:
-                return self._keep_unreadable(sections, xml, error)
+                xml = (await self._requests.send(command, connection=connection)).body
             except QueryError as error:
                 if error.code not in NOT_ACCEPTED:
                     raise
                 self._sends_sections = False
+            else:
+                session, version = self._requests.session, self.version
+                try:
+                    parsed = await self._xml_thread.process(xml, parse_parameters)
+                except ParametersError as error:
+                    return self._keep_unreadable(sections, xml, error)
+                answer = ServerAnswer(sections, xml, parsed, session, version)
         self._answers[sections] = answer
         return answer
 

@@ -4,7 +4,7 @@ The server gets one request at a time, and equal questions at the same time shar
 """
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -262,6 +262,7 @@ class SourceQueryService:
         """See QueryService."""
         queries = self._sources()[source]
         name = "/".join(path)
+        answer: Callable[[], Awaitable[Answer]]
         if (command := self._commands().get(name)) is not None:
             answer = partial(command, source, options)
         elif off := [kind.name for kind in OUTPUTS.values() if name in kind.commands]:

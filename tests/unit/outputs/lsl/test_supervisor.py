@@ -17,11 +17,14 @@ from unittest.mock import Mock
 import pytest
 
 from gateway.errors import ConfigError
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lsl import supervisor
 from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.process import Kind, Message, Report
+from gateway.outputs.lsl.process import Kind, Message, MessageReader, Report
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import LslProcesses
+from gateway.rtc3d.parameters import Parameters, ParametersEvents
 from tests.support.lsl_receiver import lsl_config
 from tests.support.waiting import wait_until
 
@@ -221,6 +224,36 @@ class Lab:
         while not self.processes.is_due:
             self.now_s += 0.1
         return round(self.now_s - began_s, 1)
+
+
+def test_the_next_process_gets_the_streams_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that receive them continue."""
+    connections: list[socket.socket] = []
+
+    def start(_settings: LslSettings) -> tuple[socket.socket, Mock]:
+        ours, theirs = socket.socketpair()
+        connections.append(theirs)
+        return ours, Mock(wait=Mock(return_value=3))
+
+    def received() -> list[Message]:
+        connections[-1].settimeout(TIMEOUT_S)
+        return list(MessageReader().feed(connections[-1].recv(65536)))
+
+    monkeypatch.setattr(supervisor, "_FIRST_RETRY_S", 0.01)
+    monkeypatch.setattr(supervisor, "_start_process", start)
+    output = LslOutput(LslSettings(enabled=True))
+    output.frame_publisher("lab")
+    output.start()
+    wait_until(lambda: connections)
+    parsed = Parameters(events=ParametersEvents())
+    output.publish_parameters("lab", ServerParameters(b"", 1, 1, parsed=parsed, frame=CoordinateFrame("lab")))
+    [first] = received()
+    assert (first.kind, first.stream) == (Kind.OPEN, 1)
+    connections[0].close()
+    wait_until(lambda: output.maintain() or len(connections) == 2)
+    assert received() == [first]
+    output.close()
+    connections[1].close()
 
 
 def test_the_wait_for_the_next_process_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
