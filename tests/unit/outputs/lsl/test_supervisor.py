@@ -239,6 +239,10 @@ def test_the_next_process_gets_the_streams_again(monkeypatch: pytest.MonkeyPatch
         connections[-1].settimeout(TIMEOUT_S)
         return list(MessageReader().feed(connections[-1].recv(65536)))
 
+    def has_next() -> bool:
+        output.maintain()
+        return len(connections) == 2
+
     monkeypatch.setattr(supervisor, "_FIRST_RETRY_S", 0.01)
     monkeypatch.setattr(supervisor, "_start_process", start)
     output = LslOutput(LslSettings(enabled=True))
@@ -250,7 +254,7 @@ def test_the_next_process_gets_the_streams_again(monkeypatch: pytest.MonkeyPatch
     [first] = received()
     assert (first.kind, first.stream) == (Kind.OPEN, 1)
     connections[0].close()
-    wait_until(lambda: output.maintain() or len(connections) == 2)
+    wait_until(has_next)
     assert received() == [first]
     output.close()
     connections[1].close()
