@@ -32,9 +32,6 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 _STATUS_S: Final = 2.0
 """How long a gateway may take to reply with its status."""
 
-_NEEDS_NAMES: Final = frozenset({"take"})
-"""Keys that no wildcard selects."""
-
 
 class ZenohTransport(Transport):
     """Sends queries over an open session, which ``close`` closes."""
@@ -110,7 +107,7 @@ class ZenohTransport(Transport):
 
     def _selectors(self, query: Query, source: str | None) -> list[str]:
         sources = ["*"] if source is None else [source]
-        if source is None and query.key in _NEEDS_NAMES:
+        if source is None and query.key == "take":  # which no wildcard selects
             sources = self._served()
             if absence := self._absence(None, sources):
                 raise QueryError(absence, code="no-gateway")

@@ -10,7 +10,7 @@ import contextlib
 import logging
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 from gateway.config.settings import SourceSettings
@@ -40,14 +40,6 @@ Publishes them, and then marks the frames that follow with the version.
 """
 
 
-@dataclass(frozen=True)
-class _Refusal:
-    """The server's refusal of SendParameters."""
-
-    error: QueryError
-    received_s: float = field(default_factory=now_s)
-
-
 class ParameterCache:
     """The answers to SendParameters.
 
@@ -74,7 +66,7 @@ class ParameterCache:
         # What the server answered about sections that the answer for all of them does not give, or for all
         # of them if that cannot be read. All of this is cleared when a connection begins.
         self._answers: dict[Sections, ServerAnswer] = {}
-        self._refusal: _Refusal | None = None
+        self._refusal: tuple[QueryError, float] | None = None  # the server's of SendParameters, and when
         self._sends_sections = True
         self._problems = FailureLog(logger, settings.name)
 
@@ -107,7 +99,7 @@ class ParameterCache:
             if shared is not None:
                 return await self._share(connection, shared)
         newest = self.newest
-        if newest is not None and self._is_current and self._is_valid(newest, fresh=True):
+        if newest is not None and self._is_current and self._is_valid(newest.received_s, fresh=True):
             return await self._share(connection, newest.parsed)
         self._reading = reading = asyncio.get_running_loop().create_future()
         try:
@@ -144,7 +136,7 @@ class ParameterCache:
         try:
             packet = await connection.ask(command)
         except ServerError as error:
-            self._refusal = _Refusal(self._requests.refused(command, error))
+            self._refusal = self._requests.refused(command, error), now_s()
             await self._invalidate(f"it refuses {command}: {error}")
             raise
         except ReplyTimeoutError as error:
@@ -265,19 +257,18 @@ class ParameterCache:
 
     async def _get(self, sections: Sections, *, fresh: bool) -> ServerAnswer:
         kept = (self.newest if self._is_current else None, self._answers.get(()))
-        everything = next(
-            (each for each in kept if each is not None and self._is_valid(each, fresh=fresh)), None
-        )
+        valid = (each for each in kept if each is not None and self._is_valid(each.received_s, fresh=fresh))
+        everything = next(valid, None)
         if everything is None:
-            if self._refusal is not None and self._is_valid(self._refusal, fresh=fresh):
-                raise self._refusal.error
+            if self._refusal is not None and self._is_valid(self._refusal[1], fresh=fresh):
+                raise self._refusal[0]
             everything = await self._request_all(self._any_connection())
         part = await everything.part(sections, self._xml_thread) if sections else everything
         if part is not None:
             return part
         # The answer for all sections lacks these, or is not well-formed. So the server has to be asked.
         answer = self._answers.get(sections)
-        if answer is not None and self._is_valid(answer, fresh=fresh):
+        if answer is not None and self._is_valid(answer.received_s, fresh=fresh):
             return answer
         return await self._requests.share(
             ("parameters", sections), partial(self._request_sections, sections, everything)
@@ -288,8 +279,8 @@ class ParameterCache:
         """Whether the newest parameters are those of a server that is still connected."""
         return any(connection.is_open for connection in self._connections)
 
-    def _is_valid(self, answer: ServerAnswer | _Refusal, *, fresh: bool) -> bool:
-        return not fresh or now_s() - answer.received_s < self._settings.fresh_interval_s
+    def _is_valid(self, received_s: float, *, fresh: bool) -> bool:
+        return not fresh or now_s() - received_s < self._settings.fresh_interval_s
 
     # Requests to the server.
 
@@ -309,7 +300,7 @@ class ParameterCache:
             packet = await self._requests.send(SendParameters(), connection=connection)
         except QueryError as error:
             if error.code == "refused":
-                self._refusal = _Refusal(error)
+                self._refusal = error, now_s()
                 self._refusing = connection
             if error.code in NOT_ACCEPTED:
                 self._report_problem(connection, error)
