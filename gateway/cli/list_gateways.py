@@ -15,7 +15,7 @@ from gateway.messages.source_report import Level
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from gateway.client.found_sources import FoundSources
+    from gateway.client.transport import FoundSources
 
 
 @options.with_options

@@ -12,8 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.client.reception import MAX_SERIES, MAX_SOURCES
-from gateway.client.series import POSE
+from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE
 from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
 from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording

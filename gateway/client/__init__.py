@@ -12,12 +12,11 @@
         client.start_take("walk", source="lab")
         subscriber = client.subscribe(["lab"], ["3d"], Messages(lambda source, key, message: ...))
 
-- ``client`` is the beginning: where gateways are, and everything that can be asked.
-- ``transport`` is what ``zenoh_transport`` and ``lcm_transport`` have in common: they find sources, ask
-  until there is a reply, and subscribe.
-- ``found_sources`` reads what gateways report about their sources; ``take_transfer`` copies takes.
-- A subscriber sorts what arrives by source and key, for a ``reception``, which keeps it in bounds.
-  ``series`` counts it, and what is missing.
+- ``client`` is the beginning: where gateways are, and everything that can be asked; it also copies takes.
+- ``transport`` is what ``zenoh_transport`` and ``lcm_transport`` have in common: they find sources, with what
+  gateways report about them, ask until there is a reply, and subscribe.
+- A subscriber sorts what arrives by source and key, for a ``reception``, which keeps it in bounds, and counts
+  it, and what is missing.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,5 +1,6 @@
 """Gateways on LCM: asking one source or all until there is a reply, and receiving what they publish."""
 
+import contextlib
 import itertools
 import logging
 import re
@@ -8,17 +9,25 @@ import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 import rtc3d
 
-from gateway.client.found_sources import FoundSources, read_status
-from gateway.client.reception import MAX_SERIES, Reception
-from gateway.client.series import FINGERPRINTS, POSE, Series, Source
-from gateway.client.transport import BUSY_CODES, RETRY_S, Query, Replies, Reply, TimeLimits, Transport
+from gateway.client.reception import FINGERPRINTS, POSE, Reception, Series, Source
+from gateway.client.transport import (
+    BUSY_CODES,
+    RETRY_S,
+    FoundSources,
+    GatewaySubscriber,
+    Query,
+    Replies,
+    Reply,
+    TimeLimits,
+    Transport,
+    read_status,
+)
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
@@ -57,13 +66,27 @@ class LcmTransport(Transport):
             found.absence = missing_source((wanted,), found.heard)
         return found
 
-    @contextmanager
+    @contextlib.contextmanager
     def _hear(self, wanted: str | None) -> Iterator[FoundSources]:
         """Receive the status messages of sources, in a thread, while the context is open."""
         found = FoundSources()
-        channels = f"{re.escape(self._prefix)}_.+{_CHANNEL.pattern}"
-        receive = partial(_add, found, self._prefix, wanted)
-        subscriber = LcmSubscriber(open_lcm(receiving_url(self._url)), channels, receive)
+
+        def receive(channel: str, message: bytes) -> None:
+            """Add the source, unless another is wanted, or it has a longer prefix: MOCAP_HALL."""
+            if not found.takes(message):
+                return
+            source = read_status(message, "")
+            if not source.name:
+                name = _CHANNEL.split(channel)[0].removeprefix(f"{self._prefix}_").lower()
+                source = replace(source, name=safe_text(name))
+            channels = lcm_channel(self._prefix, source.name)
+            if channel.startswith(channels):
+                found.hear(source.name)
+                if wanted is None or channels == lcm_channel(self._prefix, wanted):
+                    found.add(source)
+
+        pattern = f"{re.escape(self._prefix)}_.+{_CHANNEL.pattern}"
+        subscriber = LcmSubscriber(open_lcm(receiving_url(self._url)), pattern, receive)
         try:
             yield found
         finally:
@@ -87,11 +110,11 @@ class LcmTransport(Transport):
         if not names:
             replies.problems.append(QueryError(self._no_gateway(None), code="no-gateway"))
         for name in names:
-            reply = received.get(name)
-            if reply is not None and not reply.error:
-                replies.received.append(_reply(name, query, reply))
-            elif reply is not None:
-                replies.problems.append(QueryError(reply.error, code=reply.error_code))
+            if (reply := received.get(name)) is not None:
+                if reply.error:
+                    replies.problems.append(QueryError(reply.error, code=reply.error_code))
+                else:
+                    replies.received.append(_reply(name, query, reply))
             elif name in found.heard:
                 replies.problems.append(limits.no_reply(f"source {name!r}"))
             else:
@@ -115,9 +138,14 @@ class LcmTransport(Transport):
             source: self._requester.prepare(_request(query), partial(receive, source)) for source in sources
         }
         while sources and not is_complete.is_set():
-            for source, request in requests.items():
-                if source not in replies:
-                    self._send(source, request)
+            try:
+                for source, request in requests.items():
+                    if source not in replies:
+                        self._requester.send(lcm_channel(self._prefix, source), request)
+            except OSError as error:
+                raise OutputError(
+                    f"LCM did not send to {self._url}: {error}; check --url", cause="send failed"
+                ) from error
             left_s = limits.left_s
             # Only a status message shows whether a gateway is missing or does not reply. If none has come
             # when the time for replies is up, wait for one until discovery is over.
@@ -126,21 +154,10 @@ class LcmTransport(Transport):
             is_complete.wait(min(RETRY_S, left_s or RETRY_S))
         return refusals | replies
 
-    def _send(self, source: str, request: Any) -> None:
-        try:
-            self._requester.send(lcm_channel(self._prefix, source), request)
-        except OSError as error:
-            raise OutputError(
-                f"LCM did not send to {self._url}: {error}; check --url", cause="send failed"
-            ) from error
-
     # Subscribing.
 
     def subscribe(
-        self,
-        sources: Collection[str],
-        components: Collection[str] | None,
-        reception: Reception[Any, Any],
+        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
     ) -> "LcmGatewaySubscriber":
         """See Transport."""
         return LcmGatewaySubscriber(self._url, self._prefix, sources, components, reception, self._requester)
@@ -155,22 +172,6 @@ def _wait_for_all(found: FoundSources) -> None:
     start_s = time.monotonic()
     while time.monotonic() < start_s + (_LISTEN_S if found.sources else DISCOVERY_S):
         time.sleep(_POLL_S)
-
-
-def _add(found: FoundSources, prefix: str, wanted: str | None, channel: str, message: bytes) -> None:
-    """Add the source of a status, unless another is wanted, or it has a longer prefix: MOCAP_HALL."""
-    if not found.takes(message):
-        return
-    source = read_status(message, "")
-    if not source.name:
-        source = replace(
-            source, name=safe_text(_CHANNEL.split(channel)[0].removeprefix(f"{prefix}_").lower())
-        )
-    channels = lcm_channel(prefix, source.name)
-    if channel.startswith(channels):
-        found.hear(source.name)
-        if wanted is None or channels == lcm_channel(prefix, wanted):
-            found.add(source)
 
 
 def _request(query: Query) -> Any:
@@ -208,7 +209,7 @@ _MAX_WAITING: Final = 4096
 logger = logging.getLogger(__name__)
 
 
-class LcmGatewaySubscriber:
+class LcmGatewaySubscriber(GatewaySubscriber):
     """Subscribes on an LCM URL, and asks with a ``requester``, which ``close`` closes. Raises OutputError.
 
     Messages are received in one thread, replies in another.
@@ -223,107 +224,79 @@ class LcmGatewaySubscriber:
         reception: Reception[Any, Any],
         requester: "LcmRequester",
     ) -> None:
+        super().__init__(prefix, reception)
         self._url = url
-        self._prefix = prefix
         self._names = {lcm_channel(prefix, name): name for name in sources}
-        self._reception = reception
-        self._series: dict[str, Series | None] = {}  # by channel; None: left out
         self._requester = requester
         self._take_requests: dict[str, Any] = {}
         """The newest request for the takes of each source, by the beginning of its channels."""
-        pattern = _pattern(prefix, [*self._names], components)
+        channels = "|".join(map(re.escape, self._names)) or f"{re.escape(prefix)}_.+"
+        keys = ".+"
+        if components is not None:
+            wanted = {*components, "status", "parameters"}
+            keys = "|".join("6D(_.+)?" if name == "6d" else name.upper() for name in wanted)
+        pattern = f"({channels})_({keys})"
         self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
-    # In the threads that receive.
+    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
+        if address.endswith(("_REQUEST", "_REPLY", "_RECONNECTED")):
+            return None
+        key = _KEYS_BY_FINGERPRINT.get(message[:8])
+        if key == POSE:
+            channels, _, label = address.rpartition(_POSE_MARK)
+            key = f"{POSE}{label}"
+        else:
+            channels = address.removesuffix(f"_{key.upper()}") if key else address
+        if not key or channels in {"", address}:
+            self._reception.ignore(beyond_limit=False)
+            return None
+        name = self._names.get(channels)
+        guess = channels.removeprefix(f"{self._prefix}_").lower()
+        source: Source | None = self._reception.source(name or guess, channels, is_known=False)
+        if source is not None and name is not None:
+            source.has_known_name = True
+        return source, key, address
 
-    def _receive(self, channel: str, message: bytes) -> None:
-        try:
-            self._sort(channel, message)
-        except Exception as defect:  # noqa: BLE001 - the other messages are received
-            self._reception.failed(defect)
-
-    def _sort(self, channel: str, message: bytes) -> None:
-        series = self._series.get(channel) or self._find_series(channel, message)
-        if series is None:
-            return
+    def _take(self, series: Series, message: bytes, sample: Any) -> None:  # noqa: ARG002 - overrides
+        """See GatewaySubscriber. The status says the name of a source: channels have only capital letters."""
+        source = series.source
         if series.key == "parameters" and series.accepts(message):
             self._reception.receive_parameters(series, message, is_made=False)
             return
         self._reception.receive(series, message)
-        if series.key == "status" and not series.source.has_known_name:
-            self._name(series.source, message)
+        if series.key == "status" and not source.has_known_name:
+            with contextlib.suppress(ProtocolError):
+                name = decode(message).source
+                if lcm_channel(self._prefix, name) == source.channels:
+                    source.name, source.has_known_name = name, True
 
-    def _find_series(self, channel: str, message: bytes) -> Series | None:
-        """Return the series of a channel that was not received before; None, counted, if it cannot be."""
-        if channel in self._series:
-            self._reception.ignore(beyond_limit=True)
-            return None
-        if channel.endswith(("_REQUEST", "_REPLY", "_RECONNECTED")):
-            return None
-        key = _KEYS_BY_FINGERPRINT.get(message[:8])
-        if key == POSE:
-            channels, _, label = channel.rpartition(_POSE_MARK)
-            key = f"{POSE}{label}"
-        else:
-            channels = channel.removesuffix(f"_{key.upper()}") if key else channel
-        if not key or channels in {"", channel}:
-            self._reception.ignore(beyond_limit=False)
-            return None
-        source = self._source(channels)
-        series = None if source is None else self._reception.series(source, key, channel)
-        if len(self._series) < 2 * MAX_SERIES:
-            self._series[channel] = series
-        if series is None:
-            self._reception.ignore(beyond_limit=True)
-        return series
+    def _query(self, source: Source) -> None:
+        """See GatewaySubscriber. Every gateway sends its status."""
 
-    def _source(self, channels: str) -> Source | None:
-        name = self._names.get(channels)
-        guess = channels.removeprefix(f"{self._prefix}_").lower()
-        source = self._reception.source(name or guess, channels, is_known=False)
-        if source is not None and name is not None:
-            source.has_known_name = True
-        return source
+        def take(reply: Any) -> None:
+            if reply.error_code in BUSY_CODES:
+                return
+            parameters = None
+            if not reply.error:
+                xml, age_s = xml_bytes(reply.xml), min(max(0.0, reply.age_s), 1e9)
+                version = reply.parameters_version
+                parameters = self._reception.parameters_message(source, xml, None, version, age_s)
+            self._reception.answered(source, parameters)
 
-    def _name(self, source: Source, status: bytes) -> None:
-        """Take the name of a source from its status: its channels have capital letters only."""
-        try:
-            name = decode(status).source
-        except ProtocolError:
-            return
-        if lcm_channel(self._prefix, name) == source.channels:
-            source.name, source.has_known_name = name, True
-
-    def _receive_parameters(self, source: Source, reply: Any) -> None:
-        if reply.error_code in BUSY_CODES:
-            return
-        parameters = None
-        if not reply.error:
-            parameters = self._reception.parameters_message(
-                source, xml_bytes(reply.xml), None, reply.parameters_version, min(max(0.0, reply.age_s), 1e9)
-            )
-        self._reception.answered(source, parameters)
-
-    def _receive_takes(self, source: Source, reply: Any) -> None:
-        newest = self._take_requests[source.channels].request_id
-        if not reply.error and reply.request_id == newest:
-            self._reception.answered_takes(source, reply.content.encode())
-
-    # In the thread of the command.
-
-    def tick(self) -> None:
-        """Query the parameters of sources that wait for their description."""
-        for source in self._reception.sources_now:
-            if source.is_waiting and not source.has_answer and source.begin_query():
-                receive = partial(self._receive_parameters, source)
-                self._send(source, self._requester.prepare(rtc3d.parameters_request_t(), receive))
+        if not source.has_answer:
+            self._send(source, self._requester.prepare(rtc3d.parameters_request_t(), take))
 
     def query_takes(self, source: Source) -> None:
         """See GatewaySubscriber."""
+
+        def take(reply: Any) -> None:
+            newest = self._take_requests[source.channels].request_id
+            if not reply.error and reply.request_id == newest:
+                self._reception.answered_takes(source, reply.content.encode())
+
         request = rtc3d.command_request_t()
         request.command = "take"
-        receive = partial(self._receive_takes, source)
-        self._take_requests[source.channels] = self._requester.prepare(request, receive)
+        self._take_requests[source.channels] = self._requester.prepare(request, take)
         self._send(source, request)
 
     def _send(self, source: Source, request: Any) -> None:
@@ -340,17 +313,6 @@ class LcmGatewaySubscriber:
         """See GatewaySubscriber."""
         self._subscriber.close()
         self._requester.close()
-
-
-def _pattern(prefix: str, channels: Collection[str], components: Collection[str] | None) -> str:
-    """Return the regular expression of the channels to subscribe to."""
-    sources = "|".join(map(re.escape, channels)) or f"{re.escape(prefix)}_.+"
-    if components is None:
-        return f"({sources})_.+"
-    names = "|".join(
-        "6D(_.+)?" if name == "6d" else name.upper() for name in {*components, "status", "parameters"}
-    )
-    return f"({sources})_({names})"
 
 
 class LcmRequester:
@@ -390,10 +352,6 @@ class LcmRequester:
             reply = decode(data)
         except ProtocolError:
             return
-        if (
-            isinstance(reply, rtc3d.parameters_reply_t | rtc3d.command_reply_t)
-            and reply.requester == self._requester
-        ):
-            on_reply = self._callbacks.get(reply.request_id)
-            if on_reply is not None:
-                on_reply(reply)
+        is_reply = isinstance(reply, rtc3d.parameters_reply_t | rtc3d.command_reply_t)
+        if is_reply and reply.requester == self._requester:
+            self._callbacks.get(reply.request_id, lambda _reply: None)(reply)

@@ -1,16 +1,101 @@
-"""What the two transports of a client have in common: queries, replies, time limits, and their interface."""
+"""What the two transports of a client have in common: found sources, replies, and their interface."""
 
 import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
-from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-from gateway.client.found_sources import FoundSources
-from gateway.client.reception import Reception
-from gateway.errors import QueryError
+from gateway.client.reception import FINGERPRINTS, MAX_SERIES, Reception, Series, Source
+from gateway.errors import ProtocolError, QueryError
+from gateway.logs.safe_text import safe_text
+from gateway.messages.decode import decode
+from gateway.messages.source_report import SourceReport, source_report
 from gateway.outputs.discovery import DISCOVERY_S
+
+MAX_SOURCES: Final = 1000
+"""How many sources are kept. Anybody on the network can send some."""
+
+MAX_STATUS_BYTES: Final = 256 * 1024
+_MAX_TOTAL_BYTES: Final = 4 * 1024 * 1024
+"""What all statuses together may have: decoding takes about 1 s for this much."""
+
+NO_ANSWER: Final = "its gateway does not answer"
+
+
+class FoundSources:
+    """Collects the sources that are found, up to MAX_SOURCES, each with its newest status."""
+
+    def __init__(self) -> None:
+        self._sources: dict[tuple[str, ...], SourceReport] = {}
+        self._num_bytes = 0
+        self.heard: set[str] = set()
+        """The names of all sources that were heard, wanted or not, up to MAX_SOURCES."""
+        self.num_left_out = 0
+        """How many sources or statuses were left out, because there are too many."""
+        self.absence = ""
+        """Why nothing is found, or that the wanted source is not."""
+
+    @property
+    def sources(self) -> list[SourceReport]:
+        """The sources by name, server and computer."""
+        return sorted(
+            self._sources.values(),
+            key=lambda each: (each.name, each.gateway, each.problem, each.server, each.host, each.version),
+        )
+
+    @property
+    def readable_names(self) -> list[str]:
+        """The names of the sources whose status could be read, each once, sorted."""
+        return sorted({each.name for each in self._sources.values() if each.streams or not each.problem})
+
+    def add_status(self, message: bytes, name: str = "", gateway: str = "") -> None:
+        """Add the source of a ``status_t``: see ``read_status``."""
+        if self.takes(message):
+            self.add(read_status(message, name, gateway))
+
+    def takes(self, message: bytes) -> bool:
+        """Return whether a message may still be read; count it as left out if not."""
+        self._num_bytes += len(message)
+        self.num_left_out += self._num_bytes > _MAX_TOTAL_BYTES
+        return self._num_bytes <= _MAX_TOTAL_BYTES
+
+    def hear(self, name: str) -> None:
+        """Note the name of a source, wanted or not."""
+        if len(self.heard) < MAX_SOURCES:
+            self.heard.add(safe_text(name))
+
+    def add_silent(self, names: Iterable[str]) -> None:
+        """Add sources whose gateways do not answer."""
+        for name in names:
+            self.add(SourceReport(safe_text(name), problem=NO_ANSWER))
+
+    def add(self, source: SourceReport) -> None:
+        """Add a source, or replace what an earlier status said about it."""
+        where = (source.gateway,) if source.gateway else (source.server, source.host)
+        identity = (source.name, *where)
+        if identity in self._sources or len(self._sources) < MAX_SOURCES:
+            self._sources[identity] = source
+        else:
+            self.num_left_out += 1
+
+
+def read_status(message: bytes, name: str, gateway: str = "") -> SourceReport:
+    """Return what a status says about the source ``name``; if that is "", the status names it.
+
+    The message may come from anybody, and from another version of the gateway.
+    """
+    problem = "its status is of another version of rtc3d-gateway"
+    if len(message) > MAX_STATUS_BYTES:
+        problem = f"its status is too long: {len(message)} bytes"
+    elif message.startswith(FINGERPRINTS["status"]):
+        try:
+            return source_report(decode(message), name, gateway)
+        except ProtocolError as error:
+            problem = f"its status cannot be read: {error}"
+    return SourceReport(safe_text(name), gateway, problem)
+
 
 RETRY_S: Final = 0.5
 """How long to wait before repeating a query that got no reply, or came while there were too many."""
@@ -102,18 +187,76 @@ class TimeLimits:
         )
 
 
-class GatewaySubscriber(Protocol):
-    """A subscriber that hands what it receives to a Reception."""
+class GatewaySubscriber(ABC):
+    """Hands what gateways publish to a Reception, sorted by source and key.
+
+    An address is what a message arrives under: its key on Zenoh, or its channel on LCM.
+    """
+
+    def __init__(self, prefix: str, reception: Reception[Any, Any]) -> None:
+        self._prefix = prefix
+        self._reception = reception
+        self._series: dict[str, Series | None] = {}  # by address; None: left out
+
+    # In the threads that receive.
+
+    def _receive(self, address: str, message: bytes, sample: Any = None) -> None:
+        """Take a message; ``sample`` is that of Zenoh."""
+        try:
+            series = self._series.get(address) or self._find_series(address, message)
+            if series is not None:
+                self._take(series, message, sample)
+        except Exception as defect:  # noqa: BLE001 - the other messages are received
+            self._reception.failed(defect)
+
+    def _find_series(self, address: str, message: bytes) -> Series | None:
+        """Return the series of an address without messages so far; None, counted, if it cannot be."""
+        if address in self._series:
+            self._reception.ignore(beyond_limit=True)
+            return None
+        identified = self._identify(address, message)
+        if identified is None:
+            return None
+        source, key, channel = identified
+        series: Series | None = None if source is None else self._reception.series(source, key, channel)
+        if len(self._series) < 2 * MAX_SERIES:
+            self._series[address] = series
+        if series is None:
+            self._reception.ignore(beyond_limit=True)
+        return series
+
+    @abstractmethod
+    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
+        """Return the source (None if there are too many), the key and the channel of a series.
+
+        Returns None for what is left out; that of others is counted.
+        """
+
+    @abstractmethod
+    def _take(self, series: Series, message: bytes, sample: Any) -> None:
+        """Hand a message to the reception."""
+
+    # In one other thread.
 
     def tick(self) -> None:
-        """Query what is not known yet of new sources. Called often, in one thread."""
+        """Query what is not known yet of new sources. Call it often."""
+        for source in self._reception.sources_now:
+            if source.is_waiting and source.begin_query():
+                self._query(source)
 
-    def query_takes(self, source: Any) -> None:
+    @abstractmethod
+    def _query(self, source: Source) -> None:
+        """Query the parameters and the status of a source, if they are not known."""
+
+    @abstractmethod
+    def query_takes(self, source: Source) -> None:
         """Query which take the gateway of a source records; see Source.running_take."""
 
+    @abstractmethod
     def silence(self) -> str:
         """Return that no gateway is found, or none with these sources; "" if one is. It may take 1 s."""
 
+    @abstractmethod
     def close(self) -> None:
         """Unsubscribe. It may block while a peer does not read."""
 
@@ -134,10 +277,7 @@ class Transport(ABC):
 
     @abstractmethod
     def subscribe(
-        self,
-        sources: Collection[str],
-        components: Collection[str] | None,
-        reception: Reception[Any, Any],
+        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
     ) -> GatewaySubscriber:
         """See GatewayClient. Closing the subscriber closes this connection."""
 

@@ -3,16 +3,24 @@
 import json
 import re
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Final
 from urllib.parse import unquote
 
 import zenoh
 
-from gateway.client.found_sources import FoundSources
-from gateway.client.reception import MAX_SERIES, MAX_XML_BYTES, Reception
-from gateway.client.series import POSE, Series, Source
-from gateway.client.transport import BUSY_CODES, RETRY_S, Query, Replies, Reply, TimeLimits, Transport
+from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
+from gateway.client.transport import (
+    BUSY_CODES,
+    RETRY_S,
+    FoundSources,
+    GatewaySubscriber,
+    Query,
+    Replies,
+    Reply,
+    TimeLimits,
+    Transport,
+)
 from gateway.errors import QueryError
 from gateway.messages.decode import TEXT
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
@@ -22,9 +30,6 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
 _STATUS_S: Final = 2.0
 """How long a gateway may take to reply with its status."""
-
-_NEEDS_NAMES: Final = frozenset({"take"})
-"""Keys that no wildcard selects."""
 
 
 class ZenohTransport(Transport):
@@ -38,7 +43,7 @@ class ZenohTransport(Transport):
     # Finding sources.
 
     def find(self, wanted: str | None) -> FoundSources:
-        """See Transport."""
+        """See Transport. Queries that get an error are repeated."""
         served = self._served()
         found = FoundSources()
         found.absence = self._absence(wanted, served)
@@ -48,7 +53,14 @@ class ZenohTransport(Transport):
         received: set[tuple[str, str]] = set()
         end_s = time.monotonic() + _STATUS_S
         while names:
-            self._query_statuses(wanted or "*", found, received)
+            for reply in self._get(zenoh_key(self._prefix, wanted or "*", "status"), _STATUS_S):
+                if reply.ok is None:
+                    continue
+                name = str(reply.ok.key_expr).removeprefix(f"{self._prefix}/").partition("/")[0]
+                gateway = "" if reply.replier_id is None else str(reply.replier_id.zid)
+                if (name, gateway) not in received:
+                    received.add((name, gateway))
+                    found.add_status(reply.ok.payload.to_bytes(), name, gateway)
             silent = names.difference(name for name, _ in received)
             if not silent or time.monotonic() >= end_s:
                 found.add_silent(sorted(silent))
@@ -68,74 +80,75 @@ class ZenohTransport(Transport):
             served = found
             time.sleep(RETRY_S)
 
-    def _query_statuses(self, source: str, found: FoundSources, received: set[tuple[str, str]]) -> None:
-        """Query every status once. Errors are ignored: the query is repeated."""
-        for reply in self._get(zenoh_key(self._prefix, source, "status"), _STATUS_S):
-            if reply.ok is None:
-                continue
-            name = str(reply.ok.key_expr).removeprefix(f"{self._prefix}/").partition("/")[0]
-            gateway = "" if reply.replier_id is None else str(reply.replier_id.zid)
-            if (name, gateway) not in received:
-                received.add((name, gateway))
-                found.add_status(reply.ok.payload.to_bytes(), name, gateway)
-
     # Queries.
 
     def ask(self, query: Query, source: str | None, timeout_s: float) -> Replies[list[Reply]]:
         """See Transport. It repeats the queries that get no reply, as happens while Zenoh reconnects."""
-        exchange = _Exchange(query.subject, TimeLimits(timeout_s))
+        limits = TimeLimits(timeout_s)
+        replies: Replies[list[Reply]] = Replies([], [])
+        reason: QueryError | None = None
         try:
-            unanswered: Sequence[str] = self._selectors(query, source)
-            while unanswered := self._query_once(unanswered, exchange):
-                self._wait_to_repeat(unanswered, source, exchange)
+            unanswered = self._selectors(query, source)
+            while unanswered:
+                wait_s = max(0.1, limits.left_s)
+                arriving = {selector: self._get(selector, wait_s) for selector in unanswered}
+                unanswered = []
+                for selector, each in arriving.items():
+                    is_answered, problem = self._receive(each, replies, limits.no_reply(query.subject))
+                    if not is_answered:
+                        unanswered.append(selector)
+                        reason = problem or reason
+                if unanswered:
+                    self._wait_to_repeat(unanswered, source, limits, reason)
         except QueryError as error:
-            exchange.problems.append(error)
-        return Replies(exchange.received, exchange.problems)
+            replies.problems.append(error)
+        return replies
 
     def _selectors(self, query: Query, source: str | None) -> list[str]:
-        if source is not None:
-            sources = [source]
-        elif query.key in _NEEDS_NAMES:
+        sources = ["*"] if source is None else [source]
+        if source is None and query.key == "take":  # which no wildcard selects
             sources = self._served()
-            self._require_gateway(None, sources)
-        else:
-            sources = ["*"]
+            if absence := self._absence(None, sources):
+                raise QueryError(absence, code="no-gateway")
         pairs = ";".join(f"{name}={value}" for name, value in query.options.items())
         options = f"?{pairs}" if pairs else ""
         endings = [f"/{section}{options}" for section in query.sections] or [options]
         keys = [zenoh_key(self._prefix, name, query.key) for name in sources]
         return [key + ending for key in keys for ending in endings]
 
-    def _query_once(self, selectors: Sequence[str], exchange: "_Exchange") -> list[str]:
-        """Send queries, and return those without any reply."""
-        timeout_s = max(0.1, exchange.limits.left_s)
-        replies = {selector: self._get(selector, timeout_s) for selector in selectors}
-        return [selector for selector, each in replies.items() if not self._receive(each, exchange)]
-
     def _get(self, selector: str, timeout_s: float) -> zenoh.handlers.Handler[zenoh.Reply]:
         # NONE keeps the replies of all gateways: several may serve sources of the same name.
         return self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s)
 
-    def _receive(self, replies: zenoh.handlers.Handler[zenoh.Reply], exchange: "_Exchange") -> bool:
-        """Take the replies to one query; return whether there was any. A refusal, if busy, is none."""
-        is_answered = False
-        is_late = False
-        for reply in replies:
+    def _receive(
+        self, arriving: zenoh.handlers.Handler[zenoh.Reply], replies: Replies[list[Reply]], late: QueryError
+    ) -> tuple[bool, QueryError | None]:
+        """Take the replies to one query; return whether there was any, and else the reason, if known.
+
+        That is ``late`` if a gateway did not answer in time. A refusal, because the gateway is busy, is no
+        reply.
+        """
+        is_answered = is_late = False
+        reason: QueryError | None = None
+        for reply in arriving:
             if reply.ok is not None:
-                exchange.received.append(self._reply(reply.ok, str(reply.replier_id)))
+                replies.received.append(self._reply(reply.ok, str(reply.replier_id)))
+                is_answered = True
             elif reply.err is not None:
-                if _is_timeout(reply.err):
+                code, text = error_code(reply.err), reply.err.payload.to_bytes().decode("utf-8", "replace")
+                if not code and text == "Timeout":  # from Zenoh: a gateway or a busy router was too slow
                     is_late = True
-                    continue
-                problem = _problem(reply.err)
-                if problem.code in BUSY_CODES:
-                    exchange.no_answer = problem
-                    continue
-                exchange.problems.append(problem)
-            is_answered = True
-        if is_late:
-            exchange.add_late(is_answered=is_answered)
-        return is_answered
+                elif code in BUSY_CODES:
+                    reason = QueryError(text, code=code)
+                else:
+                    problem = (
+                        QueryError(text, code=code) if code else QueryError(f"Zenoh: {text}", code="zenoh")
+                    )
+                    replies.problems.append(problem)
+                    is_answered = True
+        if is_late and is_answered:  # by another gateway
+            replies.problems.append(late)
+        return is_answered, late if is_late else reason
 
     def _reply(self, sample: zenoh.Sample, gateway: str) -> Reply:
         source, _, *sections = str(sample.key_expr).removeprefix(f"{self._prefix}/").split("/")
@@ -144,31 +157,27 @@ class ZenohTransport(Transport):
         name = self._unique_names[source, gateway]
         return Reply(name, tuple(sections), sample.payload.to_bytes(), attached_facts(sample), gateway)
 
-    def _wait_to_repeat(self, unanswered: Sequence[str], source: str | None, exchange: "_Exchange") -> None:
-        """Wait before a query is repeated. Raises QueryError if time is up."""
-        limits = exchange.limits
+    def _wait_to_repeat(
+        self, unanswered: Sequence[str], source: str | None, limits: TimeLimits, reason: QueryError | None
+    ) -> None:
+        """Wait before a query is repeated. Raises QueryError if time is up: ``reason``, if there is one."""
         left_s = limits.left_s
         if left_s == 0 or limits.discovery_is_over:
-            self._require_gateway(source, served_sources(self._session, self._prefix))
+            served = served_sources(self._session, self._prefix)
+            if absence := self._absence(source, served):
+                raise QueryError(absence, code="no-gateway")
         if left_s == 0:
-            raise exchange.no_answer or limits.no_reply(", ".join(unanswered))
+            raise reason or limits.no_reply(", ".join(unanswered))
         time.sleep(min(RETRY_S, left_s))
 
-    def _require_gateway(self, source: str | None, served: Collection[str]) -> None:
-        """Raise QueryError unless ``source`` (None: any) is among those that are ``served``."""
-        if absence := self._absence(source, served):
-            raise QueryError(absence, code="no-gateway")
-
     def _absence(self, source: str | None, served: Collection[str]) -> str:
+        """Return that ``source`` (None: any) is not among those that are ``served``; "" if it is."""
         return no_gateway_on_zenoh(self._prefix, () if source is None else (source,), served)
 
     # Subscribing.
 
     def subscribe(
-        self,
-        sources: Collection[str],
-        components: Collection[str] | None,
-        reception: Reception[Any, Any],
+        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
     ) -> "ZenohGatewaySubscriber":
         """See Transport."""
         return ZenohGatewaySubscriber(self._session, self._prefix, sources, components, reception)
@@ -176,37 +185,6 @@ class ZenohTransport(Transport):
     def close(self) -> None:
         """See Transport."""
         self._session.close()
-
-
-class _Exchange:
-    """What has been received in reply to a query about ``subject``, which may be repeated."""
-
-    def __init__(self, subject: str, limits: TimeLimits) -> None:
-        self.limits = limits
-        self.received: list[Reply] = []
-        self.problems: list[QueryError] = []
-        self.no_answer: QueryError | None = None
-        """Why nobody has answered yet: too many queries, or too little time."""
-        self._subject = subject
-
-    def add_late(self, *, is_answered: bool) -> None:
-        """Note that a gateway did not answer in time; another one may have (``is_answered``)."""
-        late = self.limits.no_reply(self._subject)
-        if is_answered:
-            self.problems.append(late)
-        else:
-            self.no_answer = late
-
-
-def _is_timeout(reply: zenoh.ReplyError) -> bool:
-    """Return whether this is from Zenoh itself, because a gateway or a busy router did not answer in time."""
-    return error_code(reply) == "" and reply.payload.to_bytes() == b"Timeout"
-
-
-def _problem(reply: zenoh.ReplyError) -> QueryError:
-    text = reply.payload.to_bytes().decode("utf-8", "replace")
-    code = error_code(reply)
-    return QueryError(text, code=code) if code else QueryError(f"Zenoh: {text}", code="zenoh")
 
 
 _QUERY_S: Final = 1.0
@@ -219,11 +197,8 @@ _PLAIN_KEYS: Final = {*COMPONENTS_BY_KEY, "status", "clock", "parameters"}
 _INT32: Final = range(-(1 << 31), 1 << 31)
 
 
-class ZenohGatewaySubscriber:
-    """Subscribes on an open session, which ``close`` closes.
-
-    Each subscription calls ``_receive`` in a thread of its own.
-    """
+class ZenohGatewaySubscriber(GatewaySubscriber):
+    """Subscribes on an open session, which ``close`` closes. Each subscription has a thread of its own."""
 
     def __init__(
         self,
@@ -233,54 +208,28 @@ class ZenohGatewaySubscriber:
         components: Collection[str] | None,
         reception: Reception[Any, Any],
     ) -> None:
+        super().__init__(prefix, reception)
         self._session = session
-        self._prefix = prefix
         self._sources = sources
-        self._reception = reception
-        self._series: dict[str, Series | None] = {}  # by key; None: left out
-        for name in self._served():
-            self._source(name)
+        for name in served_sources(session, prefix):
+            if _SOURCE_NAME.fullmatch(name) and (not sources or name in sources):
+                self._source(name)
         # Never **: the gateway would make JSON of everything.
         paths = ["*"] if components is None else [*dict.fromkeys((*components, "status", "parameters"))]
         if components is None or "6d" in components:
             paths.append(f"{POSE}*")
         for source in sources or ("*",):
             for path in paths:
-                session.declare_subscriber(f"{zenoh_key(prefix, source)}/{path}", self._receive)
-
-    def _served(self) -> list[str]:
-        found = served_sources(self._session, self._prefix)
-        return [name for name in found if not self._sources or name in self._sources]
+                session.declare_subscriber(
+                    f"{zenoh_key(prefix, source)}/{path}",
+                    lambda sample: self._receive(str(sample.key_expr), sample.payload.to_bytes(), sample),
+                )
 
     def _source(self, name: str) -> Source | None:
-        if not _SOURCE_NAME.fullmatch(name):
-            return None
         return self._reception.source(name, lcm_channel(DEFAULT_LCM_PREFIX, name), is_known=True)
 
-    # In Zenoh's threads.
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        try:
-            self._sort(sample)
-        except Exception as defect:  # noqa: BLE001 - the other messages are received
-            self._reception.failed(defect)
-
-    def _sort(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        series = self._series.get(key) or self._find_series(key)
-        if series is None:
-            return
-        if series.key == "parameters":
-            self._receive_parameters(series, sample)
-        else:
-            self._reception.receive(series, sample.payload.to_bytes())
-
-    def _find_series(self, key: str) -> Series | None:
-        """Return the series of a key that was not received before; None, counted, if it cannot be."""
-        if key in self._series:
-            self._reception.ignore(beyond_limit=True)
-            return None
-        name, _, path = key.removeprefix(f"{self._prefix}/").partition("/")
+    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:  # noqa: ARG002 - overrides
+        name, _, path = address.removeprefix(f"{self._prefix}/").partition("/")
         if path in _NO_KEYS or is_json_key(path):
             return None
         label = unquote(path.removeprefix(POSE)) if path.startswith(POSE) else None
@@ -289,63 +238,44 @@ class ZenohGatewaySubscriber:
             return None
         source = self._source(name)
         names = (path,) if label is None else ("6d", label)
-        channel = "" if source is None else lcm_channel(source.channels, *names)
-        series = None if source is None else self._reception.series(source, path, channel)
-        if len(self._series) < 2 * MAX_SERIES:
-            self._series[key] = series
-        if series is None:
-            self._reception.ignore(beyond_limit=True)
-        return series
+        return source, path, "" if source is None else lcm_channel(source.channels, *names)
 
-    def _receive_parameters(self, series: Series, sample: zenoh.Sample) -> None:
-        if len(sample.payload) > MAX_XML_BYTES:
+    def _take(self, series: Series, message: bytes, sample: zenoh.Sample) -> None:
+        if series.key != "parameters":
+            self._reception.receive(series, message)
+        elif len(message) > MAX_XML_BYTES:
             self._reception.ignore(beyond_limit=False)
-            return
-        self._reception.receive_parameters(
-            series, self._parameters_message(series.source, sample), is_made=True
-        )
+        else:
+            parameters = self._parameters_message(series.source, sample)
+            self._reception.receive_parameters(series, parameters, is_made=True)
 
     def _parameters_message(self, source: Source, sample: zenoh.Sample) -> bytes:
         facts = attached_facts(sample)
+        age_s = facts.get("age_s")
         return self._reception.parameters_message(
             source,
             sample.payload.to_bytes(),
             _int32(facts.get("session")),
             _int32(facts.get("parameters_version")) or 0,
-            _age_s(facts.get("age_s")),
+            float(age_s) if isinstance(age_s, int | float) and 0 <= age_s < 1e9 else 0.0,
         )
 
-    def _answered_parameters(self, source: Source, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            if len(reply.ok.payload) <= MAX_XML_BYTES:
-                self._reception.answered(source, self._parameters_message(source, reply.ok))
-        elif reply.err is not None and error_code(reply.err) not in {"", *BUSY_CODES}:
-            self._reception.answered(source, None)
-
-    def _answered_status(self, source: Source, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self._reception.answered_status(source, reply.ok.payload.to_bytes())
-
-    # In the thread of the command.
-
-    def tick(self) -> None:
-        """Query the parameters and the status of sources that wait for their description."""
-        for source in self._reception.sources_now:
-            if source.is_waiting and source.begin_query():
-                self._query(source)
-
     def _query(self, source: Source) -> None:
-        key = zenoh_key(self._prefix, source.name)
+        def take_parameters(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                if len(reply.ok.payload) <= MAX_XML_BYTES:
+                    self._reception.answered(source, self._parameters_message(source, reply.ok))
+            elif reply.err is not None and error_code(reply.err) not in {"", *BUSY_CODES}:
+                self._reception.answered(source, None)
+
+        def take_status(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._reception.answered_status(source, reply.ok.payload.to_bytes())
+
         if not source.has_answer:
-            self._session.get(
-                f"{key}/parameters",
-                lambda reply: self._answered_parameters(source, reply),
-                timeout=_QUERY_S,
-            )
+            self._get(source, "parameters", take_parameters)
         if source.status is None:
-            self._session.get(
-                f"{key}/status", lambda reply: self._answered_status(source, reply), timeout=_QUERY_S
-            )
+            self._get(source, "status", take_status)
 
     def query_takes(self, source: Source) -> None:
         """See GatewaySubscriber."""
@@ -354,7 +284,10 @@ class ZenohGatewaySubscriber:
             if reply.ok is not None and len(reply.ok.payload) <= MAX_XML_BYTES:
                 self._reception.answered_takes(source, reply.ok.payload.to_bytes())
 
-        self._session.get(f"{zenoh_key(self._prefix, source.name)}/take", take, timeout=_QUERY_S)
+        self._get(source, "take", take)
+
+    def _get(self, source: Source, key: str, on_reply: Callable[[zenoh.Reply], None]) -> None:
+        self._session.get(zenoh_key(self._prefix, source.name, key), on_reply, timeout=_QUERY_S)
 
     def silence(self) -> str:
         """See GatewaySubscriber."""
@@ -382,7 +315,3 @@ def error_code(reply: zenoh.ReplyError) -> str:
 
 def _int32(value: Any) -> int | None:
     return value if isinstance(value, int) and value in _INT32 else None
-
-
-def _age_s(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) and 0 <= value < 1e9 else 0.0

@@ -10,8 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.client.reception import Reception
-from gateway.client.series import Series, Source
+from gateway.client.reception import Reception, Series, Source
 from gateway.descriptions.labels import Description, EventText, describe, event_text
 from gateway.errors import ParametersError, ProtocolError
 from gateway.messages.decode import decode

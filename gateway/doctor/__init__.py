@@ -6,6 +6,5 @@
 
 - ``source_checks``: one server, from its name to its frames. It connects as the gateway does and listens for
   some seconds: ``observation`` collects what arrives, ``frame_checks`` judges it.
-- ``gateway_checks``: the running gateway, by its own health page.
 - The checks of an output are in its own package (``checks``).
 """

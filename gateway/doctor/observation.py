@@ -48,10 +48,8 @@ class ObservedComponent:
         self._timestamps_us.append(component.timestamp_us)
         message_bytes = ITEMS_OFFSET + component.num_items * component.item_bytes
         self._largest_message_bytes = max(self._largest_message_bytes, message_bytes)
-        if component.type in COMPONENTS_WITH_VISIBILITY:
-            self._count_visible(component)
-
-    def _count_visible(self, component: Component) -> None:
+        if component.type not in COMPONENTS_WITH_VISIBILITY:
+            return
         items = component.items()
         # A NaN in any coordinate means missing (field note 7).
         visible = ~(np.isnan(items["x"]) | np.isnan(items["y"]) | np.isnan(items["z"]))

@@ -2,13 +2,14 @@
 
 import json
 import textwrap
+from collections import Counter
 from typing import Final
 
 from rich.console import Console
 from rich.text import Text
 
 from gateway.logs.safe_text import safe_json, safe_lines
-from gateway.outputs.findings import Finding, Result
+from gateway.outputs.findings import Finding, Result, counted
 
 _MARKS: Final = {
     Result.PASSING: ("ok", "bold green"),
@@ -79,15 +80,14 @@ class Report:
         """
         if self._quiet:
             return
-        counted = [each for each in self.findings if not each.is_of_disabled_output]
-        counts = {result: sum(each.result is result for each in counted) for result in Result}
+        counts = Counter(each.result for each in self.findings if not each.is_of_disabled_output)
         text = (
             f"{counts[Result.PASSING]} ok, {counts[Result.FAILING]} failed, "
             f"{counts[Result.NOT_TESTED]} not tested"
         )
         for result in (Result.WARNING, Result.NOTE):
             if counts[result]:
-                text += f", {counts[result]} {result.value}{'' if counts[result] == 1 else 's'}"
+                text += f", {counted(counts[result], result.value)}"
         passed_style = "bold yellow" if counts[Result.WARNING] else "bold green"
         self._print(Text(text, passed_style if self.is_ok else "bold red"))
 

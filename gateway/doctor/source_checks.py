@@ -2,8 +2,9 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from functools import partial
+from itertools import chain
 from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
@@ -15,7 +16,6 @@ from gateway.doctor.frame_checks import (
     check_receive_buffer,
     check_visibility,
 )
-from gateway.doctor.gateway_checks import HealthReport
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.logs.safe_text import quoted
@@ -47,14 +47,14 @@ _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} 
 class SourceChecks:
     """Runs the checks of one source, once. Create it in a running event loop.
 
-    ``running`` is the health page of the running gateway; None if there is none.
+    ``connected`` are the servers, as HOST:PORT, to which the running gateway is connected.
     """
 
-    def __init__(self, source: SourceSettings, seconds: float, running: HealthReport | None = None) -> None:
+    def __init__(self, source: SourceSettings, seconds: float, connected: Iterable[str] = ()) -> None:
         self._source = source
         self._seconds = seconds
         self._server = f"{source.host}:{source.port}"
-        self._running = running
+        self._connected = connected
         self._addresses: frozenset[str] = frozenset()  # of the source's host, as far as they are known
         self._streams: list[ObservedStream] = []
 
@@ -67,7 +67,12 @@ class SourceChecks:
         """Run the checks in order, yield their findings, and close the connections."""
         for number, check in enumerate((self._check_name, self._check_tcp, self._check_protocol), start=1):
             if check == self._check_tcp and await self._gateway_is_connected():
-                yield self._second_connection()
+                yield self._check(CONNECTION).note(  # field note 21
+                    f"the running gateway is connected to {self._server}; doctor now opens further "
+                    "connections to it",
+                    "Some servers serve one client only, or fail with two. With --no-connect, doctor asks "
+                    "the running gateway instead.",
+                )
             finding = await check()
             if finding.result is Result.FAILING:
                 for each in failing_first(finding, CHECKS[number:]):
@@ -77,9 +82,8 @@ class SourceChecks:
         else:
             yield self._check_parameters()
             await asyncio.sleep(self._seconds)
-            for stream in self._streams:
-                for finding in self._check_stream(stream):
-                    yield finding
+            for finding in chain.from_iterable(map(self._check_stream, self._streams)):
+                yield finding
         await asyncio.gather(*(stream.session.close() for stream in self._streams))
 
     async def run_without_connecting(self) -> AsyncIterator[Finding]:
@@ -104,7 +108,8 @@ class SourceChecks:
 
     async def _gateway_is_connected(self) -> bool:
         """Return whether the running gateway is connected to this server, perhaps by another host name."""
-        hosts = self._running.connected_hosts(self._source.port) if self._running else set()
+        servers = [server.rpartition(":") for server in self._connected]
+        hosts = {host for host, _, port in servers if port == str(self._source.port)}
         if self._source.host in hosts:
             return True
         for host in hosts:
@@ -113,19 +118,10 @@ class SourceChecks:
                     return True
         return False
 
-    def _second_connection(self) -> Finding:
-        """Return a note that says what doctor is about to do (field note 21)."""
-        return self._check(CONNECTION).note(
-            f"the running gateway is connected to {self._server}; doctor now opens further connections to it",
-            "Some servers serve one client only, or fail with two. With --no-connect, doctor asks the "
-            "running gateway instead.",
-        )
-
     @property
     def _parameters(self) -> Parameters | None:
         """The parameters that the first stream with any received."""
-        parsed = next((stream.parsed for stream in self._streams if stream.parsed is not None), None)
-        return None if parsed is None else parsed.parameters
+        return next((stream.parsed.parameters for stream in self._streams if stream.parsed is not None), None)
 
     async def _check_name(self) -> Finding:
         host = self._source.host
@@ -170,11 +166,12 @@ class SourceChecks:
                 return self._protocol_failure(stream, error)
         if self._source.streams == "auto":
             await self._open_further_streams(self._streams[0])
+        check = self._check("protocol")
         limitations = dict.fromkeys(text for stream in self._streams for text in stream.status.limitations)
         if not limitations:
-            return self._check("protocol").passing("the server accepts every command")
-        return self._check("protocol").passing(
-            f"the server is an RT server; the gateway works around this: {'; '.join(limitations)}",
+            return check.passing("the server accepts every command")
+        return check.passing(
+            f"the server is an RT server; the gateway works around this: {'; '.join(limitations)}"
         )
 
     async def _open_further_streams(self, first: ObservedStream) -> None:
@@ -186,54 +183,48 @@ class SourceChecks:
                 await stream.control.start()
             except LinkError as error:
                 await stream.session.close()
-                await first.use_one_connection(
-                    f"the server accepts one connection only ({str(error).partition('; ')[0]})"
-                )
+                reason = str(error).partition("; ")[0]
+                await first.use_one_connection(f"the server accepts one connection only ({reason})")
                 return
             self._streams.append(stream)
 
     def _protocol_failure(self, stream: ObservedStream, error: LinkError) -> Finding:
         if isinstance(error.__cause__, PacketError):
             first_bytes = quoted(error.__cause__.first_bytes.decode("latin-1"), 60)
-            return self._check("protocol").failing(
-                f"the program at {self._server} is not an RT server; its first bytes are {first_bytes}",
-                f"Correct the source's host and port: {_PORTS}.",
+            found = f"the program at {self._server} is not an RT server; its first bytes are {first_bytes}"
+            remedy = f"Correct the source's host and port: {_PORTS}."
+        elif stream.session.is_open and not stream.status.bytes_in:
+            found = f"{self._server} accepts a connection but sends nothing"
+            remedy = (
+                f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT server."
             )
-        if stream.session.is_open and not stream.status.bytes_in:
-            return self._check("protocol").failing(
-                f"{self._server} accepts a connection but sends nothing",
-                f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT server.",
+        elif stream.session.is_open:  # only the refusal of StreamFrames leaves it open
+            found = f"{self._server} refuses every form of the StreamFrames command"
+            remedy = "Enable the real-time output in the server's settings."
+        else:
+            found = str(error)
+            remedy = (
+                f"Check that this is the RT server's port ({_PORTS}) and that the server accepts one more "
+                "client. Close other programs that are connected to it, and read the server's own messages."
             )
-        if stream.session.is_open:  # only the refusal of StreamFrames leaves it open
-            return self._check("protocol").failing(
-                f"{self._server} refuses every form of the StreamFrames command",
-                "Enable the real-time output in the server's settings.",
-            )
-        return self._check("protocol").failing(
-            str(error),
-            f"Check that this is the RT server's port ({_PORTS}) and that the server accepts one more "
-            "client. Close other programs that are connected to it, and read the server's own messages.",
-        )
+        return self._check("protocol").failing(found, remedy)
 
     def _check_parameters(self) -> Finding:
-        first = self._streams[0]
+        first, check = self._streams[0], self._check("parameters")
         if first.parsed is not None:
             parameters = first.parsed.parameters
-            repaired = f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
             found = described_items(parameters, event="event type") or "the server's parameters are empty"
-            found += repaired
+            found += f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
             if source_frame(self._source, parameters).metres_per_unit is None:
                 problem, _, remedy = unknown_unit_text(parameters, "positions in metres").partition("; ")
-                return self._check("parameters").warning(f"{found}; {problem}", as_sentence(remedy))
-            return self._check("parameters").passing(found)
+                return check.warning(f"{found}; {problem}", as_sentence(remedy))
+            return check.passing(found)
         refusals = [text for text in first.status.limitations if "SendParameters" in text]
         if refusals:
-            return self._check("parameters").not_tested(
-                f"{refusals[0]}; names, units and configured rates are unknown"
-            )
+            return check.not_tested(f"{refusals[0]}; names, units and configured rates are unknown")
         prefix = "no parameters: "
         reasons = [text for text in first.status.limitations if text.startswith(prefix)]
-        return self._check("parameters").failing(
+        return check.failing(
             f"the server's XML cannot be read: {reasons[0].removeprefix(prefix)}",
             "The gateway publishes data without names and units. Look for unusual characters in the names of "
             "markers and tools on the server, or update the server's software.",

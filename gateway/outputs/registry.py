@@ -18,7 +18,7 @@ from gateway.outputs.foxglove.settings import FOXGLOVE
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.lsl.settings import LSL
-from gateway.outputs.ros2.kind import ROS2
+from gateway.outputs.ros2.settings import ROS2
 from gateway.outputs.rtc3d.settings import RTC3D
 from gateway.outputs.takes.settings import TAKES
 from gateway.outputs.vrpn.settings import VRPN

@@ -10,18 +10,13 @@ import contextlib
 import logging
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 
 from gateway.config.settings import SourceSettings
-from gateway.errors import (
-    GatewayError,
-    ParametersError,
-    QueryError,
-    ReplyTimeoutError,
-    ServerError,
-)
+from gateway.errors import GatewayError, ParametersError, QueryError, ReplyTimeoutError, ServerError
 from gateway.logs.failures import FailureLog
-from gateway.queries.server_answer import (
+from gateway.queries.answers import (
     QueryHistory,
     Reading,
     Sections,
@@ -30,7 +25,7 @@ from gateway.queries.server_answer import (
     read_parameters,
     unreadable,
 )
-from gateway.queries.server_requests import ServerRequests
+from gateway.queries.server_requests import NOT_ACCEPTED, ServerRequests
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.replies import Connection, XmlThread
@@ -45,14 +40,6 @@ Publishes them, and then marks the frames that follow with the version.
 """
 
 
-@dataclass(frozen=True)
-class _Refusal:
-    """The server's refusal of SendParameters."""
-
-    error: QueryError
-    received_s: float = field(default_factory=now_s)
-
-
 class ParameterCache:
     """The answers to SendParameters.
 
@@ -62,11 +49,7 @@ class ParameterCache:
     """
 
     def __init__(
-        self,
-        settings: SourceSettings,
-        requests: ServerRequests,
-        announce: Announce,
-        history: QueryHistory,
+        self, settings: SourceSettings, requests: ServerRequests, announce: Announce, history: QueryHistory
     ) -> None:
         self._settings = settings
         self._requests = requests
@@ -83,7 +66,7 @@ class ParameterCache:
         # What the server answered about sections that the answer for all of them does not give, or for all
         # of them if that cannot be read. All of this is cleared when a connection begins.
         self._answers: dict[Sections, ServerAnswer] = {}
-        self._refusal: _Refusal | None = None
+        self._refusal: tuple[QueryError, float] | None = None  # the server's of SendParameters, and when
         self._sends_sections = True
         self._problems = FailureLog(logger, settings.name)
 
@@ -116,7 +99,7 @@ class ParameterCache:
             if shared is not None:
                 return await self._share(connection, shared)
         newest = self.newest
-        if newest is not None and self._is_current and self._is_valid(newest, fresh=True):
+        if newest is not None and self._is_current and self._is_valid(newest.received_s, fresh=True):
             return await self._share(connection, newest.parsed)
         self._reading = reading = asyncio.get_running_loop().create_future()
         try:
@@ -153,7 +136,7 @@ class ParameterCache:
         try:
             packet = await connection.ask(command)
         except ServerError as error:
-            self._refusal = _Refusal(self._requests.refused(command, error))
+            self._refusal = self._requests.refused(command, error), now_s()
             await self._invalidate(f"it refuses {command}: {error}")
             raise
         except ReplyTimeoutError as error:
@@ -219,25 +202,21 @@ class ParameterCache:
             await self._announce(None, self.version)
 
     def _log_change(self, reading: Reading, *, is_first: bool) -> None:
+        log, version = self._history.events.log, f"(parameters_version {self.version})"
         if is_first:
             if self.version > 1:
-                text = f"the server gives parameters again (parameters_version {self.version})"
-                self._history.events.log(logging.INFO, text, "given again")
+                log(logging.INFO, f"the server gives parameters again {version}", "given again")
             return
         if reading.renamed:
-            self._history.events.log(
+            log(
                 logging.WARNING,
                 f"markers or tools were renamed on the server: {reading.renamed}; programs that use the "
-                f"names need the new ones (parameters_version {self.version})",
+                f"names need the new ones {version}",
                 "renamed",
             )
         if reading.changed_sections:
             sections = ", ".join(reading.changed_sections)
-            self._history.events.log(
-                logging.INFO,
-                f"the server's parameters changed: {sections} (parameters_version {self.version})",
-                "changed",
-            )
+            log(logging.INFO, f"the server's parameters changed: {sections} {version}", "changed")
 
     # While connections are open.
 
@@ -261,7 +240,9 @@ class ParameterCache:
         Raises QueryError.
         """
         if not self._requests.is_connected:
-            stale = await self._stale(sections) if stale_ok else None
+            stale = self.newest if stale_ok else None
+            if stale is not None and sections:
+                stale = await stale.part(sections, self._xml_thread) or self._answers.get(sections)
             if stale is None:
                 raise self._requests.no_connection_error()
             return stale
@@ -269,45 +250,37 @@ class ParameterCache:
             return await self._get(sections, fresh=fresh)
         except QueryError as error:
             is_void = self.newest is None and self.version > 0
-            if is_void and error.code in {"refused", "timeout"}:
+            if is_void and error.code in NOT_ACCEPTED:
                 text = f"{error}; the parameters of its earlier connections are void"
                 raise QueryError(text, code=error.code) from error
             raise
 
-    async def _stale(self, sections: Sections) -> ServerAnswer | None:
-        newest = self.newest
-        if newest is None or not sections:
-            return newest
-        return await newest.part(sections, self._xml_thread) or self._answers.get(sections)
-
     async def _get(self, sections: Sections, *, fresh: bool) -> ServerAnswer:
-        everything = await self._get_all(fresh=fresh)
+        kept = (self.newest if self._is_current else None, self._answers.get(()))
+        valid = (each for each in kept if each is not None and self._is_valid(each.received_s, fresh=fresh))
+        everything = next(valid, None)
+        if everything is None:
+            if self._refusal is not None and self._is_valid(self._refusal[1], fresh=fresh):
+                raise self._refusal[0]
+            everything = await self._request_all(self._any_connection())
         part = await everything.part(sections, self._xml_thread) if sections else everything
         if part is not None:
             return part
         # The answer for all sections lacks these, or is not well-formed. So the server has to be asked.
         answer = self._answers.get(sections)
-        if answer is not None and self._is_valid(answer, fresh=fresh):
+        if answer is not None and self._is_valid(answer.received_s, fresh=fresh):
             return answer
         return await self._requests.share(
-            ("parameters", sections), lambda: self._request_sections(sections, everything)
+            ("parameters", sections), partial(self._request_sections, sections, everything)
         )
-
-    async def _get_all(self, *, fresh: bool) -> ServerAnswer:
-        for answer in (self.newest if self._is_current else None, self._answers.get(())):
-            if answer is not None and self._is_valid(answer, fresh=fresh):
-                return answer
-        if self._refusal is not None and self._is_valid(self._refusal, fresh=fresh):
-            raise self._refusal.error
-        return await self._request_all(self._any_connection())
 
     @property
     def _is_current(self) -> bool:
         """Whether the newest parameters are those of a server that is still connected."""
         return any(connection.is_open for connection in self._connections)
 
-    def _is_valid(self, answer: ServerAnswer | _Refusal, *, fresh: bool) -> bool:
-        return not fresh or now_s() - answer.received_s < self._settings.fresh_interval_s
+    def _is_valid(self, received_s: float, *, fresh: bool) -> bool:
+        return not fresh or now_s() - received_s < self._settings.fresh_interval_s
 
     # Requests to the server.
 
@@ -319,17 +292,17 @@ class ParameterCache:
         return next((connection for connection in self._connections if connection in ready), ready[0])
 
     async def _request_all(self, connection: Connection) -> ServerAnswer:
-        return await self._requests.share(("parameters", ()), lambda: self._send_request(connection))
+        return await self._requests.share(("parameters", ()), partial(self._send_request, connection))
 
     async def _send_request(self, connection: Connection) -> ServerAnswer:
         self._silent = [each for each in self._silent if each is not connection]
         try:
-            _, packet = await self._requests.send(SendParameters(), connection=connection)
+            packet = await self._requests.send(SendParameters(), connection=connection)
         except QueryError as error:
             if error.code == "refused":
-                self._refusal = _Refusal(error)
+                self._refusal = error, now_s()
                 self._refusing = connection
-            if error.code in {"refused", "timeout"}:
+            if error.code in NOT_ACCEPTED:
                 self._report_problem(connection, error)
             raise
         version = self.version
@@ -357,30 +330,24 @@ class ParameterCache:
 
     async def _request_sections(self, sections: Sections, everything: ServerAnswer) -> ServerAnswer:
         """Request some sections; if the server does not send single ones, return ``everything``."""
-        if not self._sends_sections:
-            answer = replace(everything, sections=sections)
-        else:
+        answer = replace(everything, sections=sections)
+        if self._sends_sections:
+            command, connection = SendParameters(sections), self._any_connection()
             try:
-                _, packet = await self._requests.send(
-                    SendParameters(sections), connection=self._any_connection()
-                )
+                xml = (await self._requests.send(command, connection=connection)).body
             except QueryError as error:
-                if error.code not in {"refused", "timeout"}:
+                if error.code not in NOT_ACCEPTED:
                     raise
                 self._sends_sections = False
-                answer = replace(everything, sections=sections)
             else:
-                answer = await self._parse(sections, packet.body)
+                session, version = self._requests.session, self.version
+                try:
+                    parsed = await self._xml_thread.process(xml, parse_parameters)
+                except ParametersError as error:
+                    return self._keep_unreadable(sections, xml, error)
+                answer = ServerAnswer(sections, xml, parsed, session, version)
         self._answers[sections] = answer
         return answer
-
-    async def _parse(self, sections: Sections, xml: bytes) -> ServerAnswer:
-        session, version = self._requests.session, self.version
-        try:
-            parsed = await self._xml_thread.process(xml, parse_parameters)
-        except ParametersError as error:
-            return self._keep_unreadable(sections, xml, error)
-        return ServerAnswer(sections, xml, parsed, session, version)
 
     def _keep_unreadable(self, sections: Sections, xml: bytes, error: ParametersError) -> ServerAnswer:
         session, version = self._requests.session, self.version

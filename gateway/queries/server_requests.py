@@ -5,13 +5,14 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Hashable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Hashable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import CommandError, GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
 from gateway.logs.failures import DefectLog
-from gateway.queries.server_answer import QueryHistory
+from gateway.queries.answers import QueryHistory
 from gateway.rtc3d.commands import Command, ControlRecording, recording_duration_s, recording_options
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
@@ -72,21 +73,21 @@ class ServerRequests:
 
     async def send(
         self, command: Command, *, fallback: Command | None = None, connection: Connection | None = None
-    ) -> tuple[Command, Packet]:
-        """Send a command, and ``fallback`` if the server refuses or ignores it; return the one answered.
+    ) -> Packet:
+        """Send a command, and ``fallback`` if the server refuses or ignores it; return the server's reply.
 
-        The second value is the server's reply. Without ``connection`` any one is used. Raises QueryError, at
-        the latest after query_timeout_s, which includes the wait for earlier requests.
+        Without ``connection`` any one is used. Raises QueryError, at the latest after query_timeout_s, which
+        includes the wait for earlier requests.
         """
         name, timeout_s = f"source {self._settings.name!r}", self._settings.query_timeout_s
         try:
             async with RunningTimeout(timeout_s), self._lock:
                 try:
-                    return command, await self._send(command, connection)
+                    return await self._send(command, connection)
                 except QueryError:
                     if fallback is None:
                         raise
-                return fallback, await self._send(fallback, connection)
+                return await self._send(fallback, connection)
         except LinkError as error:
             raise QueryError(f"{name} has just lost its connection: {error}", code="no-connection") from error
         except TimeoutError:
@@ -119,16 +120,11 @@ class ServerRequests:
 
     async def share(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
         """Return the result of ``work``; callers with an equal ``key`` at the same time share one run."""
-        return await asyncio.shield(self.start(key, work))
-
-    def start(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> asyncio.Task[_Result]:
-        """Start ``work`` unless it runs for an equal ``key`` already; return its task."""
         task = self._pending.get(key)
         if task is None:
-            task = asyncio.create_task(work())
-            task.add_done_callback(lambda done: self._finish(key, done))
-            self._pending[key] = task
-        return task
+            task = self._pending[key] = asyncio.create_task(work())
+            task.add_done_callback(partial(self._finish, key))
+        return await asyncio.shield(task)
 
     def _finish(self, key: Hashable, task: asyncio.Task[Any]) -> None:
         del self._pending[key]
@@ -152,10 +148,7 @@ class ParameterRefresh:
     """
 
     def __init__(
-        self,
-        settings: SourceSettings,
-        read: Callable[[], Awaitable[None]],
-        last_read_s: Callable[[], float],
+        self, settings: SourceSettings, read: Callable[[], Awaitable[None]], last_read_s: Callable[[], float]
     ) -> None:
         self._defects = DefectLog(logger, settings.name)
         self._interval_s = settings.parameters_interval_s or math.inf
@@ -179,7 +172,10 @@ class ParameterRefresh:
         started_s = loop.time()
         while True:
             due_s = self._due_s(started_s)
-            await self._wait_until(due_s)
+            self._requested.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout_at(None if due_s == math.inf else due_s):
+                    await self._requested.wait()
             if self._due_s(started_s) > due_s or self._requested.is_set():
                 continue  # Somebody else has asked the server, or asks for an earlier time.
             started_s = loop.time()
@@ -199,13 +195,6 @@ class ParameterRefresh:
         requested_due_s = max(self._requested_s + self._delay_s, self._last_requested_reading_s + self._gap_s)
         return min(due_s, requested_due_s)
 
-    async def _wait_until(self, due_s: float) -> None:
-        """Wait until it is time, or until a request."""
-        self._requested.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout_at(None if due_s == math.inf else due_s):
-                await self._requested.wait()
-
 
 class RecordingAccess(NamedTuple):
     """What starts and stops recordings of one source (True starts).
@@ -218,7 +207,8 @@ class RecordingAccess(NamedTuple):
     follow: Callable[[bool, str], Awaitable[Mapping[str, Any]]]
 
 
-_NOT_ACCEPTED: Final = {"refused", "timeout"}
+NOT_ACCEPTED: Final = frozenset({"refused", "timeout"})
+"""The codes of errors after which the server may accept something else."""
 
 _MAX_OPTIONS_CHARS: Final = 500
 """Enough for the longest path of Windows and some options."""
@@ -242,11 +232,7 @@ class Recordings:
     """
 
     def __init__(
-        self,
-        source: str,
-        requests: ServerRequests,
-        access: RecordingAccess,
-        history: QueryHistory,
+        self, source: str, requests: ServerRequests, access: RecordingAccess, history: QueryHistory
     ) -> None:
         self._source = source
         self._requests = requests
@@ -261,24 +247,31 @@ class Recordings:
         The options are sent unchanged.
         """
         sent = _start_options(name, options)
-        async with self._lock:
-            self._check_connected()
-            self._forget_duration()
+        async with self._begun():
             return await self._start(sent, needs_command=bool(options))
 
     async def stop(self) -> Done:
         """Stop the recording. Raises QueryError."""
-        async with self._lock:
-            self._check_connected()
-            self._forget_duration()
-            reply = (
-                await self._ask(ControlRecording(start=False)) if self._history.is_named_recording else None
-            )
+        async with self._begun():
+            reply = None
+            if self._history.is_named_recording:
+                reply = await self._ask(ControlRecording(start=False))
             if reply is None:
                 self._send(start=False)
             self._history.is_named_recording = False
             content = {"source": self._source, "sent": "stop", **await self._access.follow(False, "")}
             return content, reply or ""
+
+    @contextlib.asynccontextmanager
+    async def _begun(self) -> AsyncIterator[None]:
+        """Have the former recording's duration forgotten, and let one command be carried out at a time."""
+        async with self._lock:
+            if not self._requests.is_connected:
+                raise self._requests.no_connection_error()
+            if self._history.end_of_recording is not None:
+                self._history.end_of_recording.cancel()
+                self._history.end_of_recording = None
+            yield
 
     async def _start(self, options: str, *, needs_command: bool) -> Done:
         name = recording_options(options).get("file", "")
@@ -297,7 +290,11 @@ class Recordings:
             raise
         if reply is not None:
             name = recording_options(reply).get("file") or name  # the server may use another one
-            self._limit_following(options)
+            with contextlib.suppress(CommandError):  # the server may know more units
+                duration_s = recording_duration_s(options)
+                if duration_s is not None:
+                    end = self._end_following(duration_s + _FOLLOW_S)
+                    self._history.end_of_recording = asyncio.create_task(end)
         named = {"name": name, "is_named": self._history.is_named_recording} if name else {}
         return {"source": self._source, "sent": "start", **named, **await following}, reply or ""
 
@@ -309,11 +306,11 @@ class Recordings:
         Raises QueryError if the server ``must`` accept it.
         """
         try:
-            _, packet = await self._requests.send(command)
+            packet = await self._requests.send(command)
         except QueryError as error:
             # A command without an answer may have been carried out. If so, a command has to stop it.
             self._history.is_named_recording = self._history.is_named_recording or error.code == "timeout"
-            if must or error.code not in _NOT_ACCEPTED:
+            if must or error.code not in NOT_ACCEPTED:
                 raise
             return None
         return decode_text(packet.body)[:_MAX_REPLY_CHARS] or f"OK-{command}"
@@ -322,27 +319,10 @@ class Recordings:
         if not self._access.send_packet(start):
             raise self._requests.no_connection_error()
 
-    def _check_connected(self) -> None:
-        if not self._requests.is_connected:
-            raise self._requests.no_connection_error()
-
-    def _limit_following(self, options: str) -> None:
-        """Let the outputs follow the recording no longer than its duration, if it has one."""
-        with contextlib.suppress(CommandError):  # the server may know more units
-            duration_s = recording_duration_s(options)
-            if duration_s is not None:
-                self._history.end_of_recording = asyncio.create_task(
-                    self._end_following(duration_s + _FOLLOW_S)
-                )
-
     async def _end_following(self, after_s: float) -> None:
+        """Let the outputs follow the recording no longer than its duration."""
         await asyncio.sleep(after_s)
         await self._access.follow(False, "")
-
-    def _forget_duration(self) -> None:
-        if self._history.end_of_recording is not None:
-            self._history.end_of_recording.cancel()
-            self._history.end_of_recording = None
 
 
 def _start_options(name: str, options: str) -> str:

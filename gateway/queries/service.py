@@ -4,7 +4,7 @@ The server gets one request at a time, and equal questions at the same time shar
 """
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from gateway.messages.encode import NOT_PUBLISHED, Stamp, encode_message
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
-from gateway.queries.answers import JsonPayload, NewestJson, message_answer, schema_answer
+from gateway.queries.answers import JsonPayload, NewestJson, QueryHistory, message_answer, schema_answer
 from gateway.queries.parameter_cache import Announce, ParameterCache
 from gateway.queries.questions import (
     RECORDING,
@@ -28,7 +28,6 @@ from gateway.queries.questions import (
     parse_question,
     parse_questions,
 )
-from gateway.queries.server_answer import QueryHistory
 from gateway.queries.server_requests import RecordingAccess, Recordings, ServerRequests, StreamAccess
 from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
@@ -89,11 +88,6 @@ class SourceQueries:
     def session(self) -> int:
         """A number that grows with every connection of any stream."""
         return self._requests.session
-
-    @property
-    def parameters_version(self) -> int:
-        """The version of the server's parameters; 0 before the first."""
-        return self._requests.parameters_version
 
     @property
     def frame(self) -> CoordinateFrame:
@@ -181,7 +175,7 @@ class SourceQueries:
             )
             utime = now_utime()
             message = encode_message(
-                current, Stamp(utime, utime, session, self.parameters_version), NOT_PUBLISHED
+                current, Stamp(utime, utime, session, self._requests.parameters_version), NOT_PUBLISHED
             )
         return self._message_answer(message, question, output)
 
@@ -201,7 +195,7 @@ class SourceQueries:
 
         If the server does not accept the component's name, request the whole frame (field note 2).
         """
-        _, packet = await self._requests.send(
+        packet = await self._requests.send(
             SendCurrentFrame((component,)), fallback=SendCurrentFrame(), connection=stream.connection
         )
         if packet.type == PacketType.NO_DATA:
@@ -210,10 +204,10 @@ class SourceQueries:
             frame = split_frame(packet.body, detect_byte_order(packet.body, self.settings.byte_order))
         except FrameError as error:
             raise QueryError(f"the current frame cannot be read: {error}", code="unreadable") from error
-        for found in frame.components:
-            if found.type is component:
-                return found
-        raise QueryError(f"the current frame has no {component.key}", code="nothing-yet")
+        found = next((each for each in frame.components if each.type is component), None)
+        if found is None:
+            raise QueryError(f"the current frame has no {component.key}", code="nothing-yet")
+        return found
 
     async def _recording(self, question: Question) -> Answer:
         if not question.set:
@@ -268,14 +262,17 @@ class SourceQueryService:
         """See QueryService."""
         queries = self._sources()[source]
         name = "/".join(path)
-        command = self._commands().get(name)
-        if command is None:
-            _check_no_output_is_off(name)
-        answer = (
-            partial(queries.answer, parse_question(path, options, queries.components), self._output)
-            if command is None
-            else partial(command, source, options)
-        )
+        answer: Callable[[], Awaitable[Answer]]
+        if (command := self._commands().get(name)) is not None:
+            answer = partial(command, source, options)
+        elif off := [kind.name for kind in OUTPUTS.values() if name in kind.commands]:
+            raise QueryError(
+                f"the output {off[0]} is off; to use {name}, set {off[0]}.enabled: true in the gateway's "
+                "configuration",
+                code="disabled",
+            )
+        else:
+            answer = partial(queries.answer, parse_question(path, options, queries.components), self._output)
         if CONTROL_OPTION in options:
             queries.check_control()
         return await answer()
@@ -290,16 +287,15 @@ class SourceQueryService:
             *(queries.answer(question, self._output) for question in questions.values()),
             return_exceptions=True,
         )
-        answers: dict[KeyPath, Answer] = {}
-        errors: list[QueryError] = []
-        for path, result in zip(questions, results, strict=True):
-            match result:
-                case Answer():
-                    answers[path] = result
-                case QueryError():
-                    errors.append(result)
-                case _:
-                    raise result
+        errors = [result for result in results if isinstance(result, BaseException)]
+        for error in errors:
+            if not isinstance(error, QueryError):
+                raise error
+        answers = {
+            path: result
+            for path, result in zip(questions, results, strict=True)
+            if not isinstance(result, BaseException)
+        }
         if errors and not answers:
             raise errors[0]
         return answers
@@ -312,14 +308,3 @@ class SourceQueryService:
             () if ordered == tuple(SECTIONS) else ordered, fresh=fresh, stale_ok=False
         )
         return ServerParameters(cached.xml, cached.session, cached.version, cached.age_s)
-
-
-def _check_no_output_is_off(command: str) -> None:
-    """Raise QueryError if this is the command of an output that is not enabled."""
-    for kind in OUTPUTS.values():
-        if command in kind.commands:
-            raise QueryError(
-                f"the output {kind.name} is off; to use {command}, set {kind.name}.enabled: true in the "
-                "gateway's configuration",
-                code="disabled",
-            )

@@ -20,8 +20,7 @@ from gateway.messages.texts import encode_within_limits
 from gateway.outputs.contract import Answer, Output, ServerFile, ServerParameters
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
-from gateway.queries.answers import FilePayload
-from gateway.queries.server_answer import QueryHistory, ServerAnswer
+from gateway.queries.answers import FilePayload, QueryHistory, ServerAnswer
 from gateway.queries.server_requests import ParameterRefresh, RecordingAccess, StreamAccess
 from gateway.queries.service import SourceQueries
 from gateway.rtc3d.components import only_components

@@ -10,8 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.client.reception import Reception
-from gateway.client.series import Series, Source
+from gateway.client.reception import Reception, Series, Source
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.outputs.parameters_message import published_again

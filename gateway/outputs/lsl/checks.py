@@ -57,7 +57,15 @@ def check_lsl(
     finally:
         output.close()
     names = {(stream["computer"], stream["name"]) for stream in streams}
-    return [opens, _found(names), _gateway(names, sources)]
+    others = {computer for computer, _ in names} - {socket.gethostname()}
+    also = f", and streams of {len(others)} other computers" if others else ""
+    found = _FOUND.passing(f"another program on this computer finds a stream{also}")
+    if (socket.gethostname(), f"{_TEST_SOURCE}_event") not in names:
+        found = _FOUND.failing(
+            "another program on this computer does not find a stream",
+            "Allow UDP port 16571 and the ports from 16572 in the firewall, and see docs/how-to/lsl.md.",
+        )
+    return [opens, found, _gateway(names, sources)]
 
 
 def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]:
@@ -87,19 +95,7 @@ def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]
 
 
 def _not_open(problem: str) -> list[Finding]:
-    failing = _OPENS.problem(problem, "Correct lsl in the configuration.")
-    return failing_first(failing, LSL.checks[1:])
-
-
-def _found(names: set[tuple[str, str]]) -> Finding:
-    others = {computer for computer, _ in names} - {socket.gethostname()}
-    if (socket.gethostname(), f"{_TEST_SOURCE}_event") in names:
-        also = f", and streams of {len(others)} other computers" if others else ""
-        return _FOUND.passing(f"another program on this computer finds a stream{also}")
-    return _FOUND.failing(
-        "another program on this computer does not find a stream",
-        "Allow UDP port 16571 and the ports from 16572 in the firewall, and see docs/how-to/lsl.md.",
-    )
+    return failing_first(_OPENS.problem(problem, "Correct lsl in the configuration."), LSL.checks[1:])
 
 
 def _gateway(names: set[tuple[str, str]], sources: Sequence[str]) -> Finding:

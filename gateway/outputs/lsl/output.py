@@ -81,8 +81,9 @@ class LslOutput(FrameOutput):
         return publisher
 
     def _forget(self, publisher: "LslFramePublisher") -> None:
-        if self._publishers.get(publisher.source) is publisher:
-            del self._publishers[publisher.source]
+        source = publisher.streams.source
+        if self._publishers.get(source) is publisher:
+            del self._publishers[source]
         self._submit(publisher.streams.close)
 
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
@@ -139,11 +140,9 @@ class LslOutput(FrameOutput):
     # In the thread that sends.
 
     def _restart(self) -> None:
-        self._processes.restart(self._reopen)
-
-    def _reopen(self) -> None:
-        for publisher in list(self._publishers.values()):
-            publisher.streams.reopen()
+        if self._processes.restart():
+            for publisher in list(self._publishers.values()):
+                publisher.streams.reopen()
 
     def _start_sending(self) -> None:
         with self._lock:
@@ -222,7 +221,7 @@ class LslFramePublisher:
             raise OutputError(f"LSL: {self._processes.problem}", cause="not open")
         captured = CapturedFrame(frame, stamp, components, self._times.steady_us(stamp))
         with self._lock:
-            if self._is_full:
+            if len(self._waiting) >= MAX_WAITING or self._num_bytes > MAX_WAITING_BYTES:
                 raise OutputError(
                     "the process for LSL does not take frames fast enough; this computer is too busy",
                     cause="queue full",
@@ -235,10 +234,6 @@ class LslFramePublisher:
             self._num_items.clear()
             self._append(functools.partial(self.streams.set_parameters, parameters), 0)
         self.on_change()
-
-    @property
-    def _is_full(self) -> bool:
-        return len(self._waiting) >= MAX_WAITING or self._num_bytes > MAX_WAITING_BYTES
 
     def _append(self, entry: CapturedFrame | Callable[[], None], num_bytes: int) -> None:
         if not self._waiting:
@@ -271,11 +266,6 @@ class LslFramePublisher:
         if not self._is_closed:
             self._is_closed = True
             self._forget(self)
-
-    @property
-    def source(self) -> str:
-        """The name of the source."""
-        return self.streams.source
 
 
 # Times --------------------------------------------------------------------------------------

@@ -104,11 +104,6 @@ def decode_samples(content: bytes) -> tuple[npt.NDArray[np.float64], npt.NDArray
     return times, values.reshape(count, -1)
 
 
-def json_content(value: Any) -> bytes:
-    """Return the content of TEXTS."""
-    return json.dumps(value).encode()
-
-
 def opening_content(facts: Mapping[str, Any], tree: Sequence[Any]) -> bytes:
     """Return the content of OPEN."""
     return f"[{json.dumps(facts)}, [{', '.join(map(_tree_json, tree))}]]".encode()
@@ -175,7 +170,11 @@ class _LslProcess:
         self._report = Report()
         self._reported_s = 0.0
         self._closed: queue.SimpleQueue[list[Any]] = queue.SimpleQueue()
-        self._offset_s = _lsl_minus_monotonic_s(pylsl)
+        # LSL's clock minus the monotonic one. In liblsl for Linux, both are the same clock.
+        offset_us = clock_difference_us(
+            lambda: round(pylsl.local_clock() * 1e6), lambda: time.monotonic_ns() // 1000
+        )
+        self._offset_s = 0.0 if abs(offset_us) < _SAME_CLOCK_US else offset_us / 1e6
         threading.Thread(target=self._destroy_closed, daemon=True).start()
 
     def run(self) -> None:
@@ -191,7 +190,12 @@ class _LslProcess:
                     self._handle(message)
             if time.monotonic() >= next_poll_s:
                 next_poll_s = time.monotonic() + _POLL_S
-                self._poll()
+                if self._failed:
+                    self._open_failed()
+                outlets = self._outlets.items()
+                self._change(wanted=tuple(number for number, outlet in outlets if outlet.have_consumers()))
+                if time.monotonic() - self._reported_s >= REPORT_INTERVAL_S:
+                    self._send(self._report)
 
     def _handle(self, message: Message) -> None:
         number = message.stream
@@ -220,36 +224,22 @@ class _LslProcess:
         if time.monotonic() < self._retry_s:
             return
         self._retry_s = time.monotonic() + _RETRY_S
-        problem = ""
+        problem, pylsl = "", self._pylsl
         for number, description in list(self._failed.items()):
             try:
-                self._outlets[number] = self._outlet(description)
+                info = pylsl.StreamInfo(
+                    *(description["name"], description["type"]),
+                    *(description["num_channels"], description["rate_hz"]),
+                    pylsl.cf_string if description["is_text"] else pylsl.cf_float32,
+                    description["source_id"],
+                )
+                _append(info.desc(), description["tree"])
+                self._outlets[number] = pylsl.StreamOutlet(info, 0, description["buffer_s"])
             except Exception as error:  # noqa: BLE001 - of any kind, from liblsl
                 problem = f"{description['name']}: {safe_text(str(error), 200)}"
             else:
                 del self._failed[number]
         self._change(not_opened=problem)
-
-    def _outlet(self, description: dict[str, Any]) -> Any:
-        pylsl = self._pylsl
-        info = pylsl.StreamInfo(
-            description["name"],
-            description["type"],
-            description["num_channels"],
-            description["rate_hz"],
-            pylsl.cf_string if description["is_text"] else pylsl.cf_float32,
-            description["source_id"],
-        )
-        _append(info.desc(), description["tree"])
-        return pylsl.StreamOutlet(info, 0, description["buffer_s"])
-
-    def _poll(self) -> None:
-        if self._failed:
-            self._open_failed()
-        wanted = tuple(number for number, outlet in self._outlets.items() if outlet.have_consumers())
-        self._change(wanted=wanted)
-        if time.monotonic() - self._reported_s >= REPORT_INTERVAL_S:
-            self._send(self._report)
 
     def _change(self, **fields: Any) -> None:
         report = self._report._replace(**fields)
@@ -275,14 +265,6 @@ def _append(element: Any, children: Any) -> None:
             _append(element.append_child(name), content)
 
 
-def _lsl_minus_monotonic_s(pylsl: Any) -> float:
-    """Return LSL's clock minus the monotonic one. In liblsl for Linux, both are the same clock."""
-    difference_us = clock_difference_us(
-        lambda: round(pylsl.local_clock() * 1e6), lambda: time.monotonic_ns() // 1000
-    )
-    return 0.0 if abs(difference_us) < _SAME_CLOCK_US else difference_us / 1e6
-
-
 def _limit(kind: int, most: int) -> None:
     hard = resource.getrlimit(kind)[1]
     limit = most if hard == resource.RLIM_INFINITY else min(most, hard)
@@ -290,31 +272,21 @@ def _limit(kind: int, most: int) -> None:
         resource.setrlimit(kind, (limit, limit))
 
 
-def _limit_stacks() -> None:
-    """Have new threads use _STACK_BYTES, which count as memory of the process. Not every C library can."""
-    libc = ctypes.CDLL(None)
-    attributes = ctypes.create_string_buffer(256)  # glibc needs 56
-    with contextlib.suppress(AttributeError):
-        libc.pthread_attr_init(attributes)
-        libc.pthread_attr_setstacksize(attributes, ctypes.c_size_t(_STACK_BYTES))
-        libc.pthread_setattr_default_np(attributes)
-
-
-def _end_with_gateway() -> None:
-    """Have the kernel kill this process, even if it hangs, when the thread that started it ends."""
-    libc = ctypes.CDLL(None)
-    with contextlib.suppress(AttributeError):  # only Linux has it
-        libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
-
-
 def _serve() -> None:
     """Run until the gateway closes the socket. Only that ends the process, not a signal to the service."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_gateway()
+    libc = ctypes.CDLL(None)
+    with contextlib.suppress(AttributeError):  # only Linux has it
+        # The kernel kills this process, even if it hangs, when the thread that started it ends.
+        libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
     _limit(resource.RLIMIT_DATA, MAX_MEMORY_BYTES)
     _limit(resource.RLIMIT_NOFILE, MAX_FILES)
-    _limit_stacks()
+    attributes = ctypes.create_string_buffer(256)  # glibc needs 56
+    with contextlib.suppress(AttributeError):  # not every C library can limit the stacks of new threads
+        libc.pthread_attr_init(attributes)
+        libc.pthread_attr_setstacksize(attributes, ctypes.c_size_t(_STACK_BYTES))
+        libc.pthread_setattr_default_np(attributes)
     gateway = socket.socket(fileno=0)
     try:
         import pylsl  # noqa: PLC0415 - it can fail, and the gateway is told why

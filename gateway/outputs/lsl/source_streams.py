@@ -4,9 +4,11 @@ Everything here is called in the thread that sends, except where it says otherwi
 """
 
 import itertools
+import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,22 +20,19 @@ from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import MAX_FLOAT, NO_ROTATION, CoordinateFrame, product
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.lsl.process import Kind, Message, json_content, opening_content, samples_content
+from gateway.outputs.lsl.process import Kind, Message, opening_content, samples_content
 from gateway.outputs.lsl.streams import (
+    CHANNELS_PER_ITEM,
     MAX_CHANNELS,
     DescribedSource,
     LslStream,
     changed_labels,
-    channels_per_item,
     lsl_stream,
     num_labels,
 )
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
-
-Values = npt.NDArray[np.float32]
-"""Shape (frames, items, channels per item)."""
 
 Numbers = npt.NDArray[np.float64]
 
@@ -48,16 +47,17 @@ def samples(
     """
     num_frames, present = items.shape[:2]
     with np.errstate(all="ignore"):  # a server may send any values
-        values = _VALUES[component](items.astype(np.float64), frame)
+        values = items.astype(np.float64)
+        if component is ComponentType.MARKERS:
+            values[..., :3] = frame.points(values[..., :3].reshape(-1, 3)).reshape(*values.shape[:2], 3)
+            values[~_is_in_range(values[..., :3])] = np.nan
+        elif component is ComponentType.TOOLS:
+            values = _tools(values, frame)
+        elif component is ComponentType.FORCE:
+            values = frame.vectors(values.reshape(-1, 3)).reshape(values.shape)
         result = np.full((num_frames, num_items, values.shape[2]), np.nan, np.float32)
         result[:, :present] = values
     return result.reshape(num_frames, -1)
-
-
-def _markers(items: Numbers, frame: CoordinateFrame) -> Numbers:
-    items[..., :3] = frame.points(items[..., :3].reshape(-1, 3)).reshape(*items.shape[:2], 3)
-    items[~_is_in_range(items[..., :3])] = np.nan
-    return items
 
 
 def _tools(items: Numbers, frame: CoordinateFrame) -> Numbers:
@@ -77,25 +77,9 @@ def _tools(items: Numbers, frame: CoordinateFrame) -> Numbers:
     return result
 
 
-def _analog(items: Numbers, _frame: CoordinateFrame) -> Numbers:
-    return items
-
-
-def _force(items: Numbers, frame: CoordinateFrame) -> Numbers:
-    return frame.vectors(items.reshape(-1, 3)).reshape(items.shape)
-
-
 def _is_in_range(values: Numbers) -> npt.NDArray[np.bool_]:
     """Return which items have only numbers that a 32-bit float can hold; comparisons with NaN are false."""
     return np.asarray((abs(values) <= MAX_FLOAT).all(axis=-1))
-
-
-_VALUES: Final[Mapping[ComponentType, Callable[[Numbers, CoordinateFrame], Numbers]]] = {
-    ComponentType.MARKERS: _markers,
-    ComponentType.TOOLS: _tools,
-    ComponentType.ANALOG: _analog,
-    ComponentType.FORCE: _force,
-}
 
 
 MIN_LIFE_S: Final = 1.0
@@ -130,18 +114,19 @@ class CapturedFrame(NamedTuple):
     captured_us: int
 
 
+@dataclass
 class _OpenStream:
     """An open stream: its number, and how many items its channels are for, by which parameters."""
 
-    def __init__(self, number: int, stream: LslStream, num_items: int, version: int) -> None:
-        self.number = number
-        self.stream = stream
-        self.num_items = num_items
-        self.version = version
+    number: int
+    stream: LslStream
+    num_items: int
+    version: int
 
     def opening(self, buffer_s: int) -> Message:
         """Return the message that opens it."""
         stream = self.stream
+        bytes_per_s = 4 * len(stream.channels) * (stream.rate_hz or _IRREGULAR_SAMPLES)
         facts = {
             "name": stream.name,
             "type": stream.type,
@@ -149,7 +134,7 @@ class _OpenStream:
             "is_text": stream.is_text,
             "source_id": stream.source_id,
             "num_channels": len(stream.channels),
-            "buffer_s": _limited_buffer_s(stream, buffer_s),
+            "buffer_s": max(1, min(buffer_s, int(MAX_BUFFER_BYTES / bytes_per_s))),
         }
         return Message(Kind.OPEN, self.number, opening_content(facts, stream.tree))
 
@@ -163,12 +148,7 @@ class SourceStreams:
     """
 
     def __init__(
-        self,
-        name: str,
-        computer: str,
-        buffer_s: int,
-        numbers: Iterator[int],
-        send: Callable[[Message], bool],
+        self, name: str, computer: str, buffer_s: int, numbers: Iterator[int], send: Callable[[Message], bool]
     ) -> None:
         self.source = name
         self.numbers: Mapping[ComponentType, int] = {}
@@ -300,12 +280,12 @@ class SourceStreams:
             self._send(Message(Kind.CLOSE, closed.number))
 
     def _is_refused(self, component: ComponentType, num_items: int) -> bool:
-        is_too_large = num_items * channels_per_item(component) > MAX_CHANNELS
+        is_too_large = num_items * CHANNELS_PER_ITEM[component] > MAX_CHANNELS
         return is_too_large or (component in _POSITIONS and self._described.frame.metres_per_unit is None)
 
     def _count_refused(self, component: ComponentType, num_items: int, num_frames: int) -> None:
         """Count frames whose component can have no stream."""
-        num_channels = num_items * channels_per_item(component)
+        num_channels = num_items * CHANNELS_PER_ITEM[component]
         if num_channels > MAX_CHANNELS:
             self._count_loss(
                 "too many channels",
@@ -344,19 +324,19 @@ class SourceStreams:
         for captured in frames:
             component_us, timestamp_us = _time_us(captured, index, suspended_us)
             for item in captured.frame.component(index).items():
-                texts.append(_event_marker(self._described.parameters, item))
-                times_s.append((component_us + _event_delay_us(item, timestamp_us)) / 1e6)
-        message = Message(Kind.TEXTS, stream.number, json_content((times_s, texts)))
+                text = event_text(self._described.parameters, item)
+                texts.append(printable(f"{text.label}: {text.description}" if text.values else text.label))
+                # An event may have happened later than its component, or earlier (field note 6).
+                has_time = "timestamp" in item.dtype.names
+                delay_us = int(item["timestamp"]) - timestamp_us if has_time else 0
+                is_plausible = abs(delay_us) <= MAX_EVENT_AGE_US
+                times_s.append((component_us + (delay_us if is_plausible else 0)) / 1e6)
+        message = Message(Kind.TEXTS, stream.number, json.dumps((times_s, texts)).encode())
         if texts and not self._send(message):
             self._count_loss("not open", NOT_OPEN, len(frames))
 
     def _count_loss(self, cause: str, text: str, num_frames: int) -> None:
         self.losses.lost(cause, text, messages=num_frames, frames=num_frames)
-
-
-def _limited_buffer_s(stream: LslStream, buffer_s: int) -> int:
-    bytes_per_s = 4 * len(stream.channels) * (stream.rate_hz or _IRREGULAR_SAMPLES)
-    return max(1, min(buffer_s, int(MAX_BUFFER_BYTES / bytes_per_s)))
 
 
 def _time_us(captured: CapturedFrame, index: int, suspended_us: int) -> tuple[int, int]:
@@ -368,16 +348,3 @@ def _time_us(captured: CapturedFrame, index: int, suspended_us: int) -> tuple[in
         apart_us = timestamp_us - frame.number_and_timestamp[1]
         captured_us += apart_us if abs(apart_us) <= _MAX_APART_US else 0
     return captured_us, timestamp_us
-
-
-def _event_delay_us(item: Any, timestamp_us: int) -> int:
-    """Return how much later than its component an event happened (field note 6); it may be negative."""
-    if "timestamp" not in item.dtype.names:
-        return 0
-    delay_us = int(item["timestamp"]) - timestamp_us
-    return delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else 0
-
-
-def _event_marker(parameters: Parameters, item: Any) -> str:
-    text = event_text(parameters, item)
-    return printable(f"{text.label}: {text.description}" if text.values else text.label)

@@ -6,12 +6,12 @@ The structure follows the meta-data recommendations of XDF, the file format of L
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from gateway.descriptions.labels import Description, describe, fitting_labels, printable
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 
 Tree = tuple[str, "str | tuple[Tree, ...]"]
@@ -34,7 +34,6 @@ Otherwise they take small gaps for jitter and space the samples evenly, which sh
 each gap. (https://github.com/sccn/xdf/wiki/Synchronization)
 """
 
-_XYZ: Final = ("X", "Y", "Z")
 _EMG: Final = re.compile(r"\bEMG", re.IGNORECASE)
 
 
@@ -89,14 +88,6 @@ class DescribedSource(NamedTuple):
     frame: CoordinateFrame
 
 
-class _Content(NamedTuple):
-    """The type of a component's streams, and its channels and the things that they belong to."""
-
-    type: str
-    channels: tuple[Channel, ...]
-    items: tuple[Tree, ...] = ()
-
-
 def num_labels(component: ComponentType, parameters: Parameters) -> int | None:
     """Return how many items of a component the parameters describe; None if they lack its section."""
     items = _described_items(component, parameters)
@@ -126,82 +117,53 @@ def _labels(description: Description, component: ComponentType) -> tuple[str, ..
     return fitting_labels(description.labels, printable, _MAX_LABEL_BYTES, noun)
 
 
-def channels_per_item(component: ComponentType) -> int:
-    """Return how many channels one item of a component has."""
-    return _CHANNELS_PER_ITEM[component]
-
-
 def lsl_stream(source: DescribedSource, component: ComponentType, num_items: int) -> LslStream:
     """Return the description of the stream of a component with ``num_items`` items."""
     description = describe(component, source.parameters, num_items)
-    content = _CONTENTS[component](_labels(description, component), description)
-    rate_hz = _announced_rate_hz(description.rate_hz, len(content.channels))
-    setup: tuple[Tree, ...] = (("name", source.name), *content.items)
+    labels = _labels(description, component)
+    channels = _channels(component, labels, description)
+    rate_hz = description.rate_hz
+    if rate_hz is None or not 0 < rate_hz <= min(MAX_RATE_HZ, MAX_VALUES_PER_S / max(len(channels), 1)):
+        rate_hz = 0.0
+    setup: list[Tree] = [("name", source.name)]
     if component not in {ComponentType.ANALOG, ComponentType.EVENT}:
-        setup = (("name", source.name), _frame_tree(source.frame), *content.items)
-    facts = repr((content.channels, setup)).encode()
-    digest = hashlib.blake2b(facts, digest_size=4).hexdigest()
+        setup.append(_frame_tree(source.frame))
+    if component is ComponentType.MARKERS:
+        setup.append(("markers", tuple(("marker", (("label", label),)) for label in labels)))
+    elif component in _OBJECTS:
+        kind = ("class", _OBJECTS[component])
+        setup.append(("objects", tuple(("object", (kind, ("label", label))) for label in labels)))
+    is_emg = bool(channels) and all(channel.type == "EMG" for channel in channels)
+    digest = hashlib.blake2b(repr((channels, tuple(setup))).encode(), digest_size=4).hexdigest()
     return LslStream(
         name=f"{source.name}_{component.key}",
-        type=content.type,
+        type="EMG" if is_emg else _TYPES[component],
         rate_hz=rate_hz,
         is_text=component is ComponentType.EVENT,
         source_id=f"rtc3d-gateway/{source.computer}/{source.name}/{component.key}/{digest}",
-        channels=content.channels,
-        setup=setup,
+        channels=channels,
+        setup=tuple(setup),
         acquisition=_acquisition(source.parameters),
     )
 
 
-def _announced_rate_hz(rate_hz: float | None, num_channels: int) -> float:
-    if rate_hz is None or not 0 < rate_hz <= min(MAX_RATE_HZ, MAX_VALUES_PER_S / max(num_channels, 1)):
-        return 0.0
-    return rate_hz
-
-
-def _markers(labels: tuple[str, ...], _description: Description) -> _Content:
+def _channels(
+    component: ComponentType, labels: tuple[str, ...], description: Description
+) -> tuple[Channel, ...]:
+    if component is ComponentType.EVENT:
+        return (Channel("event", "Marker", ""),)
+    if component is ComponentType.ANALOG:
+        types = ["EMG" if _EMG.search(label) else "Analog" for label in labels]
+        return tuple(map(Channel, labels, types, map(_short, description.units)))
     channels = []
-    for label in labels:
-        channels += [Channel(f"{label}_{axis}", f"Position{axis}", _METRES, label) for axis in _XYZ]
-        channels.append(Channel(f"{label}_reliability", "Reliability", "", label))
-    markers = tuple(("marker", (("label", label),)) for label in labels)
-    return _Content("MoCap", tuple(channels), (("markers", markers),))
-
-
-def _tools(labels: tuple[str, ...], _description: Description) -> _Content:
-    channels = []
-    for label in labels:
-        channels += [Channel(f"{label}_{axis}", f"Position{axis}", _METRES, "", label) for axis in _XYZ]
-        # XDF calls the parts of a quaternion A to D, with the scalar first.
-        for part, letter in (("X", "B"), ("Y", "C"), ("Z", "D"), ("W", "A")):
-            channels.append(Channel(f"{label}_quat_{part}", f"Orientation{letter}", "quaternion", "", label))
-        channels.append(Channel(f"{label}_error", "Error", _METRES, "", label))
-    objects = tuple(("object", (("class", "Rigid"), ("label", label))) for label in labels)
-    return _Content("MoCap", tuple(channels), (("objects", objects),))
-
-
-def _analog(labels: tuple[str, ...], description: Description) -> _Content:
-    channels = tuple(
-        Channel(label, "EMG" if _EMG.search(label) else "Analog", printable(unit)[:_MAX_LABEL_BYTES])
-        for label, unit in zip(labels, description.units, strict=True)
-    )
-    is_emg = bool(channels) and all(channel.type == "EMG" for channel in channels)
-    return _Content("EMG" if is_emg else "Analog", channels)
-
-
-def _plates(labels: tuple[str, ...], description: Description) -> _Content:
-    channels = []
-    moment_unit = printable(description.moment_unit)[:_MAX_LABEL_BYTES]
-    for label, unit in zip(labels, description.units, strict=True):
-        force_unit = printable(unit)[:_MAX_LABEL_BYTES]
-        channels += [Channel(f"{label}_F{axis}", f"Force{axis}", force_unit, "", label) for axis in _XYZ]
-        channels += [Channel(f"{label}_M{axis}", f"Moment{axis}", moment_unit, "", label) for axis in _XYZ]
-    objects = tuple(("object", (("class", "ForcePlate"), ("label", label))) for label in labels)
-    return _Content("Force", tuple(channels), (("objects", objects),))
-
-
-def _events(_labels: tuple[str, ...], _description: Description) -> _Content:
-    return _Content("Markers", (Channel("event", "Marker", ""),))
+    for index, label in enumerate(labels):
+        owner = (label, "") if component is ComponentType.MARKERS else ("", label)
+        for suffix, kind, unit in _ITEM_CHANNELS[component]:
+            if component is ComponentType.FORCE:
+                is_moment = kind.startswith("Moment")
+                unit = _short(description.moment_unit if is_moment else description.units[index])  # noqa: PLW2901
+            channels.append(Channel(f"{label}_{suffix}", kind, unit, *owner))
+    return tuple(channels)
 
 
 def _frame_tree(frame: CoordinateFrame) -> Tree:
@@ -227,7 +189,11 @@ def _acquisition(parameters: Parameters) -> tuple[Tree, ...]:
         ("protocol", "RTC3D"),
         ("time_stamps", "capture time of the server's frames"),
     )
-    return tuple((name, printable(text)[:_MAX_LABEL_BYTES]) for name, text in facts if text)
+    return tuple((name, _short(text)) for name, text in facts if text)
+
+
+def _short(text: str) -> str:
+    return printable(text)[:_MAX_LABEL_BYTES]
 
 
 _LISTS: Final[Mapping[ComponentType, str]] = {
@@ -239,17 +205,37 @@ _LISTS: Final[Mapping[ComponentType, str]] = {
 }
 """The lists of items in the sections of the parameters."""
 
-_CONTENTS: Final[Mapping[ComponentType, Callable[[tuple[str, ...], Description], _Content]]] = {
-    ComponentType.MARKERS: _markers,
-    ComponentType.TOOLS: _tools,
-    ComponentType.ANALOG: _analog,
-    ComponentType.FORCE: _plates,
-    ComponentType.EVENT: _events,
+_TYPES: Final[Mapping[ComponentType, str]] = {
+    ComponentType.MARKERS: "MoCap",
+    ComponentType.TOOLS: "MoCap",
+    ComponentType.ANALOG: "Analog",
+    ComponentType.FORCE: "Force",
+    ComponentType.EVENT: "Markers",
 }
-_CHANNELS_PER_ITEM: Final[Mapping[ComponentType, int]] = {
-    ComponentType.MARKERS: 4,
-    ComponentType.TOOLS: 8,
-    ComponentType.ANALOG: 1,
-    ComponentType.FORCE: 6,
-    ComponentType.EVENT: 1,
+_OBJECTS: Final[Mapping[ComponentType, str]] = {
+    ComponentType.TOOLS: "Rigid",
+    ComponentType.FORCE: "ForcePlate",
+}
+"""The classes of objects in XDF."""
+
+_POSITION: Final = tuple((axis, f"Position{axis}", _METRES) for axis in "XYZ")
+_ITEM_CHANNELS: Final[Mapping[ComponentType, tuple[tuple[str, str, str], ...]]] = {
+    ComponentType.MARKERS: (*_POSITION, ("reliability", "Reliability", "")),
+    ComponentType.TOOLS: (
+        *_POSITION,
+        # XDF calls the parts of a quaternion A to D, with the scalar first.
+        *(
+            (f"quat_{part}", f"Orientation{letter}", "quaternion")
+            for part, letter in ("XB", "YC", "ZD", "WA")
+        ),
+        ("error", "Error", _METRES),
+    ),
+    ComponentType.FORCE: tuple(
+        (f"{kind[0]}{axis}", f"{kind}{axis}", "") for kind in ("Force", "Moment") for axis in "XYZ"
+    ),
+}
+"""The channels of one item: what their labels end with, their types, and their units, if these are fixed."""
+
+CHANNELS_PER_ITEM: Final[Mapping[ComponentType, int]] = {
+    component: len(_ITEM_CHANNELS.get(component, ("",))) for component in WIRE_ORDER
 }

@@ -79,10 +79,10 @@ class LslProcesses:
         """Whether ``restart`` should be called, because there is no process."""
         return self._socket is None and not self._is_stopped and time.monotonic() >= self._retry_s
 
-    def restart(self, reopen: Callable[[], None]) -> None:
-        """Start a process if there is none; ``reopen`` sends it the streams."""
+    def restart(self) -> bool:
+        """Start a process if there is none; return whether there is a new one, which has no streams yet."""
         if not self.is_due:
-            return
+            return False
         self._report = Report()
         self._started_s = time.monotonic()
         self._retry_s = self._started_s + self._retry_delay_s
@@ -90,7 +90,7 @@ class LslProcesses:
             ours, self._process = _start_process(self._settings)
         except OSError as error:
             self._failed(f"the process for LSL cannot be started: {error.strerror}")
-            return
+            return False
         ours.settimeout(SILENCE_S)
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
         self._socket = ours
@@ -98,7 +98,7 @@ class LslProcesses:
             target=self._read_reports, args=(ours, self._process), name="lsl-reports", daemon=True
         )
         thread_starts.start(reader)
-        reopen()
+        return True
 
     def send(self, message: Message) -> bool:
         """Send one message; return False if there is no process. The next process gets all streams."""
@@ -109,7 +109,8 @@ class LslProcesses:
             ours.sendall(message.encode())
         except OSError:
             # A part of the message may have been sent, so the connection is of no use any more.
-            self._kill()
+            if self._process is not None:
+                self._process.kill()
             return False
         return True
 
@@ -130,10 +131,6 @@ class LslProcesses:
                 self._process.wait()
         if ours is not None:
             ours.close()
-
-    def _kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
 
     def _read_reports(self, ours: socket.socket, process: subprocess.Popen[bytes]) -> None:
         """Read what the process reports until it ends, in a thread of its own."""

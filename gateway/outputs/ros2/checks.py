@@ -10,18 +10,16 @@ from gateway.descriptions.labels import printable
 from gateway.outputs.findings import Check, Finding, MessageLoad, as_sentence, failing_first
 from gateway.outputs.ros2.messages import NO_HASH, ROS_TYPES
 from gateway.outputs.ros2.output import REMEDY, client_config
-from gateway.outputs.ros2.settings import Ros2Settings
+from gateway.outputs.ros2.settings import ROS2, Ros2Settings
 from gateway.outputs.ros2.topic import NODE_NAME, SeenEntity, full_name, seen_entity, tokens_of
 from gateway.outputs.zenoh.checks import is_local
 from gateway.outputs.zenoh.config import zenoh_reason
-
-CHECKS: Final = ("router", "gateway", "nodes", "types")
 
 _MAX_NAMED: Final = 8
 _MAX_SHOWN_CHARS: Final = 100
 _MAX_TOKENS: Final = 100_000
 
-_ROUTER, _GATEWAY, _NODES, _TYPES = (Check("ros2", name) for name in CHECKS)
+_ROUTER, _GATEWAY, _NODES, _TYPES = (Check("ros2", name) for name in ROS2.checks)
 
 
 def check_ros2(
@@ -36,7 +34,7 @@ def check_ros2(
         session = zenoh.open(config)
     except zenoh.ZError as error:
         found = f"no Zenoh router at {settings.connect}: {zenoh_reason(error)}"
-        return failing_first(_ROUTER.failing(found, as_sentence(REMEDY)), CHECKS[1:])
+        return failing_first(_ROUTER.failing(found, as_sentence(REMEDY)), ROS2.checks[1:])
     try:
         replies = session.liveliness().get(tokens_of(settings.domain_id), timeout=seconds)
         first = itertools.islice(replies, _MAX_TOKENS)
@@ -46,28 +44,27 @@ def check_ros2(
     seen = [each for each in map(seen_entity, tokens) if each is not None]
     names = sorted({each.node for each in seen if not each.topic})
     reached = _ROUTER.passing(f"connected to the router at {settings.connect}")
-    return [reached, _gateway(names, settings), _nodes(names, settings), _types(seen, settings)]
+    own, domain = full_name(settings.namespace, NODE_NAME), f"domain {settings.domain_id}"
+    is_visible = _GATEWAY.not_tested(f"the node {own} is not in {domain} now")
+    if own in names:
+        is_visible = _GATEWAY.passing(f"the node {own} is visible in {domain}")
+    return [
+        reached,
+        is_visible,
+        _nodes([name for name in names if name != own], domain),
+        _types(seen, settings),
+    ]
 
 
-def _gateway(names: Sequence[str], settings: Ros2Settings) -> Finding:
-    name = full_name(settings.namespace, NODE_NAME)
-    if name in names:
-        return _GATEWAY.passing(f"the node {name} is visible in domain {settings.domain_id}")
-    return _GATEWAY.not_tested(f"the node {name} is not in domain {settings.domain_id} now")
-
-
-def _nodes(names: Sequence[str], settings: Ros2Settings) -> Finding:
-    others = [name for name in names if name != full_name(settings.namespace, NODE_NAME)]
+def _nodes(others: Sequence[str], domain: str) -> Finding:
     if not others:
         return _NODES.note(
-            f"no ROS node is visible in domain {settings.domain_id}",
+            f"no ROS node is visible in {domain}",
             "If nodes are running, check that RMW_IMPLEMENTATION is rmw_zenoh_cpp, that ROS_DOMAIN_ID is "
-            f"{settings.domain_id}, and that they use this router.",
+            f"{domain.removeprefix('domain ')}, and that they use this router.",
         )
-    shown = ", ".join(map(_shown, others[:_MAX_NAMED])) + (
-        f" and {len(others) - _MAX_NAMED} more" if len(others) > _MAX_NAMED else ""
-    )
-    return _NODES.passing(f"visible in domain {settings.domain_id}: {shown}")
+    more = f" and {len(others) - _MAX_NAMED} more" if len(others) > _MAX_NAMED else ""
+    return _NODES.passing(f"visible in {domain}: {', '.join(map(_shown, others[:_MAX_NAMED]))}{more}")
 
 
 def _types(seen: Sequence[SeenEntity], settings: Ros2Settings) -> Finding:

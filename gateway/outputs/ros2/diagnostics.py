@@ -155,10 +155,8 @@ def _stream(name: str, server: str, stream: StreamReport, lost: Mapping[str, int
 
 
 def _output(name: str, server: str, output: OutputReport, lost: Mapping[str, int]) -> DiagnosticStatus:
-    values = {
-        **{f"sent {component}": str(number) for component, number in output.messages.items()},
-        **_causes(output.losses),
-    }
+    values = {f"sent {component}": str(number) for component, number in output.messages.items()}
+    values |= _causes(output.losses)
     level, message = ERROR, output.problem
     if output.is_connected:
         num_lost = _num_lost(output.losses)

@@ -27,11 +27,6 @@ _UINT32_STRUCT: Final = struct.Struct("<I")
 _STAMP: Final = struct.Struct("<iI")
 
 
-def padding(offset: int, alignment: int) -> bytes:
-    """Return the zeros that align a value which would be at ``offset``."""
-    return bytes(-offset % alignment)
-
-
 def stamp(utime: int) -> bytes:
     """Return a builtin_interfaces/Time for a time in µs since the Unix epoch, moved into its range."""
     seconds, microseconds = divmod(utime, 1_000_000)
@@ -63,7 +58,7 @@ class CdrWriter:
 
     def align(self, alignment: int) -> Self:
         """Append zeros until the next value is aligned."""
-        return self.raw(padding(self._offset, alignment))
+        return self.raw(bytes(-self._offset % alignment))
 
     def uint8(self, *values: int) -> Self:
         """Append numbers of one byte; a bool is one of them."""
@@ -113,20 +108,17 @@ class RosType(NamedTuple):
 
 
 POSE_STAMPED: Final = RosType(
-    "geometry_msgs/msg/PoseStamped",
-    "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    "geometry_msgs/msg/PoseStamped", "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
 )
 WRENCH_STAMPED: Final = RosType(
     "geometry_msgs/msg/WrenchStamped",
     "RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
 )
 TF_MESSAGE: Final = RosType(
-    "tf2_msgs/msg/TFMessage",
-    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 )
 POINT_CLOUD: Final = RosType(
-    "sensor_msgs/msg/PointCloud2",
-    "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+    "sensor_msgs/msg/PointCloud2", "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
 )
 FLOAT_ARRAY: Final = RosType(
     "std_msgs/msg/Float32MultiArray",
@@ -137,14 +129,7 @@ DIAGNOSTIC_ARRAY: Final = RosType(
     "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
 )
 
-ROS_TYPES: Final = (
-    POSE_STAMPED,
-    WRENCH_STAMPED,
-    TF_MESSAGE,
-    POINT_CLOUD,
-    FLOAT_ARRAY,
-    DIAGNOSTIC_ARRAY,
-)
+ROS_TYPES: Final = (POSE_STAMPED, WRENCH_STAMPED, TF_MESSAGE, POINT_CLOUD, FLOAT_ARRAY, DIAGNOSTIC_ARRAY)
 """All of them."""
 
 
@@ -159,19 +144,11 @@ pack_pose: Final = struct.Struct("<7d").pack
 pack_wrench: Final = struct.Struct("<6d").pack
 """Encodes a geometry_msgs/Wrench: force x, y, z in N, and torque x, y, z in Nm."""
 
-_FLOAT32: Final = 7
-_UINT32: Final = 6
-
 POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reliability", "<f4"), ("marker", "<u4")])
 """One point of a cloud: position, the server's reliability, and the marker's index."""
 
-_POINT_TYPES: Final = {
-    "x": _FLOAT32,
-    "y": _FLOAT32,
-    "z": _FLOAT32,
-    "reliability": _FLOAT32,
-    "marker": _UINT32,
-}
+_POINT_DATATYPES: Final = {"f": 7, "u": 6}
+"""By the kind of numbers: FLOAT32 and UINT32 of sensor_msgs/PointField."""
 
 MAX_LABEL_BYTES: Final = 16 * 1024
 """Longer labels of channels are left out, because they are in every message."""
@@ -217,12 +194,12 @@ class CloudEncoder:
     def __init__(self, frame_id: str, num_markers: int) -> None:
         self._points = np.zeros(num_markers, POINT)
         self._points["marker"] = np.arange(num_markers)
-        self._floats = self._points.view("<f4").reshape(num_markers, len(_POINT_TYPES))  # the same memory
+        assert POINT.fields is not None  # noqa: S101 - for mypy: it has names
+        self._floats = self._points.view("<f4").reshape(num_markers, len(POINT.fields))  # the same memory
         writer = CdrWriter(_STAMP_BYTES).string(frame_id).uint32(1, num_markers)  # height, width
-        writer.uint32(len(_POINT_TYPES))
-        for name, datatype in _POINT_TYPES.items():
-            assert POINT.fields is not None  # noqa: S101 - for mypy: it has names
-            writer.string(name).uint32(POINT.fields[name][1]).uint8(datatype).uint32(1)
+        writer.uint32(len(POINT.fields))
+        for name, (dtype, offset, *_) in POINT.fields.items():
+            writer.string(name).uint32(offset).uint8(_POINT_DATATYPES[dtype.kind]).uint32(1)
         is_big_endian = 0
         writer.uint8(is_big_endian).uint32(POINT.itemsize, self._points.nbytes, self._points.nbytes)
         self._layout = writer.content

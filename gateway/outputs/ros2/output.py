@@ -14,14 +14,8 @@ import zenoh
 
 from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic, unique_name
-from gateway.outputs.contract import (
-    FramePublisher,
-    IgnoringPublisher,
-    Output,
-    OutputHealth,
-    Publisher,
-    ServerParameters,
-)
+from gateway.outputs.contract import FramePublisher, OutputHealth, Publisher, ServerParameters
+from gateway.outputs.frame_output import FrameOutput
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
 from gateway.outputs.ros2.messages import DIAGNOSTIC_ARRAY, TF_MESSAGE
 from gateway.outputs.ros2.settings import MAX_PART_CHARS, Ros2Settings, ros_name
@@ -44,18 +38,13 @@ than the 60 s without a sign of life after which Zenoh gives a connection to rmw
 
 def client_config(endpoint: str) -> zenoh.Config:
     """Return the configuration of a client of one router, which it does not search by multicast."""
+    queue = {"congestion_control": {"drop": {"wait_before_drop": _WAIT_BEFORE_DROP_US}}}
     return zenoh_config(
         {
             "mode": "client",
             "connect": {"endpoints": [endpoint]},
             "scouting": {"multicast": {"enabled": False}},
-            "transport": {
-                "link": {
-                    "tx": {
-                        "queue": {"congestion_control": {"drop": {"wait_before_drop": _WAIT_BEFORE_DROP_US}}}
-                    }
-                }
-            },
+            "transport": {"link": {"tx": {"queue": queue}}},
         }
     )
 
@@ -81,14 +70,14 @@ _HUNG_S: Final = 2.0
 """A router that takes no message for this long does not read. Its connection counts as up for up to 60 s."""
 
 
-class Ros2Output(Output):
+class Ros2Output(FrameOutput):
     """Publishes for ROS 2 in the wire format of rmw_zenoh."""
 
     name = "ros2"
     drop_causes = ("not open", "no router", "queue full", "put failed", "unknown unit")
 
     def __init__(self, settings: Ros2Settings) -> None:
-        self.settings = settings
+        self.settings: Ros2Settings = settings
         self._router = router_session(settings.connect, self._declare_in_thread)
         self._sender: WorkerThread | None = None  # from start to close
         self._tf = RosTopic("/tf", TF_MESSAGE, self._on_tf_wanted)
@@ -147,28 +136,21 @@ class Ros2Output(Output):
 
     def frame_publisher(self, source: str) -> FramePublisher:
         """Return the publisher of a source's frames. Its topics appear with the parameters or the frames."""
-        name = self._ros_name(source)
-        base = f"/{self.settings.namespace}/{name}" if self.settings.namespace else f"/{name}"
-        self._sources[source] = publisher = RosSource(source, base, self._tf, self._router, self)
-        self.submit(functools.partial(self._declare_source, publisher))
-        return publisher
-
-    def _declare_source(self, source: RosSource) -> None:
-        if self._node is not None:
-            source.declare(self._node)
-
-    def _ros_name(self, source: str) -> str:
         if source not in self._names:
             name = unique_name(ros_name(source, "source"), set(self._names.values()), MAX_PART_CHARS)
             self._names[source] = name
-        return self._names[source]
+        name = self._names[source]
+        base = f"/{self.settings.namespace}/{name}" if self.settings.namespace else f"/{name}"
+        self._sources[source] = publisher = RosSource(source, base, self._tf, self._router, self)
+        self.submit(lambda: None if self._node is None else publisher.declare(self._node))
+        return publisher
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return the publisher of diagnostics for the status; other topics have nothing for ROS."""
         if topic.path == _STATUS:
             names = functools.partial(self.topic_names, topic.source)
             return DiagnosticsPublisher(self._diagnostics, names, self._router, self)
-        return IgnoringPublisher()
+        return super().publisher(topic)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Open the topics that belong to the parameters."""
@@ -183,11 +165,11 @@ class Ros2Output(Output):
     def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
         """Return the parts of topics for tools and force plates whose labels differ from them."""
         publisher = self._sources.get(source)
-        return {} if publisher is None else publisher.topics.names
+        return {} if publisher is None else publisher.names
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` the positions and items that cannot be published."""
-        self._sources[source].topics.losses = losses
+        self._sources[source].losses = losses
 
     def withdraw(self, source: str) -> None:
         """Forget the source; its FramePublisher is closed."""
@@ -216,10 +198,8 @@ class Ros2Output(Output):
         silent_s = 0.0 if self._sender is None else self._sender.call_age_s
         if silent_s < _HUNG_S:
             return self._router.health
-        problem = (
-            f"the Zenoh router at {self.settings.connect} has read nothing for {silent_s:.0f} s; restart it"
-        )
-        return OutputHealth(False, problem)
+        router = f"the Zenoh router at {self.settings.connect}"
+        return OutputHealth(False, f"{router} has read nothing for {silent_s:.0f} s; restart it")
 
     def maintain(self) -> None:
         """Log whether the router is connected, and check for subscribers."""
@@ -227,10 +207,6 @@ class Ros2Output(Output):
         if not self._is_checking and not self._router.is_cut_off:
             self._is_checking = True
             self.submit(self._check_subscribers)
-
-    def is_configured_like(self, other: Output) -> bool:
-        """Return whether the settings are the same."""
-        return isinstance(other, Ros2Output) and self.settings == other.settings
 
     def close(self) -> None:
         """Close the session. The node and its topics disappear from ROS."""
@@ -245,6 +221,6 @@ class Ros2Output(Output):
     def _undeclare_all(self) -> None:
         """Remove all topics, in the sending thread."""
         for source in list(self._sources.values()):
-            source.topics.undeclare()
+            source.undeclare()
         for topic in (self._tf, self._diagnostics):
             topic.undeclare()

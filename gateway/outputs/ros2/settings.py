@@ -1,4 +1,4 @@
-"""The section ``ros2`` of the configuration.
+"""The section ``ros2`` of the configuration, and the output in the registry.
 
 A topic consists of parts between slashes: ASCII letters, digits and single underscores, without a digit or an
 underscore at the beginning. (A part with a leading underscore is hidden from ``ros2 topic list``.)
@@ -15,6 +15,7 @@ from gateway.config.section import expects
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
 from gateway.messages.topics import unique_name
+from gateway.outputs.kind import OutputKind, imported_late
 
 _MAX_LABEL_CHARS: Final = 48
 MAX_PART_CHARS: Final = 63
@@ -76,7 +77,6 @@ def _endpoint(text: str) -> str:
     return text
 
 
-DomainId = Annotated[int, Field(strict=True, ge=0, le=232), expects("a whole number from 0 to 232")]
 Namespace = Annotated[
     str,
     AfterValidator(_namespace),
@@ -92,12 +92,9 @@ Distribution = Annotated[
     Literal["humble", "jazzy", "kilted", "lyrical", "rolling"],
     expects("humble, jazzy, kilted, lyrical or rolling; for a later one rolling"),
 ]
-Reliability = Annotated[Literal["best_effort", "reliable"], expects("best_effort or reliable")]
 Durability = Annotated[
-    Literal["volatile"],
-    expects("volatile; transient_local would keep old poses for nodes that start later"),
+    Literal["volatile"], expects("volatile; transient_local would keep old poses for nodes that start later")
 ]
-Depth = Annotated[int, Field(strict=True, ge=1, le=10_000), expects("a whole number from 1 to 10000")]
 
 
 class Ros2Settings(OutputSettings):
@@ -106,7 +103,7 @@ class Ros2Settings(OutputSettings):
     enabled: Switch = False
     """Whether to publish for ROS 2, as a node does that uses rmw_zenoh."""
 
-    domain_id: DomainId = 0
+    domain_id: Annotated[int, Field(strict=True, ge=0, le=232), expects("a whole number from 0 to 232")] = 0
     """The domain: ROS_DOMAIN_ID of the computers with ROS."""
 
     namespace: Namespace = "mocap"
@@ -118,11 +115,23 @@ class Ros2Settings(OutputSettings):
     distribution: Distribution = "jazzy"
     """The distribution of ROS 2. All since jazzy are alike; humble has no type hashes."""
 
-    reliability: Reliability = "best_effort"
+    reliability: Annotated[Literal["best_effort", "reliable"], expects("best_effort or reliable")] = (
+        "best_effort"
+    )
     """The reliability that the publishers announce."""
 
     durability: Durability = "volatile"
     """The durability that the publishers announce. There is only this one: old poses would mislead robots."""
 
-    depth: Depth = 10
+    depth: Annotated[int, Field(strict=True, ge=1, le=10_000), expects("a whole number from 1 to 10000")] = 10
     """The depth of the history that the publishers announce (keep last)."""
+
+
+ROS2: Final = OutputKind(
+    name="ros2",
+    settings=Ros2Settings,
+    create=imported_late("gateway.outputs.ros2.output:Ros2Output"),
+    checks=("router", "gateway", "nodes", "types"),
+    run_checks=imported_late("gateway.outputs.ros2.checks:check_ros2"),
+    leaves_host=imported_late("gateway.outputs.ros2.checks:leaves_host"),
+)

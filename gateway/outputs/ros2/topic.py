@@ -168,17 +168,16 @@ class RosNode:
         return Declared(publisher, self._session.liveliness().declare_token(token), gid_of(token))
 
 
-class Declared:
-    """What is declared for one topic."""
+class Declared(NamedTuple):
+    """What is declared for one topic: its publisher, which the token makes visible, and its global id."""
 
-    def __init__(self, publisher: zenoh.Publisher, token: zenoh.LivelinessToken, gid: bytes) -> None:
-        self.publisher = publisher
-        self.gid = gid
-        self._token = token
+    publisher: zenoh.Publisher
+    token: zenoh.LivelinessToken
+    gid: bytes
 
     def undeclare(self) -> None:
         """Hide the publisher from ROS, and close it."""
-        self._token.undeclare()
+        self.token.undeclare()
         self.publisher.undeclare()
 
 

@@ -14,7 +14,7 @@ from gateway.messages.encode import CONTENT_OFFSET, lcm_type_name
 from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Answer, KeyPath, Output, ServerParameters
-from gateway.queries.answers import NewestJson, message_answer, schema_answer
+from gateway.queries.answers import NewestJson, ServerAnswer, message_answer, schema_answer, unreadable
 from gateway.queries.questions import (
     RECORDING,
     Question,
@@ -24,7 +24,6 @@ from gateway.queries.questions import (
     parse_question,
     parse_questions,
 )
-from gateway.queries.server_answer import ServerAnswer, unreadable
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters

@@ -1,64 +1,16 @@
-"""What the doctor assumes about outputs and the kernel, and the command ``doctor``.
+"""The command ``doctor``.
 
 The findings about Zenoh and LCM are in tests/unit/outputs/{zenoh,lcm}/test_checks.py.
 """
 
 import json
 import re
-import socket
 from pathlib import Path
-from typing import Any, Final
 
-import pytest
-
-from gateway.outputs.lcm.checks import charged_bytes
-from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.registry import OUTPUTS
-from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.commands import Completed, run
 from tests.support.networks import free_port, zenoh_keys
-
-GROUP: Final = "udpm://239.255.76.67:7667"
-
-
-@pytest.mark.parametrize("size", [200, 1500, 3000, 8000, 20_000, 60_000])
-def test_the_kernel_charges_at_most_charged_bytes_for_a_datagram(size: int) -> None:
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
-        receiver.bind(("127.0.0.1", 0))
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 150_000)
-        count = receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // charged_bytes(size)
-        assert count >= 1
-        for _ in range(count):
-            sender.sendto(bytes(size), receiver.getsockname())
-        receiver.setblocking(False)
-        assert [len(receiver.recv(size)) for _ in range(count)] == [size] * count
-
-
-def test_large_messages_are_charged_per_datagram() -> None:
-    assert charged_bytes(3 * 65_499) == 3 * charged_bytes(65_499)
-    assert (charged_bytes(200), charged_bytes(1500)) == (1280, 2304)
-
-
-@pytest.mark.parametrize(
-    ("output", "settings", "leaves"),
-    [
-        ("zenoh", ZenohSettings(), True),
-        ("zenoh", ZenohSettings(config={"scouting": {"multicast": {"enabled": False}}}), True),  # listens
-        ("lcm", LcmSettings(url=f"{GROUP}?ttl=0"), False),
-        ("lcm", LcmSettings(url=f"{GROUP}?ttl=1"), True),
-        ("lcm", LcmSettings(url=GROUP), False),
-        ("lcm", LcmSettings(url="memq://"), False),
-        ("lcm", LcmSettings(url="tcpq://127.0.0.1:7700"), False),
-        ("lcm", LcmSettings(url="tcpq://192.0.2.10:7700"), True),
-    ],
-)
-def test_whether_an_output_leaves_this_computer(output: str, settings: Any, leaves: bool) -> None:
-    assert OUTPUTS[output].leaves_host(settings) is leaves
 
 
 async def doctor(*arguments: str) -> Completed:

@@ -19,7 +19,7 @@ import rtc3d
 import yaml
 import zenoh
 
-from gateway.client.series import FINGERPRINTS
+from gateway.client.reception import FINGERPRINTS
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel

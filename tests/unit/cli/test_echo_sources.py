@@ -8,7 +8,7 @@ import rtc3d
 from gateway.cli import echo_sources
 from gateway.cli.echo_sources import EchoSources
 from gateway.client.client import GatewayClient
-from gateway.client.found_sources import FoundSources
+from gateway.client.transport import FoundSources
 from gateway.errors import OutputError, QueryError
 from gateway.messages.source_report import source_report
 from gateway.outputs.kind import SubscriptionRequest

@@ -10,7 +10,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from gateway.cli.list_gateways import found_json, notes, write_sources
-from gateway.client.found_sources import MAX_SOURCES, MAX_STATUS_BYTES, FoundSources
+from gateway.client.transport import MAX_SOURCES, MAX_STATUS_BYTES, FoundSources
 from gateway.messages.decode import decode
 from tests.unit.messages.samples import status_of
 

@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import pytest
 
-from gateway.doctor import all_checks, frame_checks, gateway_checks, source_checks
+from gateway.doctor import all_checks, frame_checks, source_checks
+from gateway.doctor.all_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.frame_checks import check_receive_buffer
-from gateway.doctor.gateway_checks import HealthReport, RunningLoss, RunningStream, check_gateway
 from gateway.doctor.observation import ObservedStream
 from gateway.outputs.findings import Check, Finding, Result
 from gateway.outputs.kind import OPENS
@@ -205,7 +205,7 @@ def test_the_guide_lists_every_check_in_order() -> None:
     checks = re.findall(r"^\| [^|]*\| ([\w ]+) \|", table, re.MULTILINE)
     expected = [
         "file",
-        *gateway_checks.CHECKS,
+        *all_checks.GATEWAY_CHECKS,
         *source_checks.CHECKS,
         *(check for kind in OUTPUTS.values() for check in kind.checks),
         OPENS,

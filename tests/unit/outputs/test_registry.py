@@ -1,5 +1,9 @@
 """The registry: which sections the configuration has, and which outputs it builds."""
 
+from typing import Any
+
+import pytest
+
 from gateway.config.settings import SourceSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.output import LcmOutput
@@ -15,6 +19,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
 from tests.support.configurations import make_settings
 
+GROUP = "udpm://239.255.76.67:7667"
 SOURCES = (SourceSettings(name="lab", host="127.0.0.1"),)
 
 
@@ -51,3 +56,20 @@ def test_outputs_have_the_limits_and_the_tool_poses_of_their_settings() -> None:
         lcm = LcmOutput(LcmSettings(max_rate_hz=rates, tool_poses=has_tool_poses))
         assert [zenoh.max_rate_hz, lcm.max_rate_hz] == [rates, rates]
         assert [zenoh.has_tool_poses, lcm.has_tool_poses] == [has_tool_poses, has_tool_poses]
+
+
+@pytest.mark.parametrize(
+    ("output", "settings", "leaves"),
+    [
+        ("zenoh", ZenohSettings(), True),
+        ("zenoh", ZenohSettings(config={"scouting": {"multicast": {"enabled": False}}}), True),  # listens
+        ("lcm", LcmSettings(url=f"{GROUP}?ttl=0"), False),
+        ("lcm", LcmSettings(url=f"{GROUP}?ttl=1"), True),
+        ("lcm", LcmSettings(url=GROUP), False),
+        ("lcm", LcmSettings(url="memq://"), False),
+        ("lcm", LcmSettings(url="tcpq://127.0.0.1:7700"), False),
+        ("lcm", LcmSettings(url="tcpq://192.0.2.10:7700"), True),
+    ],
+)
+def test_whether_an_output_leaves_this_computer(output: str, settings: Any, leaves: bool) -> None:
+    assert OUTPUTS[output].leaves_host(settings) is leaves

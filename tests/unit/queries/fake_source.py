@@ -10,8 +10,8 @@ import rtc3d
 from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
 from gateway.outputs.contract import Answer
+from gateway.queries.answers import QueryHistory, ServerAnswer
 from gateway.queries.questions import Question
-from gateway.queries.server_answer import QueryHistory, ServerAnswer
 from gateway.queries.server_requests import RecordingAccess, StreamAccess
 from gateway.queries.service import SourceQueries
 from gateway.rtc3d.commands import Command

@@ -7,8 +7,8 @@ from itertools import combinations
 import pytest
 
 from gateway.errors import ClosedError, ParametersError, ReplyTimeoutError, ServerError
+from gateway.queries.answers import MAX_PARTS
 from gateway.queries.parameter_cache import ParameterCache
-from gateway.queries.server_answer import MAX_PARTS
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.replies import LONG_XML_BYTES, XmlThread
@@ -289,7 +289,7 @@ async def test_changes_are_logged(
     source = FakeSource()
     await source.store_parameters(labelled(before))
     await source.refresh(labelled(after))
-    [record] = [record for record in caplog.records if record.name == "gateway.queries.server_answer"]
+    [record] = [record for record in caplog.records if record.name == "gateway.queries.answers"]
     assert record.levelno == level
     assert record.message.startswith(text)
 
@@ -427,7 +427,7 @@ async def test_xml_is_parsed_in_a_thread_and_only_its_statistics_if_nothing_else
         parsed.append(xml)
         return parse_parameters(xml)
 
-    monkeypatch.setattr("gateway.queries.server_answer.parse_parameters", parse)
+    monkeypatch.setattr("gateway.queries.answers.parse_parameters", parse)
     source = FakeSource()
     long = parameters_xml("mm") + b" " * LONG_XML_BYTES
     await source.store_parameters(long)

@@ -47,8 +47,9 @@ async def test_the_fallback_is_sent_if_the_command_is_refused_and_its_error_rais
     source = FakeSource()
     source.server.replies = {"SendParameters 3D": ServerError("err-what?"), "SendParameters": b"<a/>"}
     requests = ServerRequests(source.queries.settings, lambda: source.streams)
-    command, packet = await requests.send(SendParameters(("3d",)), fallback=SendParameters())
-    assert (command, packet.body) == (SendParameters(), b"<a/>")
+    packet = await requests.send(SendParameters(("3d",)), fallback=SendParameters())
+    assert packet.body == b"<a/>"
+    assert source.server.commands == ["SendParameters 3D", "SendParameters"]
     source.server.replies = {"SendCurrentFrame 3D": ServerError("a"), "SendCurrentFrame": ServerError("b")}
     [component, _] = source.streams[0].components
     with pytest.raises(QueryError, match="the server does not know SendCurrentFrame, or refuses it: b"):

@@ -8,9 +8,7 @@ import pytest
 import rtc3d
 
 from gateway.client import reception
-from gateway.client import series as subscriber_series
-from gateway.client.reception import MAX_SOURCES
-from gateway.client.series import FINGERPRINTS
+from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
@@ -102,7 +100,7 @@ class Recorded:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The monotonic clock of everything that is received and recorded."""
     clock = Clock()
-    for module in (recorder, reception, subscriber_series):
+    for module in (recorder, reception):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=clock))
     return clock
 

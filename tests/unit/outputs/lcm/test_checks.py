@@ -1,5 +1,6 @@
 """The doctor's findings about LCM, word for word."""
 
+import socket
 from typing import Any
 
 import pytest
@@ -157,3 +158,24 @@ def test_requests_are_not_tested_without_a_route() -> None:
     finally:
         add_multicast_route()
     assert finding == Finding("lcm", "requests", Result.NOT_TESTED, "it needs route, which failed")
+
+
+@pytest.mark.parametrize("size", [200, 1500, 3000, 8000, 20_000, 60_000])
+def test_the_kernel_charges_at_most_charged_bytes_for_a_datagram(size: int) -> None:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        receiver.bind(("127.0.0.1", 0))
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 150_000)
+        count = receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // charged_bytes(size)
+        assert count >= 1
+        for _ in range(count):
+            sender.sendto(bytes(size), receiver.getsockname())
+        receiver.setblocking(False)
+        assert [len(receiver.recv(size)) for _ in range(count)] == [size] * count
+
+
+def test_large_messages_are_charged_per_datagram() -> None:
+    assert charged_bytes(3 * 65_499) == 3 * charged_bytes(65_499)
+    assert (charged_bytes(200), charged_bytes(1500)) == (1280, 2304)

@@ -12,11 +12,11 @@ from gateway.outputs.findings import Result
 from gateway.outputs.lsl import checks
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.streams import (
+    CHANNELS_PER_ITEM,
     MAX_RATE_HZ,
     DescribedSource,
     LslStream,
     changed_labels,
-    channels_per_item,
     lsl_stream,
     num_labels,
 )
@@ -115,7 +115,7 @@ def test_a_stream_of_nothing_but_emg_is_of_that_type() -> None:
 def test_without_parameters_items_are_called_by_their_position(component: ComponentType) -> None:
     stream = stream_of(component, 3, Parameters())
     is_event = component is ComponentType.EVENT
-    assert len(stream.channels) == (1 if is_event else 3 * channels_per_item(component))
+    assert len(stream.channels) == (1 if is_event else 3 * CHANNELS_PER_ITEM[component])
     assert len({channel.label for channel in stream.channels}) == len(stream.channels)
     assert stream.rate_hz == 0.0
 

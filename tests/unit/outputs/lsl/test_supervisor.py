@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -17,11 +17,14 @@ from unittest.mock import Mock
 import pytest
 
 from gateway.errors import ConfigError
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lsl import supervisor
 from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.process import Kind, Message, Report
+from gateway.outputs.lsl.process import Kind, Message, MessageReader, Report
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.supervisor import LslProcesses
+from gateway.rtc3d.parameters import Parameters, ParametersEvents
 from tests.support.lsl_receiver import lsl_config
 from tests.support.waiting import wait_until
 
@@ -35,7 +38,7 @@ from gateway.outputs.lsl.supervisor import LslProcesses
 from tests.support.waiting import wait_until
 
 processes = LslProcesses(LslSettings(enabled=True, config=sys.argv[1]))
-processes.restart(lambda: None)
+processes.restart()
 wait_until(lambda: processes.version)
 print(processes._process.pid, flush=True)
 signal.pause()
@@ -54,14 +57,10 @@ def processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LslPr
     processes.stop()
 
 
-def nothing() -> None:
-    """There are no streams to open again."""
-
-
-def start(processes: LslProcesses, reopen: Callable[[], None] = nothing) -> int:
-    """Start a process and wait until it is ready; return its number."""
+def start(processes: LslProcesses) -> int:
+    """Start a process, which has no streams, and wait until it is ready; return its number."""
     wait_until(lambda: processes.is_due, TIMEOUT_S)
-    processes.restart(reopen)
+    assert processes.restart()
     wait_until(lambda: not processes.problem, TIMEOUT_S)
     assert processes._process is not None
     return processes._process.pid
@@ -97,16 +96,12 @@ def test_the_process_lives_on_while_nothing_is_sent(tmp_path: Path, monkeypatch:
         output.close()
 
 
-def test_a_process_that_ended_is_replaced_and_gets_the_streams_again(
-    processes: LslProcesses, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_process_that_ended_is_replaced(processes: LslProcesses, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     first = start(processes)
     os.kill(first, signal.SIGKILL)
     assert problem(processes) == "the process for LSL ended by SIGKILL; it is started again"
-    reopened: list[bool] = []
-    assert start(processes, lambda: reopened.append(True)) != first
-    assert reopened == [True]
+    assert start(processes) != first
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert warnings == ["lsl: the process for LSL ended by SIGKILL; it is started again"]
     assert "streams are offered by liblsl" in caplog.records[-1].getMessage()
@@ -167,7 +162,7 @@ def test_why_liblsl_cannot_be_loaded_is_said(
     (tmp_path / "queue.py").unlink()
     monkeypatch.syspath_prepend(tmp_path)
     wait_until(lambda: processes.is_due, TIMEOUT_S)
-    processes.restart(nothing)
+    processes.restart()
     wait_until(lambda: "failed" in processes.problem, TIMEOUT_S)
     text = "the process for LSL failed: ImportError: libc is too old; it is started again"
     assert processes.problem == text
@@ -177,7 +172,7 @@ def test_a_failed_start_is_tried_again(processes: LslProcesses, monkeypatch: pyt
     with monkeypatch.context() as without_descriptors:
         error = OSError(errno.EMFILE, os.strerror(errno.EMFILE))
         without_descriptors.setattr(socket, "socketpair", Mock(side_effect=error))
-        processes.restart(nothing)
+        assert not processes.restart()
     text = "the process for LSL cannot be started: Too many open files; it is started again"
     assert processes.problem == text
     start(processes)
@@ -218,7 +213,7 @@ class Lab:
     def live(self, seconds: float) -> None:
         """Start a process that ends after this time."""
         assert self.processes.is_due
-        self.processes.restart(nothing)
+        self.processes.restart()
         self.now_s += seconds
         self.theirs.close()
         wait_until(lambda: self.processes._socket is None and "status 3" in self.processes.problem)
@@ -229,6 +224,40 @@ class Lab:
         while not self.processes.is_due:
             self.now_s += 0.1
         return round(self.now_s - began_s, 1)
+
+
+def test_the_next_process_gets_the_streams_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that receive them continue."""
+    connections: list[socket.socket] = []
+
+    def start(_settings: LslSettings) -> tuple[socket.socket, Mock]:
+        ours, theirs = socket.socketpair()
+        connections.append(theirs)
+        return ours, Mock(wait=Mock(return_value=3))
+
+    def received() -> list[Message]:
+        connections[-1].settimeout(TIMEOUT_S)
+        return list(MessageReader().feed(connections[-1].recv(65536)))
+
+    def has_next() -> bool:
+        output.maintain()
+        return len(connections) == 2
+
+    monkeypatch.setattr(supervisor, "_FIRST_RETRY_S", 0.01)
+    monkeypatch.setattr(supervisor, "_start_process", start)
+    output = LslOutput(LslSettings(enabled=True))
+    output.frame_publisher("lab")
+    output.start()
+    wait_until(lambda: connections)
+    parsed = Parameters(events=ParametersEvents())
+    output.publish_parameters("lab", ServerParameters(b"", 1, 1, parsed=parsed, frame=CoordinateFrame("lab")))
+    [first] = received()
+    assert (first.kind, first.stream) == (Kind.OPEN, 1)
+    connections[0].close()
+    wait_until(has_next)
+    assert received() == [first]
+    output.close()
+    connections[1].close()
 
 
 def test_the_wait_for_the_next_process_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,7 +273,7 @@ def test_the_wait_for_the_next_process_doubles_up_to_a_limit(monkeypatch: pytest
 def test_each_change_of_what_is_received_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """What was received stays wanted until the next process knows it; nothing is after the end."""
     lab = Lab(monkeypatch)
-    lab.processes.restart(nothing)
+    lab.processes.restart()
     assert not lab.processes.is_due  # there is one
     for wanted, failed in (((1,), ""), ((1,), "x"), ((1, 2), "x"), ((), "x"), ((3,), "")):
         report = Report(ready="116", wanted=wanted, not_opened=failed)

@@ -136,8 +136,7 @@ class Source:
         self.node, self.router, self.sender = Node(), Router(), Sender()
         self.tf = RosTopic("/tf", TF_MESSAGE, self._update_wanted)
         self.publisher = RosSource("lab", "/mocap/lab", self.tf, self.router, self.sender)  # type: ignore[arg-type]
-        self.topics = self.publisher.topics
-        self.topics.losses = Losses(logging.getLogger("tests"), "lab to ros2")
+        self.publisher.losses = Losses(logging.getLogger("tests"), "lab to ros2")
         self.num_changes = 0
         self.publisher.on_wanted_changed = self._note_change
         if is_declared:
@@ -157,7 +156,7 @@ class Source:
 
     def subscribe(self, *names: str, is_there: bool = True) -> None:
         """Let subscribers come to these topics, or to all; or go."""
-        for topic in (self.tf, *self.topics.topics):
+        for topic in (self.tf, *self.publisher.topics):
             if not names or topic.name in names:
                 topic._on_matching(is_there)
 
@@ -184,4 +183,4 @@ class Source:
 
     @property
     def lost(self) -> dict[str, tuple[int, int]]:
-        return amounts(self.topics.losses.report())
+        return amounts(self.publisher.losses.report())

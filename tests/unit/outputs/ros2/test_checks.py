@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from gateway.outputs.findings import Result
-from gateway.outputs.ros2.checks import CHECKS, check_ros2, leaves_host
+from gateway.outputs.ros2.checks import check_ros2, leaves_host
 from gateway.outputs.ros2.messages import NO_HASH, POSE_STAMPED
-from gateway.outputs.ros2.settings import Ros2Settings
+from gateway.outputs.ros2.settings import ROS2, Ros2Settings
 from tests.support.networks import free_endpoint
 from tests.support.ros_lab import RosLab, ros_lab
 from tests.support.waiting import wait_until
@@ -22,7 +22,7 @@ def lab() -> Iterator[RosLab]:
 
 def findings(settings: Ros2Settings, seconds: float = 1.0) -> dict[str, tuple[Result, str]]:
     found = check_ros2(settings, ["lab"], [], seconds)
-    assert [each.check for each in found] == list(CHECKS)
+    assert [each.check for each in found] == list(ROS2.checks)
     return {each.check: (each.result, each.found) for each in found}
 
 

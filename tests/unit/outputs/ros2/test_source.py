@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.outputs.ros2.source_topics import MAX_PLATES, MAX_TOOLS
+from gateway.outputs.ros2.source import MAX_PLATES, MAX_TOOLS
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
 from gateway.rtc3d.parameters import ForceChannel, Plate
 from tests.support.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, tools_frame
@@ -110,9 +110,9 @@ def test_names_that_differ_from_labels_are_shown() -> None:
     """Nodes look for labels; those that are valid names need no explanation."""
     source = Source(parameters(("wand", "Left Foot"), plates=(Plate("1", "left"), Plate("2"))))
     names = {"6d": {"Left Foot": "Left_Foot"}, "force": {"left": "force_1", "plate 2": "force_2"}}
-    assert source.topics.names == names
+    assert source.publisher.names == names
     source.use(parameters(("wand",), version=2))
-    assert source.topics.names == {"6d": {}}
+    assert source.publisher.names == {"6d": {}}
 
 
 # What is wanted -----------------------------------------------------------------------------
@@ -151,14 +151,14 @@ def test_a_subscriber_that_came_before_its_topic_is_noticed() -> None:
     source.publisher.check_subscribers()
     assert not source.publisher.wants(ALL)
     assert source.num_changes == 2
-    [topic] = source.topics._by_component[MARKERS]
+    [topic] = source.publisher._by_component[MARKERS]
     topic.wanted = True  # noted in another thread, which has not got further
     source.node.matching.add("/mocap/lab/markers")
     source.publisher.check_subscribers()
     assert source.publisher.wants([MARKERS])
     source.subscribe(is_there=False)
     topic.wanted = True  # between the declaration and the list of topics
-    source.topics.open_for({ANALOG: 1}, source.publisher._parameters)
+    source.publisher._open_for({ANALOG: 1}, source.publisher._parameters)
     assert source.publisher.wants([MARKERS])
 
 
@@ -349,9 +349,9 @@ def test_a_closed_source_publishes_nothing_more_and_its_topics_go() -> None:
     assert source.num_changes == 1
     assert not source.publisher.wants(ALL)
     source.sender.run()
-    assert (source.sent, source.node.open, source.topics.topics) == ({}, {"/tf"}, ())
+    assert (source.sent, source.node.open, source.publisher.topics) == ({}, {"/tf"}, ())
     source.subscribe()
     source.publisher.update_wanted()
     assert not source.publisher.wants(ALL)
     assert cause_of(source.offer, ONE_OF_EACH) == "closed"
-    assert source.topics.wanted == frozenset()
+    assert source.publisher._wanted == frozenset()

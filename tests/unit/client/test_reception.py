@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.client.series import Series, Source
+from gateway.client.reception import Series, Source
 from gateway.messages.encode import NOT_PUBLISHED, PREFIX
 
 
@@ -17,7 +17,7 @@ def test_messages_without_a_number_are_counted_and_show_no_loss() -> None:
 
 def test_queries_without_a_reply_become_rarer(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 1000.0
-    monkeypatch.setattr("gateway.client.series.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("gateway.client.reception.time.monotonic", lambda: now_s)
     source = Source("lab", "MOCAP_LAB")
     due_s = []
     for tick in range(36_000):  # an hour
