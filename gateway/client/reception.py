@@ -11,8 +11,7 @@ from gateway.client.series import Series, Source
 from gateway.messages.encode import VERSION_OFFSET
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.parameters_message import encode_parameters
+from gateway.outputs.contract import ServerParameters, encode_parameters
 
 MAX_SOURCES: Final = 64
 MAX_SERIES: Final = 4096

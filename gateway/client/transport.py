@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 from gateway.client.found_sources import FoundSources
 from gateway.client.reception import Reception
 from gateway.errors import QueryError
-from gateway.outputs.discovery import DISCOVERY_S
+from gateway.outputs.kind import DISCOVERY_S
 
 RETRY_S: Final = 0.5
 """How long to wait before repeating a query that got no reply, or came while there were too many."""

@@ -16,7 +16,7 @@ from gateway.client.transport import BUSY_CODES, RETRY_S, Query, Replies, Reply,
 from gateway.errors import QueryError
 from gateway.messages.decode import TEXT
 from gateway.messages.topics import is_json_key, lcm_channel, unique_name, zenoh_key
-from gateway.outputs.discovery import DISCOVERY_S
+from gateway.outputs.kind import DISCOVERY_S
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY

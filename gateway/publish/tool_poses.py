@@ -38,7 +38,7 @@ class _Tool:
         """Open the routes that are missing, and close those to other outputs."""
         path = (ComponentType.TOOLS.key, self.name)
         for output_route in self.routes.keys() - set(output_routes):
-            self.routes.pop(output_route).close()
+            self.routes.pop(output_route).publisher.close()
         for output_route in output_routes:
             if output_route not in self.routes:
                 self.routes[output_route] = TopicRoute(output_route, path, rtc3d.tool_pose_t, "6d/tool")

@@ -18,7 +18,7 @@ from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.foxglove.connections import Viewer
 from gateway.outputs.foxglove.server import Channel, FoxgloveServer, send, send_to
-from gateway.outputs.threads import in_this_loop
+from gateway.outputs.frame_output import in_this_loop
 from gateway.rtc3d.components import COMPONENT_HEADER_BYTES, ITEM_DTYPES, WIRE_ORDER, Component, ComponentType
 from gateway.rtc3d.frames import ComponentLayout, Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters

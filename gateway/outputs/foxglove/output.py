@@ -12,9 +12,8 @@ from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParamet
 from gateway.outputs.foxglove.live_source import QUEUE_FULL, SLOW, FoxglovePublisher, ServedSource
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.frame_output import PortOpener, ServerOutput
+from gateway.outputs.frame_output import LoopThread, PortOpener, ServerOutput
 from gateway.outputs.listen_address import host_in_url
-from gateway.outputs.threads import LoopThread
 
 logger = logging.getLogger(__name__)
 

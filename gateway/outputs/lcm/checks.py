@@ -17,8 +17,6 @@ from gateway.outputs.lcm.connection import (
 )
 from gateway.outputs.lcm.settings import LcmSettings
 
-CHECKS: Final = ("route", "requests", "buffers")
-
 PAUSE_S: Final = 0.02
 """The longest time that a subscriber may pause without losing a message."""
 
@@ -27,7 +25,7 @@ _LARGEST_DATAGRAM: Final = 65_499
 
 _LOOPBACK: Final = {None, "", "127.0.0.1", "::1", "localhost"}
 
-_ROUTE, _REQUESTS, _BUFFERS = (Check("lcm", name) for name in CHECKS)
+_ROUTE, _REQUESTS, _BUFFERS = Check("lcm", "route"), Check("lcm", "requests"), Check("lcm", "buffers")
 
 
 def check_lcm(

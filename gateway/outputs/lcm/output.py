@@ -15,7 +15,7 @@ from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters
+from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters, encode_parameters
 from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import (
     LONG_REPLY_BYTES,
@@ -26,7 +26,6 @@ from gateway.outputs.lcm.requests import (
 )
 from gateway.outputs.lcm.sender import LcmPublisher, LcmSender, LcmThreadSender, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.parameters_message import encode_parameters
 from gateway.workers import WorkerThread
 
 logger = logging.getLogger(__name__)

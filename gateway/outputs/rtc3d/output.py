@@ -19,10 +19,9 @@ from gateway.outputs.contract import (
     ServerFile,
     ServerParameters,
 )
-from gateway.outputs.frame_output import PortOpener, ServerOutput
+from gateway.outputs.frame_output import LoopThread, PortOpener, ServerOutput, in_this_loop
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT, LiveServer, SourceState
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
-from gateway.outputs.threads import LoopThread, in_this_loop
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 

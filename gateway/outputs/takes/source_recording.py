@@ -12,8 +12,7 @@ from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.parameters_message import encode_parameters, published_again
+from gateway.outputs.contract import ServerParameters, encode_parameters, published_again
 from gateway.outputs.takes.disk import Host
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.outputs.takes.segments import RollingSegments, Save

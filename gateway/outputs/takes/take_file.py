@@ -9,7 +9,7 @@ from typing import Final
 from gateway.errors import QueryError
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
-from gateway.outputs.parameters_message import published_again
+from gateway.outputs.contract import published_again
 from gateway.outputs.takes.disk import Disk, is_full
 from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.new_file import numbered

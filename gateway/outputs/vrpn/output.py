@@ -11,8 +11,7 @@ from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
-from gateway.outputs.frame_output import ServerOutput
-from gateway.outputs.threads import LoopThread, in_this_loop
+from gateway.outputs.frame_output import LoopThread, ServerOutput, in_this_loop
 from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import VrpnServer
 from gateway.outputs.vrpn.settings import VrpnSettings

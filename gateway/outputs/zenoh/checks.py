@@ -20,8 +20,6 @@ from gateway.outputs.findings import Check, Finding, MessageLoad, counted, faili
 from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
-CHECKS: Final = ("link", "gateway")
-
 _ROUTER_REMEDY: Final = (
     "Start zenohd at that address, or correct connect/endpoints in zenoh.config. With TLS, check that all "
     "certificates come from one authority, have not expired and contain the address."
@@ -30,7 +28,7 @@ _LOCAL: Final = re.compile(r"unix|(tcp|tls|quic|udp|ws)/(127\.[\d.]+|\[::1\]|loc
 """The beginning of endpoints on this computer."""
 _POLL_S: Final = 0.05
 
-_LINK, _GATEWAY = (Check("zenoh", name) for name in CHECKS)
+_LINK, _GATEWAY = Check("zenoh", "link"), Check("zenoh", "gateway")
 
 
 def check_zenoh(
@@ -135,5 +133,5 @@ def _gateway(served: Sequence[str], sources: Sequence[str]) -> Finding:
         return _GATEWAY.passing(f"a gateway serves {', '.join(sources)}")
     return _GATEWAY.not_tested(
         f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix and "
-        "the router's access rules",
+        "the router's access rules"
     )

@@ -59,10 +59,7 @@ class SourceDeclarations:
     """
 
     def __init__(
-        self,
-        settings: ZenohSettings,
-        service: QueryService,
-        loop: asyncio.AbstractEventLoop,
+        self, settings: ZenohSettings, service: QueryService, loop: asyncio.AbstractEventLoop
     ) -> None:
         self._prefix = settings.prefix
         self._loop = loop
