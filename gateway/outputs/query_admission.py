@@ -7,7 +7,7 @@ questions costs the event loop no more than the questions that are answered.
 import logging
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -58,7 +58,7 @@ class QueryAdmission:
         self._monotonic = monotonic
         self._lock = threading.Lock()
         self._total = TokenBucket(limits.per_s, monotonic=monotonic)
-        self._keys: OrderedDict[str, TokenBucket] = OrderedDict()
+        self._keys: dict[str, TokenBucket] = {}  # the one that was asked for least recently is first
         self._bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._refusals = TokenBucket(REFUSALS_PER_S, monotonic=monotonic)
@@ -82,10 +82,16 @@ class QueryAdmission:
         It is counted for ``source``, one of the gateway's.
         """
         with self._lock:
-            refusal = self._refusal(key)
+            bucket = self._keys.pop(key, None)
+            if bucket is None:
+                bucket = TokenBucket(self._limits.per_key_per_s, monotonic=self._monotonic)
+                if len(self._keys) >= MAX_KEYS:
+                    del self._keys[next(iter(self._keys))]
+            self._keys[key] = bucket
+            refusal = self._refusal(bucket)
             if refusal is None:
                 self._total.take()
-                self._keys[key].take()
+                bucket.take()
                 self._num_pending += 1
             else:
                 self._count_result(source, refusal.error.code if refusal.is_sent else NO_REPLY)
@@ -121,8 +127,7 @@ class QueryAdmission:
             code="rate",
         )
 
-    def _refusal(self, key: str) -> Refusal | None:
-        bucket = self._bucket(key)
+    def _refusal(self, bucket: TokenBucket) -> Refusal | None:
         if self._num_pending >= self._limits.pending:
             error = QueryError("the gateway has too many queries; try again", code="busy")
             return Refusal(error, "queue", self._refusals.try_take())
@@ -137,16 +142,6 @@ class QueryAdmission:
                 )
                 return Refusal(QueryError(text, code="rate"), "rate", self._refusals.try_take())
         return None
-
-    def _bucket(self, key: str) -> TokenBucket:
-        bucket = self._keys.get(key)
-        if bucket is None:
-            if len(self._keys) >= MAX_KEYS:
-                self._keys.popitem(last=False)
-            bucket = self._keys[key] = TokenBucket(self._limits.per_key_per_s, monotonic=self._monotonic)
-        else:
-            self._keys.move_to_end(key)
-        return bucket
 
 
 class QueryDefects:

@@ -35,21 +35,16 @@ def check_lcm(
     url = settings.effective_url
     scheme = scheme_of(url)
     if scheme not in MULTICAST_SCHEMES:
-        return [
-            _check_other_scheme(url, scheme),
-            _check_requests(settings),
-            _BUFFERS.not_tested(f"{scheme} does not need a receive buffer"),
-        ]
+        route = _ROUTE.passing(f"{url} does not need multicast")
+        if scheme == "tcpq":
+            try:
+                open_lcm(url)
+            except OutputError as error:
+                problem = str(error).partition("; ")[0]
+                route = _ROUTE.failing(problem, "Start LCM's TCP relay, or correct lcm.url.")
+        buffers = _BUFFERS.not_tested(f"{scheme} does not need a receive buffer")
+        return [route, _check_requests(settings), buffers]
     return [_check_route(url), _check_requests(settings), _check_buffers(url, loads)]
-
-
-def _check_other_scheme(url: str, scheme: str) -> Finding:
-    if scheme == "tcpq":
-        try:
-            open_lcm(url)
-        except OutputError as error:
-            return _ROUTE.failing(str(error).partition("; ")[0], "Start LCM's TCP relay, or correct lcm.url.")
-    return _ROUTE.passing(f"{url} does not need multicast")
 
 
 def leaves_host(settings: LcmSettings) -> bool:

@@ -28,7 +28,6 @@ from gateway.outputs.lcm.connection import (
     scheme_of,
     send_problem,
 )
-from gateway.outputs.lcm.requests import MAX_PENDING
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.token_bucket import TokenBucket
 from gateway.workers import WorkerThread, thread_starts
@@ -38,6 +37,9 @@ _MAGIC: Final = b"LC02"
 
 _HEADER_BYTES: Final = 8
 _MAX_DATAGRAM_BYTES: Final = 65_535
+
+MAX_PENDING: Final = 64
+"""The maximum number of requests in progress. Further ones are dropped and counted."""
 
 RECEIVED_PER_S: Final = 2000.0
 """How many messages a second are received. LCM or the kernel discards further ones, uncounted."""

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, Final
+from typing import Final
 
 import lcm
 
@@ -201,15 +201,15 @@ class LcmThreadSender:
                 self._set_problem(str(error))
                 self._opening.failed(str(error))
                 self._closing.wait(RETRY_S)
-                continue
-            with self._lock:
-                if self._closing.is_set():
-                    return
-                self._problem = ""
-                self._is_open = True
-            self._opening.succeeded(f"sending {self._what} to {self._url}")
-            self._on_open()
-            return
+            else:
+                with self._lock:
+                    if self._closing.is_set():
+                        return
+                    self._problem = ""
+                    self._is_open = True
+                self._opening.succeeded(f"sending {self._what} to {self._url}")
+                self._on_open()
+                return
 
     def _publish(self, channel: str, message: bytes, source: str) -> None:
         """Publish a message, with retries; give up when that fails after ``close`` was called."""
@@ -235,21 +235,17 @@ class LcmThreadSender:
 
 
 class LcmPublisher:
-    """Sends the messages of one topic of ``source`` on ``channel``."""
+    """Sends the messages of one topic of ``source`` on ``channel``, which leaves ``channels`` at the end."""
 
     wanted = True  # LCM cannot know who is subscribed
 
     def __init__(
-        self,
-        channel: str,
-        source: str,
-        send: Callable[[str, bytes, str], None],
-        forget: Callable[[Any], None],
+        self, channel: str, source: str, sender: LcmSender | LcmThreadSender, channels: set[str]
     ) -> None:
         self.channel = channel
         self._source = source
-        self._send = send
-        self._forget = forget
+        self._sender = sender
+        self._channels = channels
         self._is_closed = False
 
     def publish(self, message: bytes) -> None:
@@ -258,10 +254,10 @@ class LcmPublisher:
             raise OutputError(
                 f"LCM channel {self.channel} is closed; ask for a new publisher", cause="closed"
             )
-        self._send(self.channel, message, self._source)
+        self._sender.send(self.channel, message, self._source)
 
     def close(self) -> None:
         """Free the channel's name."""
         if not self._is_closed:
             self._is_closed = True
-            self._forget(self)
+            self._channels.discard(self.channel)

@@ -97,7 +97,8 @@ class SourceDeclarations:
         with self._lock:
             self._session = session
             self._declared = {source: self._declare(session, source) for source in sources}
-        self._call_in_loop(self._publish_all)
+        for source in sources:
+            self._call_in_loop(self._publish_again, source)
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` what is lost of ``source``: queries, parameters and announcements."""
@@ -124,14 +125,12 @@ class SourceDeclarations:
     def _declare(self, session: zenoh.Session, source: str) -> _Declared:
         key = zenoh_key(self._prefix, source)
 
-        def on_query(query: zenoh.Query) -> None:
-            self._answers.receive(source, query)
-
         def on_matching(is_matched: bool) -> None:
             if is_matched:
                 self._call_in_loop(self._publish_soon, source)
 
-        queryable = session.declare_queryable(f"{key}/**", in_zenoh_thread(on_query))
+        on_query = in_zenoh_thread(functools.partial(self._answers.receive, source))
+        queryable = session.declare_queryable(f"{key}/**", on_query)
         parameters = f"{key}/parameters"
         publisher = declare_publisher(
             *(session, parameters, on_matching),
@@ -176,14 +175,15 @@ class SourceDeclarations:
         if sent is None:
             return None
         arrived = self._loop.create_future()
+
+        def arrive() -> None:
+            if not arrived.done():
+                arrived.set_result(None)
+
         asyncio.wrap_future(sent, loop=self._loop).add_done_callback(
-            lambda _: self._loop.call_later(_OVERTAKING_S, _set_done, arrived)
+            lambda _: self._loop.call_later(_OVERTAKING_S, arrive)
         )
         return arrived
-
-    def _publish_all(self) -> None:
-        for source in list(self._parameters):
-            self._publish_again(source)
 
     def _publish_soon(self, source: str) -> None:
         """Publish the parameters again for a new subscriber."""
@@ -258,8 +258,3 @@ def _facts(parameters: ServerParameters) -> dict[str, Any]:
         "parameters_version": parameters.version,
         "frame": parameters.frame.facts,
     }
-
-
-def _set_done(future: asyncio.Future[None]) -> None:
-    if not future.done():
-        future.set_result(None)

@@ -54,9 +54,8 @@ class ZenohOutput(Output):
         # The lock of the session protects what the opening thread shares: publishers, tokens and queries.
         self._lock = self._holder.lock
         self._publishers: list[ZenohPublisher] = []
-        # By the source's name; None while the session is not open.
-        self._alive: dict[str, zenoh.LivelinessToken | None] = {}
-        self._streaming: dict[str, zenoh.LivelinessToken | None] = {}
+        # By the source's name and the token's; None while the session is not open.
+        self._tokens: dict[tuple[str, str], zenoh.LivelinessToken | None] = {}
         self._declarations: SourceDeclarations | None = None
         self._declarer = WorkerThread("zenoh-declare")
         self._defects = DefectLog(logger, self.name)
@@ -78,11 +77,11 @@ class ZenohOutput(Output):
         """Declare on a new session everything that was requested before it opened."""
         for publisher in self._publishers:
             publisher.declare(session)
-        for tokens, name in ((self._alive, "alive"), (self._streaming, "server")):
-            for source in tokens:
-                tokens[source] = self._token(session, source, name)
+        for token in self._tokens:
+            self._tokens[token] = self._token(session, *token)
         if self._declarations is not None:
-            self._declarations.open(session, list(self._alive))  # the parameters, before the first frame
+            sources = [source for source, name in self._tokens if name == "alive"]
+            self._declarations.open(session, sources)  # the parameters, before the first frame
 
     def _update_link(self) -> None:
         self._link.is_cut_off = self._holder.is_cut_off
@@ -146,38 +145,37 @@ class ZenohOutput(Output):
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` refused queries about ``source``, and what else is not published of it."""
-        self._json.count_losses(source, losses)
+        self._json.losses[source] = losses
         if self._declarations is not None:
             self._declarations.count_losses(source, losses)
 
     def announce(self, source: str) -> None:
         """Declare the liveliness token PREFIX/SOURCE/alive, and answer queries about ``source``."""
-        self._show(self._alive, source, "alive", True)
+        self._show(source, "alive", True)
         with self._lock:
             if self._declarations is not None and self.session is not None:
                 self._declarations.add(source)
 
     def withdraw(self, source: str) -> None:
         """Undeclare the liveliness token PREFIX/SOURCE/alive, and stop answering queries about ``source``."""
-        self._show(self._alive, source, "alive", False)
+        self._show(source, "alive", False)
         with self._lock:
             if self._declarations is not None:
                 self._declarations.remove(source)
 
     def show_streaming(self, source: str, is_streaming: bool) -> None:
         """Declare the liveliness token PREFIX/SOURCE/server while frames arrive, undeclare it otherwise."""
-        self._show(self._streaming, source, "server", is_streaming)
+        self._show(source, "server", is_streaming)
 
-    def _show(
-        self, tokens: dict[str, zenoh.LivelinessToken | None], source: str, name: str, is_shown: bool
-    ) -> None:
+    def _show(self, source: str, name: str, is_shown: bool) -> None:
         with self._lock:
+            session = self.session
             if not is_shown:
-                token = tokens.pop(source, None)
+                token = self._tokens.pop((source, name), None)
                 if token is not None:
                     token.undeclare()
-            elif source not in tokens:
-                tokens[source] = None if self.session is None else self._token(self.session, source, name)
+            elif (source, name) not in self._tokens:
+                self._tokens[source, name] = session and self._token(session, source, name)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
@@ -210,5 +208,4 @@ class ZenohOutput(Output):
         self._json.close()
         self._holder.close()
         with self._lock:
-            self._alive.clear()
-            self._streaming.clear()
+            self._tokens.clear()
