@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 from gateway.errors import QueryError
 from gateway.logs.failures import DefectLog
@@ -37,6 +37,15 @@ class QueryLimits(NamedTuple):
     per_key_per_s: float
     reply_bytes_per_s: float
     pending: int
+
+    @classmethod
+    def of(cls, output: str, key_setting: str, settings: Any, pending: int) -> Self:
+        """Return the limits that the ``settings`` of an output have."""
+        return cls(
+            *(output, key_setting, settings.max_queries_per_s, getattr(settings, key_setting)),
+            reply_bytes_per_s=settings.max_reply_bytes_per_s,
+            pending=pending,
+        )
 
 
 class Refusal(NamedTuple):

@@ -72,7 +72,9 @@ class ToolPoses:
         labels = () if parsed.tools is None else tuple(tool.label for tool in parsed.tools.tools)
         if labels != self._labels:
             self._labels = labels
-            self._close_topics()
+            for tool in self._tools:
+                tool.set_routes(())
+            self._tools.clear()
         self._parameters = parsed
         self._frame = parameters.frame
 
@@ -143,11 +145,6 @@ class ToolPoses:
             self._tools.append(tool)
         for name in list(self._sequences)[:-_MAX_REMEMBERED_NAMES]:
             del self._sequences[name]
-
-    def _close_topics(self) -> None:
-        for tool in self._tools:
-            tool.set_routes(())
-        self._tools.clear()
 
 
 def _num_tools(frame: Frame, indices: Sequence[int]) -> int:

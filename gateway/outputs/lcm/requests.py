@@ -98,14 +98,7 @@ class LcmRequests:
         self.long_sender = WorkerThread("lcm-send-long")
         """Makes and sends what is long."""
         self.admission = QueryAdmission(
-            QueryLimits(
-                output="lcm",
-                key_setting="max_queries_per_source_per_s",
-                per_s=settings.max_queries_per_s,
-                per_key_per_s=settings.max_queries_per_source_per_s,
-                reply_bytes_per_s=settings.max_reply_bytes_per_s,
-                pending=MAX_PENDING,
-            )
+            QueryLimits.of("lcm", "max_queries_per_source_per_s", settings, MAX_PENDING)
         )
         self._tasks: set[asyncio.Task[None]] = set()
         self._defects = QueryDefects(logger)

@@ -30,7 +30,8 @@ from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, KeyPath, QueryService
-from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, Refusal
+from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, QueryLimits, Refusal
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.workers import WorkerThread
 
 MAX_PENDING: Final = 4096
@@ -83,17 +84,18 @@ class ZenohAnswers:
 
     def __init__(
         self,
-        prefix: str,
+        settings: ZenohSettings,
         service: QueryService,
         loop: asyncio.AbstractEventLoop,
-        admission: QueryAdmission,
         sender: WorkerThread,
         losses: defaultdict[str, Losses],
     ) -> None:
-        self._prefix = prefix
+        self._prefix = settings.prefix
         self._service = service
         self._loop = loop
-        self._admission = admission
+        self.admission = QueryAdmission(
+            QueryLimits.of("zenoh", "max_queries_per_key_per_s", settings, MAX_PENDING)
+        )
         self._sender = sender
         self._long_sender = WorkerThread("zenoh-send-long")
         self._losses = losses
@@ -121,7 +123,7 @@ class ZenohAnswers:
 
     def _is_admitted(self, source: str, query: zenoh.Query) -> bool:
         selected = str(query.key_expr)
-        refusal = self._admission.admit(source, selected[:MAX_KEY_CHARS])
+        refusal = self.admission.admit(source, selected[:MAX_KEY_CHARS])
         if refusal is not None:
             self._refuse(source, query, refusal)
             return False
@@ -221,7 +223,7 @@ class ZenohAnswers:
             raise QueryError(
                 f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
             )
-        self._admission.count(len(paths) - 1)
+        self.admission.count(len(paths) - 1)
         answers = await self._service.answer_all(source, paths, options)
         return {base + "/".join(path): answer for path, answer in answers.items()}
 
@@ -273,7 +275,7 @@ class ZenohAnswers:
     def _drop_now(self, queries: list[zenoh.Query], source: str) -> None:
         for query in queries:
             query.drop()
-            self._admission.finished(source, NO_REPLY)
+            self.admission.finished(source, NO_REPLY)
 
     def _reply(self, query: zenoh.Query, source: str, outcome: Mapping[str, Answer] | QueryError) -> None:
         result = "ok"
@@ -290,12 +292,12 @@ class ZenohAnswers:
             result = "defect"
             self._defects.log(source, problem, f"query {safe_text(str(query.key_expr))}")
         finally:
-            self._admission.finished(source, result)
+            self.admission.finished(source, result)
 
     def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
         """Reply with each of the answers. Raises QueryError if there is none, or too many bytes."""
         num_bytes = sum(answer.num_bytes for answer in answers.values())
-        self._admission.check_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
+        self.admission.check_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
         num_replies, error = 0, None
         for key, answer in answers.items():
             try:

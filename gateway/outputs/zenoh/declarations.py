@@ -18,8 +18,7 @@ from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, QueryService, ServerParameters
-from gateway.outputs.query_admission import QueryAdmission, QueryLimits
-from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
+from gateway.outputs.zenoh.answers import ZenohAnswers
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.session import declare_publisher, in_zenoh_thread
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -70,27 +69,11 @@ class SourceDeclarations:
         self._unsent: dict[str, Future[None]] = {}  # publications of parameters that have not begun
         self._due: set[str] = set()  # sources whose parameters will be published for a new subscriber
         self._published_s: dict[str, float] = {}  # when that was done last
-        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
+        self.losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))
+        """By source, what is lost: queries, parameters and announcements."""
         self._sender = WorkerThread("zenoh-send")
-        self._admission = QueryAdmission(
-            QueryLimits(
-                output="zenoh",
-                key_setting="max_queries_per_key_per_s",
-                per_s=settings.max_queries_per_s,
-                per_key_per_s=settings.max_queries_per_key_per_s,
-                reply_bytes_per_s=settings.max_reply_bytes_per_s,
-                pending=MAX_PENDING,
-            )
-        )
-        self._answers = ZenohAnswers(
-            *(self._prefix, service, loop, self._admission, self._sender, self._losses)
-        )
+        self.answers = ZenohAnswers(settings, service, loop, self._sender, self.losses)
         self._is_closed = False
-
-    @property
-    def results(self) -> Mapping[str, Mapping[str, int]]:
-        """See QueryAdmission."""
-        return self._admission.results
 
     def open(self, session: zenoh.Session, sources: Sequence[str]) -> None:
         """Declare the queryables and publishers of ``sources`` on an open session."""
@@ -99,10 +82,6 @@ class SourceDeclarations:
             self._declared = {source: self._declare(session, source) for source in sources}
         for source in sources:
             self._call_in_loop(self._publish_again, source)
-
-    def count_losses(self, source: str, losses: Losses) -> None:
-        """Count in ``losses`` what is lost of ``source``: queries, parameters and announcements."""
-        self._losses[source] = losses
 
     def add(self, source: str) -> None:
         """Answer queries about one more source."""
@@ -129,7 +108,7 @@ class SourceDeclarations:
             if is_matched:
                 self._call_in_loop(self._publish_soon, source)
 
-        on_query = in_zenoh_thread(functools.partial(self._answers.receive, source))
+        on_query = in_zenoh_thread(functools.partial(self.answers.receive, source))
         queryable = session.declare_queryable(f"{key}/**", on_query)
         parameters = f"{key}/parameters"
         publisher = declare_publisher(
@@ -147,7 +126,7 @@ class SourceDeclarations:
         def on_history(query: zenoh.Query) -> None:
             newest = self._parameters.get(source)
             answers = {} if newest is None else {parameters: Answer(newest.xml, XML, _facts(newest))}
-            self._answers.reply(source, query, answers)
+            self.answers.reply(source, query, answers)
 
         return _Declared(
             queryable,
@@ -234,7 +213,7 @@ class SourceDeclarations:
             )
             if not self._sender.offer(put) and not self._is_closed:
                 text = "the announcement of a C3D file is dropped, because earlier ones wait to be sent"
-                self._losses[source].lost("put failed", text, frames=0)
+                self.losses[source].lost("put failed", text, frames=0)
 
     def _put(self, source: str, put: Callable[..., None], *arguments: Any, **options: Any) -> None:
         """Publish, in the sending thread."""
@@ -243,12 +222,12 @@ class SourceDeclarations:
         except zenoh.ZError as error:
             if not self._is_closed:
                 text = f"Zenoh did not take parameters or an announcement: {zenoh_reason(error)}"
-                self._losses[source].lost("put failed", text, frames=0)
+                self.losses[source].lost("put failed", text, frames=0)
 
     async def close(self) -> None:
         """Drop the pending queries. Their peers see at once that no reply follows."""
         self._is_closed = True
-        await self._answers.close()
+        await self.answers.close()
 
 
 def _facts(parameters: ServerParameters) -> dict[str, Any]:

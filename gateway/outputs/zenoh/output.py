@@ -147,7 +147,7 @@ class ZenohOutput(Output):
         """Count in ``losses`` refused queries about ``source``, and what else is not published of it."""
         self._json.losses[source] = losses
         if self._declarations is not None:
-            self._declarations.count_losses(source, losses)
+            self._declarations.losses[source] = losses
 
     def announce(self, source: str) -> None:
         """Declare the liveliness token PREFIX/SOURCE/alive, and answer queries about ``source``."""
@@ -201,7 +201,7 @@ class ZenohOutput(Output):
     @property
     def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
         """By source, the number of queries by result; None before ``serve_queries``."""
-        return None if self._declarations is None else self._declarations.results
+        return None if self._declarations is None else self._declarations.answers.admission.results
 
     def close(self) -> None:
         """Close the session. Otherwise a process with Zenoh callbacks never ends."""

@@ -121,7 +121,7 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
     used: list[str] = []
     for name, sender in (
         ("short", lab.declarations._sender),
-        ("long", lab.declarations._answers._long_sender),
+        ("long", lab.declarations.answers._long_sender),
     ):
         offer = sender.offer
 
@@ -229,7 +229,7 @@ async def test_what_zenoh_does_not_publish_is_counted_and_logged(
     loop = asyncio.get_running_loop()
     declarations = declarations_module.SourceDeclarations(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
     losses = Losses(logging.getLogger("test"), "lab, zenoh")
-    declarations.count_losses("lab", losses)
+    declarations.losses["lab"] = losses
     declarations.open(session, ["lab"])
     await asyncio.sleep(0)  # the event loop publishes what was there before: nothing
     session.close()

@@ -70,7 +70,7 @@ class Queries(SourceDeclarations):
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
         super().__init__(ZenohSettings(), None, loop)  # type: ignore[arg-type]  # nobody asks
-        self.count_losses("lab", Losses(declarations_module.logger, "lab to zenoh"))
+        self.losses["lab"] = Losses(declarations_module.logger, "lab to zenoh")
         self._parameters["lab"] = PARAMETERS
         self.published_s: list[float] = []
 
