@@ -71,7 +71,8 @@ class QueryAdmission:
         self._bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._refusals = TokenBucket(REFUSALS_PER_S, monotonic=monotonic)
-        self._num_pending = 0
+        self.num_pending = 0
+        """How many questions have been admitted and are not finished."""
         self._results: dict[str, Counter[str]] = {}  # by source
 
     @property
@@ -79,11 +80,6 @@ class QueryAdmission:
         """By source, the number of questions by result: ok, the code of the error, or NO_REPLY."""
         with self._lock:
             return {source: results.copy() for source, results in self._results.items()}
-
-    @property
-    def num_pending(self) -> int:
-        """How many questions have been admitted and are not finished."""
-        return self._num_pending
 
     def admit(self, source: str, key: str) -> Refusal | None:
         """Admit a question about ``key``, until ``finished`` is called for it; or return why not.
@@ -101,7 +97,7 @@ class QueryAdmission:
             if refusal is None:
                 self._total.take()
                 bucket.take()
-                self._num_pending += 1
+                self.num_pending += 1
             else:
                 self._count_result(source, refusal.error.code if refusal.is_sent else NO_REPLY)
             return refusal
@@ -109,7 +105,7 @@ class QueryAdmission:
     def finished(self, source: str, result: str) -> None:
         """Count the result of a question that was admitted; "" if it has none."""
         with self._lock:
-            self._num_pending -= 1
+            self.num_pending -= 1
             if result:
                 self._count_result(source, result)
 
@@ -137,7 +133,7 @@ class QueryAdmission:
         )
 
     def _refusal(self, bucket: TokenBucket) -> Refusal | None:
-        if self._num_pending >= self._limits.pending:
+        if self.num_pending >= self._limits.pending:
             error = QueryError("the gateway has too many queries; try again", code="busy")
             return Refusal(error, "queue", self._refusals.try_take())
         for allowed, per_s, setting, what in (

@@ -92,11 +92,6 @@ class SessionHolder:
         """Start the thread that opens the session."""
         thread_starts.start(self._opener)
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait until the thread has opened the session and declared everything, or was never started."""
-        if self._opener.is_alive():
-            self._opener.join(timeout_s)
-
     def _run(self) -> None:
         prepare_threads()
         while not self._closing.is_set():
