@@ -35,6 +35,9 @@ LONG_REPLY_BYTES: Final = 32 * 1024
 MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
 
+MAX_REMEMBERED: Final = 64
+"""How many commands are remembered with their results, for requests that are repeated."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -80,12 +83,11 @@ class LcmRequests:
         self._service = service
         self._loop = loop
         self._losses = losses
-        self._commands = LcmCommands(service)
         self._kinds = (
             RequestKind(
                 *("PARAMETERS", rtc3d.parameters_request_t, rtc3d.parameters_reply_t, self._answer_parameters)
             ),
-            self._commands.kind,
+            RequestKind("COMMAND", rtc3d.command_request_t, rtc3d.command_reply_t, self._answer_command),
         )
         url = settings.effective_queries_url
         is_own_url = url != settings.effective_url
@@ -101,6 +103,7 @@ class LcmRequests:
             QueryLimits.of("lcm", "max_queries_per_source_per_s", settings, MAX_PENDING)
         )
         self._tasks: set[asyncio.Task[None]] = set()
+        self._remembered: OrderedDict[tuple[Any, ...], asyncio.Task[ReplyContent]] = OrderedDict()
         self._defects = QueryDefects(logger)
 
     def add(self, source: str) -> None:
@@ -117,8 +120,7 @@ class LcmRequests:
     async def close(self) -> None:
         """Stop receiving requests. Those in progress get no reply."""
         await self.receiver.close()
-        self._commands.close()
-        for task in self._tasks:
+        for task in (*self._remembered.values(), *self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.long_sender.close()
@@ -214,6 +216,54 @@ class LcmRequests:
 
         return ReplyContent(len(parameters.xml), fill)
 
+    async def _answer_command(self, source: str, request: Any) -> ReplyContent:
+        """Return the answer to a command.
+
+        Requests and replies can be lost on LCM, so their senders repeat them. A command that changes
+        something is carried out once nevertheless: equal requests get the result of the first.
+        """
+        options = {}
+        for option in request.options:
+            name, separator, value = option.partition("=")
+            if not separator:
+                raise QueryError(f"option {quoted(option)} is not accepted; accepted: NAME=VALUE")
+            options[name] = value
+        if CONTROL_OPTION not in options:
+            return await self._carry_out(source, request.command, options)
+        identity = (source, request.request_id, request.requester, request.command, *request.options)
+        task = self._remembered.get(identity)
+        if task is None:
+            task = asyncio.create_task(self._carry_out(source, request.command, options))
+            self._remembered[identity] = task
+            task.add_done_callback(lambda done: self._finish(identity, done))
+        return await asyncio.shield(task)
+
+    def _finish(self, identity: tuple[Any, ...], task: asyncio.Task[ReplyContent]) -> None:
+        """Forget a command that failed, because it may be tried again, and the oldest of too many."""
+        if task.cancelled() or task.exception() is not None:
+            del self._remembered[identity]
+        while len(self._remembered) > MAX_REMEMBERED:
+            self._remembered.popitem(last=False)
+
+    async def _carry_out(self, source: str, command: str, options: dict[str, str]) -> ReplyContent:
+        if command not in self._service.commands():
+            accepted = ", ".join(self._service.commands())
+            raise QueryError(f"unknown command {quoted(command)}; accepted on LCM: {accepted}")
+        if READ_OPTION in options:
+            raise QueryError(
+                f"{command} with {READ_OPTION}= is not answered on LCM; ask on Zenoh (a take: rtc3d-gateway "
+                "take fetch, without --lcm)"
+            )
+        answer = await self._service.answer(source, tuple(command.split("/")), options)
+        content = answer.content
+        if answer.encoding != JSON or not isinstance(content, bytes):
+            raise QueryError(f"the answer to {command} with these options is no JSON; ask on Zenoh")
+
+        def fill(reply: Any) -> None:
+            reply.content = content.decode()
+
+        return ReplyContent(len(content), fill)
+
     # In the event loop, or in the thread that sends what is long.
 
     def _send_error(self, kind: RequestKind, source: str, request: Any, error: QueryError) -> None:
@@ -239,69 +289,3 @@ def _decoded(kind: RequestKind, data: bytes) -> Any | None:
     except Exception:  # noqa: BLE001 - lcm-gen's decoders raise anything
         return None
     return request if len(request.requester.encode()) <= MAX_REQUESTER_BYTES else None
-
-
-MAX_REMEMBERED: Final = 64
-"""How many commands are remembered with their results, for requests that are repeated."""
-
-
-class LcmCommands:
-    """Answers ``command_request_t`` with ``service``.
-
-    Requests and replies can be lost on LCM, so their senders repeat them. A command that changes something is
-    carried out once nevertheless: equal requests get the result of the first.
-    """
-
-    def __init__(self, service: QueryService) -> None:
-        self.kind = RequestKind("COMMAND", rtc3d.command_request_t, rtc3d.command_reply_t, self._answer_once)
-        """The requests that ``service`` answers."""
-        self._service = service
-        self._remembered: OrderedDict[tuple[Any, ...], asyncio.Task[ReplyContent]] = OrderedDict()
-
-    def close(self) -> None:
-        """Cancel the commands in progress."""
-        for task in self._remembered.values():
-            task.cancel()
-
-    async def _answer_once(self, source: str, request: Any) -> ReplyContent:
-        options = {}
-        for option in request.options:
-            name, separator, value = option.partition("=")
-            if not separator:
-                raise QueryError(f"option {quoted(option)} is not accepted; accepted: NAME=VALUE")
-            options[name] = value
-        if CONTROL_OPTION not in options:
-            return await self._answer(source, request.command, options)
-        identity = (source, request.request_id, request.requester, request.command, *request.options)
-        task = self._remembered.get(identity)
-        if task is None:
-            task = asyncio.create_task(self._answer(source, request.command, options))
-            self._remembered[identity] = task
-            task.add_done_callback(lambda done: self._finish(identity, done))
-        return await asyncio.shield(task)
-
-    def _finish(self, identity: tuple[Any, ...], task: asyncio.Task[ReplyContent]) -> None:
-        """Forget a command that failed, because it may be tried again, and the oldest of too many."""
-        if task.cancelled() or task.exception() is not None:
-            del self._remembered[identity]
-        while len(self._remembered) > MAX_REMEMBERED:
-            self._remembered.popitem(last=False)
-
-    async def _answer(self, source: str, command: str, options: dict[str, str]) -> ReplyContent:
-        if command not in self._service.commands():
-            accepted = ", ".join(self._service.commands())
-            raise QueryError(f"unknown command {quoted(command)}; accepted on LCM: {accepted}")
-        if READ_OPTION in options:
-            raise QueryError(
-                f"{command} with {READ_OPTION}= is not answered on LCM; ask on Zenoh (a take: rtc3d-gateway "
-                "take fetch, without --lcm)"
-            )
-        answer = await self._service.answer(source, tuple(command.split("/")), options)
-        content = answer.content
-        if answer.encoding != JSON or not isinstance(content, bytes):
-            raise QueryError(f"the answer to {command} with these options is no JSON; ask on Zenoh")
-
-        def fill(reply: Any) -> None:
-            reply.content = content.decode()
-
-        return ReplyContent(len(content), fill)
