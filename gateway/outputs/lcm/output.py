@@ -55,6 +55,7 @@ class LcmOutput(Output):
         self.has_tool_poses = settings.tool_poses
         self._shared = shared
         self._channels: set[str] = set()
+        self._loop: asyncio.AbstractEventLoop  # from ``serve_queries`` on
         self._requests: LcmRequests | None = None
         self._publications: dict[str, _Publication] = {}  # by source
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, self.name))  # by source
@@ -117,7 +118,7 @@ class LcmOutput(Output):
         publication = self._publications.setdefault(source, _Publication())
         publication.parameters, publication.arrived_utime = parameters, now_utime()
         sent = self._publish_again(source, publication, self._requests)
-        return None if sent is None else asyncio.wrap_future(sent)
+        return None if sent is None else asyncio.wrap_future(sent, loop=self._loop)
 
     def _publish_again(
         self, source: str, publication: _Publication, requests: LcmRequests
@@ -150,9 +151,9 @@ class LcmOutput(Output):
 
     def serve_queries(self, service: QueryService) -> None:
         """Publish parameters and, with ``lcm.queries``, answer ``parameters_request_t`` for each source."""
-        loop = asyncio.get_running_loop()
+        self._loop = asyncio.get_running_loop()
         shared = self._shared if self.settings.queries else None
-        self._requests = LcmRequests(self.settings, service, loop, self._sender, shared, self._losses)
+        self._requests = LcmRequests(self.settings, service, self._loop, self._sender, shared, self._losses)
 
     async def stop_queries(self) -> None:
         """Stop receiving requests. Pending requests get no reply."""
