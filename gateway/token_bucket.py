@@ -12,10 +12,7 @@ class TokenBucket:
     """
 
     def __init__(
-        self,
-        per_s: float,
-        capacity: float | None = None,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, per_s: float, capacity: float | None = None, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
         self._per_s = per_s
         self._capacity = max(per_s, 1.0) if capacity is None else capacity

@@ -157,11 +157,18 @@ class WorkerThread:
             if self._is_closed:
                 return
             self._is_closed = True
-            dropped = self._calls.copy(), self._offered.copy()
+            calls, offered = self._calls.copy(), self._offered.copy()
+
+            def end() -> None:
+                last()
+                for done, _ in calls:
+                    done.cancel()
+                calls.clear()  # freed in the thread, because to free a query of Zenoh can block
+                offered.clear()
+
             self._calls.clear()
             self._offered.clear()
-            # What the others hold is freed in the thread, because to free a query of Zenoh can block.
-            self._calls.append((Future(), functools.partial(_end, last, *dropped)))
+            self._calls.append((Future(), end))
             self._wake()
 
     def finish(self, timeout_s: float) -> bool:
@@ -217,32 +224,15 @@ class WorkerThread:
             return None
 
 
-def _end(
-    last: Callable[[], None],
-    calls: deque[tuple[Future[Any], Callable[[], Any]]],
-    offered: deque[tuple[int, Callable[[], None]]],
-) -> None:
-    """Make the last call of a thread, and drop those that waited."""
-    last()
-    for done, _ in calls:
-        done.cancel()
-    calls.clear()
-    offered.clear()
-
-
 async def result_of(call: Future[_Result]) -> _Result:
     """Return the result of a call, or raise its exception. Cancelling this does not cancel the call.
 
     What the call raises after that is not logged.
     """
     result = asyncio.wrap_future(call)
-    result.add_done_callback(_retrieve)
+    # Otherwise, asyncio logs that an exception was never retrieved.
+    result.add_done_callback(lambda done: done.cancelled() or done.exception())
     return await asyncio.shield(result)
-
-
-def _retrieve(result: "asyncio.Future[Any]") -> None:
-    if not result.cancelled():
-        result.exception()  # otherwise, asyncio logs that it was never retrieved
 
 
 def make_call(done: Future[_Result], call: Callable[[], _Result]) -> None:

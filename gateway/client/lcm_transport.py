@@ -33,7 +33,7 @@ from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
 from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.discovery import DISCOVERY_S, missing_source
+from gateway.outputs.kind import DISCOVERY_S, missing_source
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
 

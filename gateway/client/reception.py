@@ -17,8 +17,7 @@ from gateway.messages.encode import FINGERPRINT_BYTES, MESSAGE_TYPES, NOT_PUBLIS
 from gateway.messages.host_time import now_utime
 from gateway.messages.sequence import SequenceCheck
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.parameters_message import encode_parameters
+from gateway.outputs.contract import ServerParameters, encode_parameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
 PREFIX_END: Final = 40

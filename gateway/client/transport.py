@@ -12,7 +12,7 @@ from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
 from gateway.messages.source_report import SourceReport, source_report
-from gateway.outputs.discovery import DISCOVERY_S
+from gateway.outputs.kind import DISCOVERY_S
 
 MAX_SOURCES: Final = 1000
 """How many sources are kept. Anybody on the network can send some."""

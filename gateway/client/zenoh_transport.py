@@ -24,7 +24,7 @@ from gateway.client.transport import (
 from gateway.errors import QueryError
 from gateway.messages.decode import TEXT
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
-from gateway.outputs.discovery import DISCOVERY_S
+from gateway.outputs.kind import DISCOVERY_S
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 

@@ -13,9 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
+import rtc3d
+
 from gateway.logs.losses import Loss, Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
+from gateway.messages.texts import xml_text
 from gateway.messages.topics import Topic
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -157,6 +160,30 @@ class ServerParameters(NamedTuple):
     parsed: Parameters = Parameters()
     frame: CoordinateFrame = CoordinateFrame("")
     components: frozenset[ComponentType] = frozenset(WIRE_ORDER)
+
+
+_UTIME: Final = slice(8, 16)
+
+
+def encode_parameters(
+    parameters: ServerParameters, *, utime: int, arrived_utime: int, sequence: int
+) -> bytes:
+    """Return parameters as a ``parameters_t``, the same on LCM and in takes.
+
+    ``utime`` is when it is published, ``arrived_utime`` when the parameters arrived from the server, both in
+    µs since the Unix epoch.
+    """
+    message = rtc3d.parameters_t()
+    message.utime, message.capture_utime = utime, arrived_utime
+    message.sequence = sequence
+    message.session, message.parameters_version = parameters.session, parameters.version
+    message.xml = xml_text(parameters.xml)
+    return bytes(message.encode())
+
+
+def published_again(message: bytes, utime: int) -> bytes:
+    """Return an encoded ``parameters_t`` as of a later time, in µs since the Unix epoch."""
+    return message[: _UTIME.start] + utime.to_bytes(8, "big", signed=True) + message[_UTIME.stop :]
 
 
 class ServerFile(NamedTuple):

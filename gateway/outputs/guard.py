@@ -8,13 +8,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from gateway.errors import OutputError
 from gateway.logs.failures import DefectLog, defect_text
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import (
-    Command,
-    FramePublisher,
-    Output,
-    OutputHealth,
-    Publisher,
-)
+from gateway.outputs.contract import Command, FramePublisher, Output, OutputHealth, Publisher
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import FrameLayout
 
@@ -25,13 +19,21 @@ logger = getLogger(__name__)
 
 
 def _guarded(
-    method: Callable[Concatenate[Output, _Parameters], _Result], otherwise: _Result
+    method: Callable[Concatenate[Output, _Parameters], _Result],
+    otherwise: _Result,
+    *,
+    is_repeated: bool = False,
 ) -> Callable[Concatenate["GuardedOutput", _Parameters], _Result]:
-    """Return ``method`` of Output for a GuardedOutput: a call that returns ``otherwise`` after a defect."""
+    """Return ``method`` of Output for a GuardedOutput: a call that returns ``otherwise`` after a defect.
+
+    If ``is_repeated``, the gateway makes the call again and again, so a defect does not damage the output.
+    """
     name = method.__name__
 
     def call(self: "GuardedOutput", /, *args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
         inner: Callable[_Parameters, _Result] = getattr(self.output, name)
+        if is_repeated:
+            return self.defects.attempt(partial(inner, *args, **kwargs), otherwise)
         return self.try_once(inner, otherwise, *args, **kwargs)
 
     return call
@@ -48,11 +50,11 @@ class GuardedOutput(Output):
     def __init__(self, output: Output) -> None:
         self.output = output
         """The output itself."""
+        self.defects = DefectLog(logger, output.name)
         self.name = output.name
         self.max_rate_hz = output.max_rate_hz
         self.has_tool_poses = output.has_tool_poses
         self.drop_causes = output.drop_causes
-        self._defects = DefectLog(logger, output.name)
         self._damage = ""
 
     def try_once(
@@ -66,11 +68,9 @@ class GuardedOutput(Output):
         try:
             return call(*args, **kwargs)
         except Exception as defect:  # noqa: BLE001 - other outputs continue
-            self._defects.log(defect)
+            self.defects.log(defect)
             self._damage = self._damage or defect_text(defect)
             return otherwise
-
-    # Calls that are not made again: a defect damages the output.
 
     start = _guarded(Output.start, None)
     close = _guarded(Output.close, None)
@@ -83,24 +83,25 @@ class GuardedOutput(Output):
     publish_parameters = _guarded(Output.publish_parameters, None)
     announce_file = _guarded(Output.announce_file, None)
     serve_queries = _guarded(Output.serve_queries, None)
+    maintain = _guarded(Output.maintain, None, is_repeated=True)
+    topic_names = _guarded(Output.topic_names, {}, is_repeated=True)
 
     def publisher(self, topic: Topic) -> Publisher:
         """See Output. After a defect, the publisher accepts nothing, so that every message counts as lost."""
-        publisher = self.try_once(self.output.publisher, _Refusal(topic.source), topic)
-        return _GuardedPublisher(publisher, self._defects)
+        return _GuardedPublisher(
+            self.try_once(self.output.publisher, _Refusal(topic.source), topic), self.defects
+        )
 
     def frame_publisher(self, source: str) -> FramePublisher | None:
         """See Output. After a defect, the publisher accepts nothing, so that every frame counts as lost."""
         publisher = self.try_once(self.output.frame_publisher, _Refusal(source), source)
-        return None if publisher is None else _GuardedFramePublisher(publisher, self._defects)
+        return None if publisher is None else _GuardedPublisher(publisher, self.defects)
 
     def take_over(self, other: Output) -> bool:
         """See Output."""
         differs = self.try_once(self.output.take_over, True, _inner(other))
         self.has_tool_poses = self.output.has_tool_poses
         return differs
-
-    # Calls that are made again and again.
 
     def health(self) -> OutputHealth:
         """See Output. A defect is a problem of the output."""
@@ -111,28 +112,20 @@ class GuardedOutput(Output):
         try:
             return self.output.health()
         except Exception as defect:  # noqa: BLE001 - other outputs continue
-            self._defects.log(defect)
+            self.defects.log(defect)
             return OutputHealth(False, f"{defect_text(defect)}; report this with the log")
 
     def is_configured_like(self, other: Output) -> bool:
         """See Output. One that a defect has damaged is like no other, so that a reload replaces it."""
         is_like = partial(self.output.is_configured_like, _inner(other))
-        return not self._damage and self._defects.attempt(is_like, False)
-
-    def maintain(self) -> None:
-        """See Output."""
-        self._defects.attempt(self.output.maintain, None)
-
-    def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
-        """See Output."""
-        return self._defects.attempt(partial(self.output.topic_names, source), {})
+        return not self._damage and self.defects.attempt(is_like, False)
 
     async def follow_recording(self, source: str, *, start: bool, name: str) -> Mapping[str, Any]:
         """See Output. After a defect, the recording starts nevertheless."""
         try:
             return await self.output.follow_recording(source, start=start, name=name)
         except Exception as defect:  # noqa: BLE001 - other outputs continue
-            self._defects.log(defect)
+            self.defects.log(defect)
             return {}
 
     async def stop_queries(self) -> None:
@@ -140,17 +133,17 @@ class GuardedOutput(Output):
         try:
             await self.output.stop_queries()
         except Exception as defect:  # noqa: BLE001 - the output is closed nevertheless
-            self._defects.log(defect)
+            self.defects.log(defect)
 
     @property
     def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
         """See Output."""
-        return self._defects.attempt(lambda: self.output.query_results, None)
+        return self.defects.attempt(lambda: self.output.query_results, None)
 
     @property
     def commands(self) -> Mapping[str, Command]:
         """See Output."""
-        return self._defects.attempt(lambda: self.output.commands, {})
+        return self.defects.attempt(lambda: self.output.commands, {})
 
 
 def _inner(output: Output) -> Output:
@@ -158,9 +151,9 @@ def _inner(output: Output) -> Output:
 
 
 class _GuardedPublisher:
-    """A publisher whose ``wanted`` and ``close`` do not raise. ``publish`` may, and costs nothing more."""
+    """A publisher of which no method raises but ``publish``, which costs nothing more."""
 
-    def __init__(self, publisher: Publisher, defects: DefectLog) -> None:
+    def __init__(self, publisher: Any, defects: DefectLog) -> None:
         self.publish: Any = publisher.publish
         self._publisher = publisher
         self._defects = defects
@@ -168,28 +161,16 @@ class _GuardedPublisher:
     @property
     def wanted(self) -> bool:
         try:
-            return self._publisher.wanted
+            return bool(self._publisher.wanted)
         except Exception as defect:  # noqa: BLE001 - other outputs continue
             self._defects.log(defect)
             return True
 
-    def close(self) -> None:
-        self._defects.attempt(self._publisher.close, None)
-
-
-class _GuardedFramePublisher:
-    """A publisher of frames of which no method raises but ``publish``."""
-
-    def __init__(self, publisher: FramePublisher, defects: DefectLog) -> None:
-        self.publish: Any = publisher.publish
-        self._publisher = publisher
-        self._defects = defects
-
     def wants(self, components: Collection[ComponentType]) -> bool:
-        return self._defects.attempt(partial(self._publisher.wants, components), True)
+        return self._defects.attempt(lambda: bool(self._publisher.wants(components)), True)
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
-        return self._defects.attempt(partial(self._publisher.prepare, layout, components), True)
+        return self._defects.attempt(lambda: bool(self._publisher.prepare(layout, components)), True)
 
     def close(self) -> None:
         self._defects.attempt(self._publisher.close, None)

@@ -1,10 +1,10 @@
-"""The description of an output in the registry: its name, its settings, and functions for it.
+"""The description of an output in the registry: its name, its settings, functions for it, and subscribing.
 
 The optional functions are for the commands ``echo``, ``doctor`` and ``demo``. An output without the function
 is left out of that command.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -47,6 +47,22 @@ def imported_late(path: str, extra: str = "") -> Callable[..., Any]:
 
 Receive = Callable[[str, bytes], None]
 """Takes the key or channel, and the message. Called in a thread of the subscription."""
+
+
+DISCOVERY_S: Final = 2.5
+"""How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""
+
+_MAX_NAMED: Final = 20
+
+
+def missing_source(wanted: Collection[str], served: Collection[str]) -> str:
+    """Return which of the ``wanted`` sources is not served, and which sources are; "" if all are."""
+    missing = [source for source in wanted if source not in served]
+    if not missing:
+        return ""
+    names = sorted(served)
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return f"no gateway serves source {missing[0]!r}; sources found: {', '.join(names[:_MAX_NAMED])}{more}"
 
 
 OPENS: Final = "opens"

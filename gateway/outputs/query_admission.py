@@ -7,9 +7,9 @@ questions costs the event loop no more than the questions that are answered.
 import logging
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 from gateway.errors import QueryError
 from gateway.logs.failures import DefectLog
@@ -38,6 +38,15 @@ class QueryLimits(NamedTuple):
     reply_bytes_per_s: float
     pending: int
 
+    @classmethod
+    def of(cls, output: str, key_setting: str, settings: Any, pending: int) -> Self:
+        """Return the limits that the ``settings`` of an output have."""
+        return cls(
+            *(output, key_setting, settings.max_queries_per_s, getattr(settings, key_setting)),
+            reply_bytes_per_s=settings.max_reply_bytes_per_s,
+            pending=pending,
+        )
+
 
 class Refusal(NamedTuple):
     """Why a question is not answered. ``cause`` is rate or queue, for counters.
@@ -58,11 +67,12 @@ class QueryAdmission:
         self._monotonic = monotonic
         self._lock = threading.Lock()
         self._total = TokenBucket(limits.per_s, monotonic=monotonic)
-        self._keys: OrderedDict[str, TokenBucket] = OrderedDict()
+        self._keys: dict[str, TokenBucket] = {}  # the one that was asked for least recently is first
         self._bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._refusals = TokenBucket(REFUSALS_PER_S, monotonic=monotonic)
-        self._num_pending = 0
+        self.num_pending = 0
+        """How many questions have been admitted and are not finished."""
         self._results: dict[str, Counter[str]] = {}  # by source
 
     @property
@@ -71,22 +81,23 @@ class QueryAdmission:
         with self._lock:
             return {source: results.copy() for source, results in self._results.items()}
 
-    @property
-    def num_pending(self) -> int:
-        """How many questions have been admitted and are not finished."""
-        return self._num_pending
-
     def admit(self, source: str, key: str) -> Refusal | None:
         """Admit a question about ``key``, until ``finished`` is called for it; or return why not.
 
         It is counted for ``source``, one of the gateway's.
         """
         with self._lock:
-            refusal = self._refusal(key)
+            bucket = self._keys.pop(key, None)
+            if bucket is None:
+                bucket = TokenBucket(self._limits.per_key_per_s, monotonic=self._monotonic)
+                if len(self._keys) >= MAX_KEYS:
+                    del self._keys[next(iter(self._keys))]
+            self._keys[key] = bucket
+            refusal = self._refusal(bucket)
             if refusal is None:
                 self._total.take()
-                self._keys[key].take()
-                self._num_pending += 1
+                bucket.take()
+                self.num_pending += 1
             else:
                 self._count_result(source, refusal.error.code if refusal.is_sent else NO_REPLY)
             return refusal
@@ -94,7 +105,7 @@ class QueryAdmission:
     def finished(self, source: str, result: str) -> None:
         """Count the result of a question that was admitted; "" if it has none."""
         with self._lock:
-            self._num_pending -= 1
+            self.num_pending -= 1
             if result:
                 self._count_result(source, result)
 
@@ -121,9 +132,8 @@ class QueryAdmission:
             code="rate",
         )
 
-    def _refusal(self, key: str) -> Refusal | None:
-        bucket = self._bucket(key)
-        if self._num_pending >= self._limits.pending:
+    def _refusal(self, bucket: TokenBucket) -> Refusal | None:
+        if self.num_pending >= self._limits.pending:
             error = QueryError("the gateway has too many queries; try again", code="busy")
             return Refusal(error, "queue", self._refusals.try_take())
         for allowed, per_s, setting, what in (
@@ -137,16 +147,6 @@ class QueryAdmission:
                 )
                 return Refusal(QueryError(text, code="rate"), "rate", self._refusals.try_take())
         return None
-
-    def _bucket(self, key: str) -> TokenBucket:
-        bucket = self._keys.get(key)
-        if bucket is None:
-            if len(self._keys) >= MAX_KEYS:
-                self._keys.popitem(last=False)
-            bucket = self._keys[key] = TokenBucket(self._limits.per_key_per_s, monotonic=self._monotonic)
-        else:
-            self._keys.move_to_end(key)
-        return bucket
 
 
 class QueryDefects:

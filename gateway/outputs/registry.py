@@ -16,13 +16,13 @@ from gateway.logs.safe_text import safe_text
 from gateway.outputs.contract import Output
 from gateway.outputs.foxglove.settings import FOXGLOVE
 from gateway.outputs.kind import OutputKind
-from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.lcm.settings import LCM
 from gateway.outputs.lsl.settings import LSL
 from gateway.outputs.ros2.settings import ROS2
 from gateway.outputs.rtc3d.settings import RTC3D
 from gateway.outputs.takes.settings import TAKES
 from gateway.outputs.vrpn.settings import VRPN
-from gateway.outputs.zenoh.kind import ZENOH
+from gateway.outputs.zenoh.settings import ZENOH
 
 GROUP: Final = "rtc3d_gateway.outputs"
 """The group of entry points in which packages name their OutputKind."""

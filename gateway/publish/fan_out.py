@@ -3,12 +3,13 @@
 import logging
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 from gateway.messages.encode import MESSAGE_TYPES, Stamp, encode_content, has_lcm_form, lcm_content
 from gateway.outputs.contract import Output, OutputStatus, ServerParameters
-from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
+from gateway.publish.routes import FrameRoute, OutputRoute, TopicRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -91,7 +92,7 @@ class _ComponentPlan:
     """How to publish one component of a layout: its index and place in the frame, and its routes."""
 
     def __init__(
-        self, component: _Component, layout: FrameLayout, index: int, routes: list[ComponentRoute]
+        self, component: _Component, layout: FrameLayout, index: int, routes: list[TopicRoute]
     ) -> None:
         self.routes = routes
         self._component = component
@@ -112,32 +113,19 @@ class _ComponentPlan:
         return message
 
 
+@dataclass
 class _Plan:
-    """How to publish the ``wanted`` components of a layout. Made once per layout, not for every frame.
+    """How to publish the ``wanted`` components of a layout. Made once per layout, not for every frame."""
 
-    ``frame_routes`` are those of the outputs that publish such frames now. ``tool_indices`` are the indices
-    of 6D components whose poses are published per tool. ``num_items`` are the numbers of markers, tools,
-    channels and plates.
-    """
-
-    def __init__(
-        self,
-        layout: FrameLayout,
-        wanted: frozenset[ComponentType],
-        components: list[_ComponentPlan],
-        frame_routes: list[FrameRoute],
-        tool_indices: list[int],
-    ) -> None:
-        self.layout = layout
-        self.wanted = wanted
-        self.components = components
-        self.frame_routes = frame_routes
-        self.tool_indices = tool_indices
-        self.num_items: dict[ComponentType, int] = {
-            component.type: component.num_items
-            for component in layout.components
-            if component.type in wanted and component.type is not ComponentType.EVENT
-        }
+    layout: FrameLayout
+    wanted: frozenset[ComponentType]
+    components: list[_ComponentPlan]
+    frame_routes: list[FrameRoute]
+    """Those of the outputs that publish such frames now."""
+    tool_indices: list[int]
+    """The indices of 6D components whose poses are published per tool."""
+    num_items: dict[ComponentType, int]
+    """The numbers of markers, tools, channels and plates."""
 
 
 class FanOut:
@@ -152,10 +140,7 @@ class FanOut:
     """
 
     def __init__(
-        self,
-        source: str,
-        outputs: Sequence[Output],
-        on_items_changed: Callable[[], None] = lambda: None,
+        self, source: str, outputs: Sequence[Output], on_items_changed: Callable[[], None] = lambda: None
     ) -> None:
         self.on_items_changed = on_items_changed
         self._source = source
@@ -228,15 +213,15 @@ class FanOut:
     def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish the ``wanted`` components of a frame. Raises nothing if an output fails."""
         # This is the inner loop of the gateway; benchmarks/own_cost.py measures it.
-        plan = self._plan_of(frame, stamp, wanted)
-        if not plan.components:
-            return
+        plan = self._plan
+        if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
+            plan = self._change_plan(frame, stamp, wanted)
         for frame_route in plan.frame_routes:
             frame_route.publish(frame, stamp, wanted)
         for component in plan.components:
             message = component.next_message(frame, stamp)
             for route in component.routes:
-                route.publish(message, stamp)
+                route.send(message, stamp)
         if plan.tool_indices:
             self._tool_poses.publish(frame, plan.tool_indices, stamp)
 
@@ -245,9 +230,7 @@ class FanOut:
 
         Returns how many messages this loses. Messages that pacing leaves out on every output do not count.
         """
-        plan = self._plan_of(frame, stamp, components)
-        if not plan.components:
-            return 0
+        plan = self._change_plan(frame, stamp, components)
         num_lost = self._tool_poses.skip(frame, plan.tool_indices)
         for component in plan.components:
             message = component.next_message(frame, stamp)
@@ -255,12 +238,10 @@ class FanOut:
             num_lost += any(is_lost) or bool(plan.frame_routes)
         return num_lost
 
-    def _plan_of(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
-        plan = self._plan
-        if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
-            self._plan = plan = self._plan_for(frame.layout, wanted)
-            if self._item_counts.update(plan.num_items, stamp.session):
-                self.on_items_changed()
+    def _change_plan(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
+        self._plan = plan = self._plan_for(frame.layout, wanted)
+        if self._item_counts.update(plan.num_items, stamp.session):
+            self.on_items_changed()
         return plan
 
     def _new_plan(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> _Plan:
@@ -279,9 +260,13 @@ class FanOut:
             )
             for index, component in indexed
         ]
-        tools = [index for index, component in indexed if component.type is ComponentType.TOOLS]
-        frame_routes = [route for route in self._frame_routes if plans and route.prepare(layout, wanted)]
-        return _Plan(layout, wanted, plans, frame_routes, tools if self._tool_poses.is_used else [])
+        is_used = self._tool_poses.is_used
+        return _Plan(
+            *(layout, wanted, plans),
+            [route for route in self._frame_routes if plans and route.publisher.prepare(layout, wanted)],
+            [index for index, each in indexed if is_used and each.type is ComponentType.TOOLS],
+            {each.type: each.num_items for _, each in indexed if each.type is not ComponentType.EVENT},
+        )
 
     def forget_layouts(self) -> None:
         """Forget how to publish earlier frames: the connection ended, or an output wants something else."""

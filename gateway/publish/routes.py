@@ -15,9 +15,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.contract import WHOLE_FRAME, FramePublisher, Output, OutputStatus
 from gateway.outputs.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
-
-_NOT_OPEN: Final = "not open"  # the cause in an OutputError
+from gateway.rtc3d.frames import Frame
 
 OPENING_S: Final = 2.0
 """How long an output may take to open, before the gateway starts without it, or warns after a reload."""
@@ -59,13 +57,19 @@ class OutputRoute:
         frame_publisher = output.frame_publisher(source)
         self.frame_route: FrameRoute | None = None
         """For whole frames. An output that takes them gets no single components."""
-        self.components: dict[ComponentType, ComponentRoute] = {}
+        self.components: dict[ComponentType, TopicRoute] = {}
         if frame_publisher is not None:
             self.frame_route = FrameRoute(self, frame_publisher)
         else:
             before = {} if predecessor is None else predecessor.components
             for component, sequence in sequences.items():
-                self.components[component] = ComponentRoute(self, component, sequence, before.get(component))
+                is_event = component is ComponentType.EVENT  # events are never left out
+                self.components[component] = TopicRoute(
+                    *(self, (component.key,), MESSAGE_TYPES[component], component.key),
+                    max_rate_hz=None if is_event else output.max_rate_hz.get(component),
+                    sequence=sequence,
+                    predecessor=before.get(component),
+                )
         self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
         self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
         self.is_selective: bool = output.watch_wanted(source, on_wanted_changed)
@@ -86,109 +90,91 @@ class OutputRoute:
             takes_frames=self.frame_route is not None,
         )
 
-    def count_loss(self, error: Exception, frame: object | None) -> None:
-        """Count a message of ``frame`` that the output did not accept; None if it belongs to no frame."""
+    def count_loss(self, error: Exception, stamp: Stamp | None) -> None:
+        """Count a message that the output did not accept, of the frame with ``stamp`` or of none."""
         cause = error.cause if isinstance(error, OutputError) else type(error).__name__
         text = str(error) if isinstance(error, OutputError) else f"{cause}: {error}"
         # A reload replaces an output by one that takes a moment to open. That is no reason for a warning.
-        is_opening = cause == _NOT_OPEN and time.monotonic() < self._opening_until_s
-        self.losses.message_lost(cause, text, frame, level=logging.INFO if is_opening else logging.WARNING)
+        is_opening = cause == "not open" and time.monotonic() < self._opening_until_s
+        self.losses.message_lost(cause, text, stamp, level=logging.INFO if is_opening else logging.WARNING)
 
     def close(self) -> None:
         """Close the publishers and withdraw the source from the output."""
         for route in (*self.components.values(), self.status_route, self.clock_route):
-            route.close()
+            route.publisher.close()
         if self.frame_route is not None:
-            self.frame_route.close()
+            self.frame_route.publisher.close()
         self.losses.close()
         self.output.withdraw(self.source)
 
 
 class TopicRoute:
-    """The route of one topic to one output. Its messages are counted under ``counted_as``."""
+    """The route of one topic to one output. Its messages are counted under ``counted_as``.
+
+    With ``max_rate_hz``, it leaves messages out and numbers the others itself, so that only loss is a gap. It
+    continues the numbers of ``predecessor`` if that was paced, too. Otherwise it begins with ``sequence``,
+    the number of the next message on routes that are not paced: no route ever goes back to smaller numbers.
+    """
 
     def __init__(
-        self, output_route: OutputRoute, path: tuple[str, ...], message_type: type[Any], counted_as: str
+        self,
+        output_route: OutputRoute,
+        path: tuple[str, ...],
+        message_type: type[Any],
+        counted_as: str,
+        max_rate_hz: float | None = None,
+        sequence: int = 0,
+        predecessor: "TopicRoute | None" = None,
     ) -> None:
         topic = Topic(output_route.source, path, lcm_type_name(message_type))
         self.publisher = output_route.output.publisher(topic)
         self._publish = self.publisher.publish  # saves looking it up for every message
         self._output_route = output_route
         self._sent = output_route.sent.setdefault(counted_as, SentCounter())
+        self._pacer = None if max_rate_hz is None else Pacer(max_rate_hz)
+        self._sequence = sequence  # of the next message; only used if the route is paced
+        if predecessor is not None and predecessor._pacer is not None:  # noqa: SLF001 - of the same class
+            self._sequence = predecessor._sequence  # noqa: SLF001
 
     @property
     def is_idle(self) -> bool:
         """Whether to publish nothing now, because the output wants nothing."""
         return self._output_route.is_selective and not self.publisher.wanted
 
-    def send(self, message: bytes, frame: object | None = None) -> None:
-        """Publish and count one message; never raises, because outputs must not disturb each other.
+    def send(self, message: bytes, stamp: Stamp | None = None) -> None:
+        """Publish and count one message, unless pacing leaves it out.
 
-        ``frame`` is any object that all messages of one frame share, None if there is no frame.
+        Never raises, because outputs must not disturb each other. ``stamp`` is that of the message's frame;
+        None if it belongs to no frame.
         """
+        if self._pacer is not None and stamp is not None:
+            if not _is_due(self._pacer, message, stamp):
+                return
+            message = with_sequence(message, self._sequence)
+            self._sequence += 1  # even if the output does not accept it, so that subscribers see the loss
         try:
             self._publish(message)
         except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
-            self._output_route.count_loss(error, frame)
+            self._output_route.count_loss(error, stamp)
         else:
             self._sent.messages += 1
             self._sent.bytes += len(message)
 
-    def close(self) -> None:
-        """Close the publisher."""
-        self.publisher.close()
-
-
-class ComponentRoute(TopicRoute):
-    """The route of one component to one output.
-
-    A paced route leaves messages out and numbers the others itself, so that only loss is a gap. It continues
-    the numbers of ``predecessor`` if that was paced, too. Otherwise it begins with ``sequence``, the number
-    of the next message on routes that are not paced: no route ever goes back to smaller numbers.
-    """
-
-    def __init__(
-        self,
-        output_route: OutputRoute,
-        component: ComponentType,
-        sequence: int,
-        predecessor: "ComponentRoute | None",
-    ) -> None:
-        super().__init__(output_route, (component.key,), MESSAGE_TYPES[component], component.key)
-        max_rate_hz = output_route.output.max_rate_hz.get(component)
-        if component is ComponentType.EVENT:  # events are never left out
-            max_rate_hz = None
-        self._pacer = None if max_rate_hz is None else Pacer(max_rate_hz)
-        self._sequence = sequence  # of the next message; only used if the route is paced
-        if predecessor is not None and predecessor._pacer is not None:  # noqa: SLF001 - of the same class
-            self._sequence = predecessor._sequence  # noqa: SLF001
-
-    def publish(self, message: bytes, stamp: Stamp) -> None:
-        """Publish a message, unless the pacer leaves it out.
-
-        A message that the output does not accept uses up its number, so that subscribers see the loss.
-        """
-        if self._pacer is None:
-            self.send(message, stamp)
-        elif self._is_due(self._pacer, message, stamp):
-            self.send(with_sequence(message, self._sequence), stamp)
-            self._sequence += 1
-
     def skip(self, message: bytes, stamp: Stamp) -> bool:
-        """Use up the number of a message that is not published. Return False if the pacer leaves it out."""
-        if self._pacer is None:
-            return True
-        is_due = self._is_due(self._pacer, message, stamp)
-        if is_due:
+        """Use up the number of a message that is not published. Return False if pacing leaves it out."""
+        if self._pacer is not None:
+            if not _is_due(self._pacer, message, stamp):
+                return False
             self._sequence += 1
-        return is_due
+        return True
 
     def numbered(self, message: bytes) -> bytes:
         """Return the newest message with the number of the newest one that this route has let through."""
         return message if self._pacer is None else with_sequence(message, self._sequence - 1)
 
-    def _is_due(self, pacer: Pacer, message: bytes, stamp: Stamp) -> bool:
-        return pacer.due(message_timestamp_us(message) if stamp.has_clock else None, stamp.utime)
+
+def _is_due(pacer: Pacer, message: bytes, stamp: Stamp) -> bool:
+    return pacer.due(message_timestamp_us(message) if stamp.has_clock else None, stamp.utime)
 
 
 class FrameRoute:
@@ -199,10 +185,6 @@ class FrameRoute:
         self._output_route = output_route
         self._sent = output_route.sent.setdefault(WHOLE_FRAME, SentCounter())
 
-    def prepare(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> bool:
-        """Return whether to publish frames of ``layout``."""
-        return self.publisher.prepare(layout, wanted)
-
     def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""
         try:
@@ -212,7 +194,3 @@ class FrameRoute:
         else:
             self._sent.messages += 1
             self._sent.bytes += len(frame.body)
-
-    def close(self) -> None:
-        """Close the publisher."""
-        self.publisher.close()

@@ -38,7 +38,7 @@ class _Tool:
         """Open the routes that are missing, and close those to other outputs."""
         path = (ComponentType.TOOLS.key, self.name)
         for output_route in self.routes.keys() - set(output_routes):
-            self.routes.pop(output_route).close()
+            self.routes.pop(output_route).publisher.close()
         for output_route in output_routes:
             if output_route not in self.routes:
                 self.routes[output_route] = TopicRoute(output_route, path, rtc3d.tool_pose_t, "6d/tool")
@@ -72,7 +72,9 @@ class ToolPoses:
         labels = () if parsed.tools is None else tuple(tool.label for tool in parsed.tools.tools)
         if labels != self._labels:
             self._labels = labels
-            self._close_topics()
+            for tool in self._tools:
+                tool.set_routes(())
+            self._tools.clear()
         self._parameters = parsed
         self._frame = parameters.frame
 
@@ -143,11 +145,6 @@ class ToolPoses:
             self._tools.append(tool)
         for name in list(self._sequences)[:-_MAX_REMEMBERED_NAMES]:
             del self._sequences[name]
-
-    def _close_topics(self) -> None:
-        for tool in self._tools:
-            tool.set_routes(())
-        self._tools.clear()
 
 
 def _num_tools(frame: Frame, indices: Sequence[int]) -> int:

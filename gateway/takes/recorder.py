@@ -13,7 +13,7 @@ from typing import Final
 from gateway.client.reception import Reception, Series, Source
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.host_time import now_utime
-from gateway.outputs.parameters_message import published_again
+from gateway.outputs.contract import published_again
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.new_file import default_name, numbered
 from gateway.takes.files.reader import SUFFIX

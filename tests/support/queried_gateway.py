@@ -149,9 +149,9 @@ async def wait_until_cached(gateway: Gateway) -> None:
     """Wait until the gateway answers queries, knows the parameters, and its handshakes are done."""
     await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
     for output in (each.output for each in gateway.outputs):
-        if isinstance(output, LcmOutput) and output._queries is not None and output.settings.queries:
+        if isinstance(output, LcmOutput) and output._requests is not None and output.settings.queries:
             # The thread that receives requests opens it once it receives; a request before that is lost.
-            replies = output._queries._reply_sender
+            replies = output._requests._sender
             await wait_until_async(lambda: not replies.problem)  # noqa: B023
     [source] = gateway.sources
     await wait_until_async(lambda: source.queries.parameters.newest)

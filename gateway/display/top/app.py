@@ -20,7 +20,7 @@ from gateway.errors import QueryError
 from gateway.logs.safe_text import safe_json, safe_text
 from gateway.messages.decode import json_text
 from gateway.messages.host_time import now_utime
-from gateway.outputs.discovery import DISCOVERY_S, missing_source
+from gateway.outputs.kind import DISCOVERY_S, missing_source
 
 _MAX_FILTER: Final = 60
 _MAX_NOTICE_LINES: Final = 3

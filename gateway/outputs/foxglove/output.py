@@ -22,9 +22,8 @@ from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParamet
 from gateway.outputs.foxglove.connections import Viewer
 from gateway.outputs.foxglove.server import Channel, FoxgloveServer, send
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.frame_output import PortOpener, ServerOutput
+from gateway.outputs.frame_output import LoopThread, PortOpener, ServerOutput, in_this_loop
 from gateway.outputs.listen_address import host_in_url
-from gateway.outputs.threads import LoopThread, in_this_loop
 from gateway.rtc3d.components import COMPONENT_HEADER_BYTES, ITEM_DTYPES, WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import ComponentLayout, Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters

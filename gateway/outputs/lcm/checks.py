@@ -17,8 +17,6 @@ from gateway.outputs.lcm.connection import (
 )
 from gateway.outputs.lcm.settings import LcmSettings
 
-CHECKS: Final = ("route", "requests", "buffers")
-
 PAUSE_S: Final = 0.02
 """The longest time that a subscriber may pause without losing a message."""
 
@@ -27,7 +25,7 @@ _LARGEST_DATAGRAM: Final = 65_499
 
 _LOOPBACK: Final = {None, "", "127.0.0.1", "::1", "localhost"}
 
-_ROUTE, _REQUESTS, _BUFFERS = (Check("lcm", name) for name in CHECKS)
+_ROUTE, _REQUESTS, _BUFFERS = Check("lcm", "route"), Check("lcm", "requests"), Check("lcm", "buffers")
 
 
 def check_lcm(
@@ -37,21 +35,16 @@ def check_lcm(
     url = settings.effective_url
     scheme = scheme_of(url)
     if scheme not in MULTICAST_SCHEMES:
-        return [
-            _check_other_scheme(url, scheme),
-            _check_requests(settings),
-            _BUFFERS.not_tested(f"{scheme} does not need a receive buffer"),
-        ]
+        route = _ROUTE.passing(f"{url} does not need multicast")
+        if scheme == "tcpq":
+            try:
+                open_lcm(url)
+            except OutputError as error:
+                problem = str(error).partition("; ")[0]
+                route = _ROUTE.failing(problem, "Start LCM's TCP relay, or correct lcm.url.")
+        buffers = _BUFFERS.not_tested(f"{scheme} does not need a receive buffer")
+        return [route, _check_requests(settings), buffers]
     return [_check_route(url), _check_requests(settings), _check_buffers(url, loads)]
-
-
-def _check_other_scheme(url: str, scheme: str) -> Finding:
-    if scheme == "tcpq":
-        try:
-            open_lcm(url)
-        except OutputError as error:
-            return _ROUTE.failing(str(error).partition("; ")[0], "Start LCM's TCP relay, or correct lcm.url.")
-    return _ROUTE.passing(f"{url} does not need multicast")
 
 
 def leaves_host(settings: LcmSettings) -> bool:

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import ipaddress
 import os
+import select
 import socket
 import struct
 import sys
@@ -162,6 +163,39 @@ def open_lcm(url: str) -> lcm.LCM:
         return lcm.LCM(_with_address(url))
     except RuntimeError as error:
         raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
+
+
+class Waiting:
+    """The wait of a thread for what arrives on LCM, which other threads can end."""
+
+    def __init__(self) -> None:
+        self._woken, self._waker = socket.socketpair()
+
+    def wait(self, connection: lcm.LCM | socket.socket) -> bool:
+        """Wait until something has arrived, or ``wake`` is called; return whether something has.
+
+        Raises OSError if the connection is closed.
+        """
+        number, woken = connection.fileno(), self._woken.fileno()
+        if number < 0:
+            raise OSError(errno.ENOTCONN, os.strerror(errno.ENOTCONN))
+        poll = select.poll()
+        poll.register(number, select.POLLIN)
+        poll.register(woken, select.POLLIN)
+        ready = {each for each, _ in poll.poll()}
+        if woken in ready:
+            self._woken.recv(4096)
+        return number in ready
+
+    def wake(self) -> None:
+        """End the wait, or the next one. Called in any thread."""
+        with contextlib.suppress(OSError):  # the thread has ended, or is about to wake up
+            self._waker.send(b"\0", socket.MSG_DONTWAIT)
+
+    def close(self) -> None:
+        """Free the sockets."""
+        self._woken.close()
+        self._waker.close()
 
 
 def reconnect(connection: lcm.LCM, channel: str) -> None:

@@ -15,118 +15,12 @@ from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters
-from gateway.outputs.lcm.receiver import LcmReceiver
-from gateway.outputs.lcm.requests import (
-    LONG_REPLY_BYTES,
-    MAX_PENDING,
-    LcmCommands,
-    LcmRequests,
-    parameter_requests,
-)
-from gateway.outputs.lcm.sender import LcmPublisher, LcmSender, LcmThreadSender, new_sender
+from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters, encode_parameters
+from gateway.outputs.lcm.requests import LONG_REPLY_BYTES, LcmRequests
+from gateway.outputs.lcm.sender import LcmPublisher, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.parameters_message import encode_parameters
-from gateway.workers import WorkerThread
 
 logger = logging.getLogger(__name__)
-
-
-class LcmOutput(Output):
-    """Publishes on one LCM URL.
-
-    ``shared`` is an existing LCM object to use, because memq:// connects only users of one object.
-    """
-
-    name = "lcm"
-    drop_causes = ("not open", "send failed", "closed")
-
-    def __init__(self, settings: LcmSettings, shared: lcm.LCM | None = None) -> None:
-        self.settings = settings
-        self.max_rate_hz = settings.max_rate_hz
-        self.has_tool_poses = settings.tool_poses
-        self._shared = shared
-        self._channels: set[str] = set()
-        self._queries: LcmQueries | None = None
-        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, self.name))  # by source
-        self._sender = new_sender(settings.effective_url, shared, self._on_open)
-
-    def _on_open(self) -> None:
-        if self._queries is not None and self.settings.queries:
-            self._queries.start()
-
-    def start(self) -> None:
-        """Open LCM, with retries."""
-        self._sender.open()
-
-    def publisher(self, topic: Topic) -> LcmPublisher:
-        """Return a new publisher of ``topic`` on a channel that no other publisher of this output uses."""
-        name = lcm_channel(self.settings.prefix, topic.source, *topic.path)
-        channel = unique_name(name, self._channels)
-        self._channels.add(channel)
-        return LcmPublisher(channel, topic.source, self._sender.send, self._forget)
-
-    def _forget(self, publisher: LcmPublisher) -> None:
-        self._channels.discard(publisher.channel)
-
-    def health(self) -> OutputHealth:
-        """Return whether LCM is open and the last message was sent."""
-        return OutputHealth(not self._sender.problem, self._sender.problem)
-
-    def maintain(self) -> None:
-        """Retry to open LCM if it is time, and publish parameters again that are due."""
-        self._sender.maintain()
-        if self._queries is not None:
-            self._queries.maintain()
-
-    def is_configured_like(self, other: Output) -> bool:
-        """Return whether the settings are the same."""
-        return isinstance(other, LcmOutput) and self.settings == other.settings.model_copy(
-            update={"tool_poses": self.settings.tool_poses}
-        )
-
-    def count_losses(self, source: str, losses: Losses) -> None:
-        """Count in ``losses`` what is lost later: at the end, and of requests, parameters and replies."""
-        self._losses[source] = losses
-        if self._queries is not None:
-            self._queries.count_losses(source, losses)
-
-    def announce(self, source: str) -> None:
-        """Answer requests about ``source``. Its status messages show that it is served."""
-        if self._queries is not None:
-            self._queries.add(source)
-
-    def withdraw(self, source: str) -> None:
-        """Stop answering requests about ``source``."""
-        if self._queries is not None:
-            self._queries.remove(source)
-
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
-        """Publish the XML as ``parameters_t``, now and every few seconds. LCM keeps the order of messages."""
-        return None if self._queries is None else self._queries.publish_parameters(source, parameters)
-
-    def serve_queries(self, service: QueryService) -> None:
-        """Publish parameters and, with ``lcm.queries``, answer ``parameters_request_t`` for each source."""
-        loop = asyncio.get_running_loop()
-        shared = self._shared if self.settings.queries else None
-        self._queries = LcmQueries(self.settings, service, loop, self._sender, shared)
-
-    async def stop_queries(self) -> None:
-        """Stop receiving requests. Pending requests get no reply."""
-        if self._queries is not None:
-            await self._queries.close()
-
-    @property
-    def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
-        """By source, the number of requests by result; None before ``serve_queries``."""
-        return None if self._queries is None else self._queries.results
-
-    def close(self) -> None:
-        """Release LCM, and count the messages that its peer has not taken."""
-        for source, num_messages in self._sender.close().items():
-            text = f"{num_messages} messages waited when the output was closed; check the peer of lcm.url"
-            self._losses[source].lost("closed", text, messages=num_messages, frames=0)
-
 
 REPEAT_S: Final = 5.0
 """How often the parameters are published again, for late subscribers."""
@@ -146,95 +40,89 @@ class _Publication:
         self.sent: Future[None] | None = None
 
 
-class LcmQueries:
-    """What the output does besides its data: it answers requests with ``service``, and publishes parameters.
+class LcmOutput(Output):
+    """Publishes on one LCM URL.
 
-    ``sender`` publishes the parameters. Requests and replies use ``queries_url``, where a thread of this
-    object receives. If that is the output's own URL and there is a ``shared`` LCM object (memq://), the owner
-    of that object receives instead. Another thread makes and sends what is long.
+    ``shared`` is an existing LCM object to use, because memq:// connects only users of one object.
     """
 
-    def __init__(
-        self,
-        settings: LcmSettings,
-        service: QueryService,
-        loop: asyncio.AbstractEventLoop,
-        sender: LcmSender | LcmThreadSender,
-        shared: lcm.LCM | None,
-    ) -> None:
-        self._prefix = settings.prefix
-        self._loop = loop
-        self._sender = sender
-        url = settings.effective_queries_url
-        is_own_url = url != settings.effective_url
-        self._reply_sender = new_sender(url, None, lambda: None, "replies") if is_own_url else sender
-        self._long_sender = WorkerThread("lcm-send-long")
-        self._commands = LcmCommands(service)
-        kinds = (parameter_requests(service), self._commands.kind)
-        self._requests = LcmRequests(
-            *(settings, service, loop, kinds, self._reply_sender.send, self._long_sender)
-        )
-        self._receiver = LcmReceiver(
-            *(url, settings.prefix, None if is_own_url else shared, MAX_PENDING, self._open_replies)
-        )
-        self._publications: dict[str, _Publication] = {}  # by source
+    name = "lcm"
+    drop_causes = ("not open", "send failed", "closed")
 
-    @property
-    def results(self) -> Mapping[str, Mapping[str, int]]:
-        """See QueryAdmission."""
-        return self._requests.results
+    def __init__(self, settings: LcmSettings, shared: lcm.LCM | None = None) -> None:
+        self.settings = settings
+        self.max_rate_hz = settings.max_rate_hz
+        self.has_tool_poses = settings.tool_poses
+        self._shared = shared
+        self._channels: set[str] = set()
+        self._loop: asyncio.AbstractEventLoop  # from ``serve_queries`` on
+        self._requests: LcmRequests | None = None
+        self._publications: dict[str, _Publication] = {}  # by source
+        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, self.name))  # by source
+        self._sender = new_sender(settings.effective_url, shared, self._on_open)
+
+    def _on_open(self) -> None:
+        if self._requests is not None and self.settings.queries:
+            self._requests.receiver.start()
 
     def start(self) -> None:
-        """Receive requests. Called in any thread, after the output has opened."""
-        self._receiver.start()
+        """Open LCM, with retries."""
+        self._sender.open()
 
-    def _open_replies(self) -> None:
-        if self._reply_sender is not self._sender:
-            self._reply_sender.open()
+    def publisher(self, topic: Topic) -> LcmPublisher:
+        """Return a new publisher of ``topic`` on a channel that no other publisher of this output uses."""
+        name = lcm_channel(self.settings.prefix, topic.source, *topic.path)
+        channel = unique_name(name, self._channels)
+        self._channels.add(channel)
+        return LcmPublisher(channel, topic.source, self._sender, self._channels)
 
-    def count_losses(self, source: str, losses: Losses) -> None:
-        """Count in ``losses`` what is lost of ``source``: requests, replies and parameters."""
-        self._requests.losses[source] = losses
-
-    def add(self, source: str) -> None:
-        """Answer requests about one more source."""
-        for channel, take in self._requests.channels(source).items():
-            self._receiver.add(channel, take)
-
-    def remove(self, source: str) -> None:
-        """Stop publishing a source's parameters; ``service`` no longer serves requests about it."""
-        self._publications.pop(source, None)
+    def health(self) -> OutputHealth:
+        """Return whether LCM is open and the last message was sent."""
+        return OutputHealth(not self._sender.problem, self._sender.problem)
 
     def maintain(self) -> None:
-        """Publish the parameters again that are due. Called once a second."""
-        if self._reply_sender is not self._sender:
-            self._reply_sender.maintain()
-        for source, publication in self._publications.items():
-            if time.monotonic() >= publication.due_s:
-                self._publish_again(source, publication)
+        """Retry to open LCM if it is time, and publish parameters again that are due."""
+        self._sender.maintain()
+        if self._requests is not None:
+            self._requests.maintain()
+            for source, publication in self._publications.items():
+                if time.monotonic() >= publication.due_s:
+                    self._publish_again(source, publication, self._requests)
 
-    async def close(self) -> None:
-        """Stop receiving requests. Pending requests get no reply."""
-        await self._receiver.close()
-        self._commands.close()
-        await self._requests.close()
-        self._long_sender.close()
-        if self._reply_sender is not self._sender:
-            await WorkerThread("close lcm replies").run(self._reply_sender.close)  # may wait for a peer
+    def is_configured_like(self, other: Output) -> bool:
+        """Return whether the settings are the same."""
+        return isinstance(other, LcmOutput) and self.settings == other.settings.model_copy(
+            update={"tool_poses": self.settings.tool_poses}
+        )
 
-    # Parameters.
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` what is lost later: at the end, and of requests, parameters and replies."""
+        self._losses[source] = losses
+
+    def announce(self, source: str) -> None:
+        """Answer requests about ``source``. Its status messages show that it is served."""
+        if self._requests is not None:
+            self._requests.add(source)
+
+    def withdraw(self, source: str) -> None:
+        """Stop publishing its parameters. The service no longer serves requests about it."""
+        self._publications.pop(source, None)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
-        """Publish a source's parameters, now and every REPEAT_S seconds.
+        """Publish the XML as ``parameters_t``, now and every REPEAT_S. LCM keeps the order of messages.
 
         Returns a future that is done when long parameters have been sent; None if these have been.
         """
+        if self._requests is None:
+            return None
         publication = self._publications.setdefault(source, _Publication())
         publication.parameters, publication.arrived_utime = parameters, now_utime()
-        sent = self._publish_again(source, publication)
+        sent = self._publish_again(source, publication, self._requests)
         return None if sent is None else asyncio.wrap_future(sent, loop=self._loop)
 
-    def _publish_again(self, source: str, publication: _Publication) -> Future[None] | None:
+    def _publish_again(
+        self, source: str, publication: _Publication, requests: LcmRequests
+    ) -> Future[None] | None:
         publication.due_s = time.monotonic() + REPEAT_S
         waits = publication.sent is not None and not publication.sent.done()
         is_long = len(publication.parameters.xml) > LONG_REPLY_BYTES
@@ -243,7 +131,7 @@ class LcmQueries:
             return None
         # If one waits to be sent, it may have begun with the former parameters.
         publish = functools.partial(self._publish_newest, source, publication)
-        publication.sent = self._long_sender.submit(publish)
+        publication.sent = requests.long_sender.submit(publish)
         return publication.sent
 
     def _publish_newest(self, source: str, publication: _Publication) -> None:
@@ -257,6 +145,28 @@ class LcmQueries:
         )
         publication.sequence += 1
         try:
-            self._sender.send(lcm_channel(self._prefix, source, "PARAMETERS"), message, source)
+            self._sender.send(lcm_channel(self.settings.prefix, source, "PARAMETERS"), message, source)
         except OutputError as error:
-            self._requests.losses[source].lost(error.cause, str(error), frames=0)
+            self._losses[source].lost(error.cause, str(error), frames=0)
+
+    def serve_queries(self, service: QueryService) -> None:
+        """Publish parameters and, with ``lcm.queries``, answer ``parameters_request_t`` for each source."""
+        self._loop = asyncio.get_running_loop()
+        shared = self._shared if self.settings.queries else None
+        self._requests = LcmRequests(self.settings, service, self._loop, self._sender, shared, self._losses)
+
+    async def stop_queries(self) -> None:
+        """Stop receiving requests. Pending requests get no reply."""
+        if self._requests is not None:
+            await self._requests.close()
+
+    @property
+    def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
+        """By source, the number of requests by result; None before ``serve_queries``."""
+        return None if self._requests is None else self._requests.admission.results
+
+    def close(self) -> None:
+        """Release LCM, and count the messages that its peer has not taken."""
+        for source, num_messages in self._sender.close().items():
+            text = f"{num_messages} messages waited when the output was closed; check the peer of lcm.url"
+            self._losses[source].lost("closed", text, messages=num_messages, frames=0)

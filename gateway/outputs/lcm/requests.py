@@ -8,10 +8,11 @@ import asyncio
 import contextlib
 import functools
 import logging
-from collections import OrderedDict, defaultdict
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final, NamedTuple
 
+import lcm
 import rtc3d
 
 from gateway.errors import OutputError, QueryError
@@ -22,18 +23,20 @@ from gateway.messages.decode import JSON
 from gateway.messages.texts import xml_text
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
+from gateway.outputs.lcm.receiver import MAX_PENDING, LcmReceiver
+from gateway.outputs.lcm.sender import LcmSender, LcmThreadSender, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.query_admission import QueryAdmission, QueryDefects, QueryLimits, Refusal
 from gateway.workers import WorkerThread
-
-MAX_PENDING: Final = 64
-"""The maximum number of requests in progress. Further ones are dropped and counted."""
 
 LONG_REPLY_BYTES: Final = 32 * 1024
 """Longer contents are encoded and sent by a thread: 16 MB take 30 ms."""
 
 MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
+
+MAX_REMEMBERED: Final = 64
+"""How many commands are remembered with their results, for requests that are repeated."""
 
 logger = logging.getLogger(__name__)
 
@@ -60,9 +63,11 @@ class RequestKind(NamedTuple):
 
 
 class LcmRequests:
-    """Answers requests of several ``kinds``, which share all limits. ``send`` raises OutputError.
+    """Answers requests for parameters, and commands, with ``service``. They share all limits.
 
-    ``long_sender`` makes and sends long replies.
+    Requests and replies use ``queries_url``, where a thread of this object receives. If that is the output's
+    own URL, ``sender`` sends the replies; and if there is a ``shared`` LCM object (memq://), its owner
+    receives. ``losses`` counts what is lost, by source.
     """
 
     def __init__(
@@ -70,50 +75,57 @@ class LcmRequests:
         settings: LcmSettings,
         service: QueryService,
         loop: asyncio.AbstractEventLoop,
-        kinds: Sequence[RequestKind],
-        send: Callable[[str, bytes], None],
-        long_sender: WorkerThread,
+        sender: LcmSender | LcmThreadSender,
+        shared: lcm.LCM | None,
+        losses: Mapping[str, Losses],
     ) -> None:
         self._prefix = settings.prefix
         self._service = service
         self._loop = loop
-        self._kinds = kinds
-        self._send = send
-        self._long_sender = long_sender
-        self._admission = QueryAdmission(
-            QueryLimits(
-                output="lcm",
-                key_setting="max_queries_per_source_per_s",
-                per_s=settings.max_queries_per_s,
-                per_key_per_s=settings.max_queries_per_source_per_s,
-                reply_bytes_per_s=settings.max_reply_bytes_per_s,
-                pending=MAX_PENDING,
-            )
+        self._losses = losses
+        self._kinds = (
+            RequestKind(
+                *("PARAMETERS", rtc3d.parameters_request_t, rtc3d.parameters_reply_t, self._answer_parameters)
+            ),
+            RequestKind("COMMAND", rtc3d.command_request_t, rtc3d.command_reply_t, self._answer_command),
         )
-        self.losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "lcm"))
-        """What is lost, by source."""
+        url = settings.effective_queries_url
+        is_own_url = url != settings.effective_url
+        self._own_sender = new_sender(url, None, lambda: None, "replies") if is_own_url else None
+        self._sender = self._own_sender or sender
+        self.receiver = LcmReceiver(
+            *(url, settings.prefix, None if is_own_url else shared),
+            on_open=self._own_sender.open if self._own_sender is not None else lambda: None,
+        )
+        self.long_sender = WorkerThread("lcm-send-long")
+        """Makes and sends what is long."""
+        self.admission = QueryAdmission(
+            QueryLimits.of("lcm", "max_queries_per_source_per_s", settings, MAX_PENDING)
+        )
         self._tasks: set[asyncio.Task[None]] = set()
+        self._remembered: OrderedDict[tuple[Any, ...], asyncio.Task[ReplyContent]] = OrderedDict()
         self._defects = QueryDefects(logger)
 
-    @property
-    def results(self) -> Mapping[str, Mapping[str, int]]:
-        """See QueryAdmission."""
-        return self._admission.results
+    def add(self, source: str) -> None:
+        """Answer requests about one more source, while ``service`` serves it."""
+        for kind in self._kinds:
+            channel = lcm_channel(self._prefix, source, f"{kind.name}_REQUEST")
+            self.receiver.add(channel, functools.partial(self._take, kind, source))
 
-    def channels(self, source: str) -> dict[str, Callable[[bytes], None]]:
-        """Return the channels of requests about a source, each with the function that takes a message."""
-        return {
-            lcm_channel(self._prefix, source, f"{kind.name}_REQUEST"): functools.partial(
-                self._take, kind, source
-            )
-            for kind in self._kinds
-        }
+    def maintain(self) -> None:
+        """See LcmSender."""
+        if self._own_sender is not None:
+            self._own_sender.maintain()
 
     async def close(self) -> None:
-        """Cancel the requests in progress. They get no reply."""
-        for task in self._tasks:
+        """Stop receiving requests. Those in progress get no reply."""
+        await self.receiver.close()
+        for task in (*self._remembered.values(), *self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        self.long_sender.close()
+        if self._own_sender is not None:
+            await WorkerThread("close lcm replies").run(self._own_sender.close)  # may wait for a peer
 
     # In the receiving thread.
 
@@ -122,20 +134,20 @@ class LcmRequests:
         if len(data) > MAX_REQUEST_BYTES or data[:8] != kind.request._get_packed_fingerprint():  # noqa: SLF001 - see decode.py
             self._count_malformed(kind, source, data)
             return
-        refusal = self._admission.admit(source, source)
+        refusal = self.admission.admit(source, source)
         if refusal is not None:
             self._refuse(kind, source, data, refusal)
             return
         request = _decoded(kind, data)
         if request is None:
-            self._admission.finished(source, "")
+            self.admission.finished(source, "")
             self._count_malformed(kind, source, data)
             return
         with contextlib.suppress(RuntimeError):  # the loop has just ended
             self._loop.call_soon_threadsafe(self._start_answer, kind, source, request)
 
     def _count_malformed(self, kind: RequestKind, source: str, data: bytes) -> None:
-        self.losses[source].lost(
+        self._losses[source].lost(
             "malformed request",
             f"a message on the channel of requests is ignored: {len(data)} bytes that are no "
             f"{kind.request.__name__}; correct the program that sends it",
@@ -144,7 +156,7 @@ class LcmRequests:
 
     def _refuse(self, kind: RequestKind, source: str, data: bytes, refusal: Refusal) -> None:
         if refusal.cause == "queue":
-            self.losses[source].lost(
+            self._losses[source].lost(
                 "request beyond the queue",
                 f"a request on LCM is ignored, because {MAX_PENDING} others are in progress; "
                 "ask less often, or subscribe to the parameters",
@@ -152,16 +164,16 @@ class LcmRequests:
             )
             return
         error = refusal.error
-        self.losses[source].lost("request beyond the rate", f"a request is refused: {error}", frames=0)
+        self._losses[source].lost("request beyond the rate", f"a request is refused: {error}", frames=0)
         request = _decoded(kind, data) if refusal.is_sent else None
         if request is not None:
-            self._long_sender.offer(functools.partial(self._send_error, kind, source, request, error))
+            self.long_sender.offer(functools.partial(self._send_error, kind, source, request, error))
 
     # In the event loop.
 
     def _start_answer(self, kind: RequestKind, source: str, request: Any) -> None:
         if not self._service.serves(source):
-            self._admission.finished(source, "")
+            self.admission.finished(source, "")
             return
         with log_fields(source=source):
             task = asyncio.create_task(self._answer(kind, source, request))
@@ -172,7 +184,7 @@ class LcmRequests:
         content: ReplyContent | QueryError | None = None
         try:
             content = await kind.answer(source, request)
-            self._admission.check_reply(content.num_bytes)
+            self.admission.check_reply(content.num_bytes)
         except QueryError as error:
             content = error
         except Exception as defect:  # noqa: BLE001 - every request gets a reply
@@ -181,55 +193,22 @@ class LcmRequests:
         finally:
             # Before the reply is sent: its receiver may ask again at once. Cancelled, it has no result.
             result = "" if content is None else content.code if isinstance(content, QueryError) else "ok"
-            self._admission.finished(source, result)
+            self.admission.finished(source, result)
         if isinstance(content, QueryError):
             self._send_error(kind, source, request, content)
-        else:
-            self._send_content(kind, source, request, content)
-
-    def _send_content(self, kind: RequestKind, source: str, request: Any, content: ReplyContent) -> None:
+            return
         send = functools.partial(self._send_reply, kind, source, request, content.fill)
         if content.num_bytes <= LONG_REPLY_BYTES:
             send()
-        elif not self._long_sender.offer(send, content.num_bytes):
-            self.losses[source].lost(
+        elif not self.long_sender.offer(send, content.num_bytes):
+            self._losses[source].lost(
                 "reply beyond the queue",
                 "a reply on LCM is dropped, because earlier ones wait to be sent; ask less often",
                 frames=0,
             )
 
-    # In the event loop, or in the thread that sends what is long.
-
-    def _send_error(self, kind: RequestKind, source: str, request: Any, error: QueryError) -> None:
-        def fill(reply: Any) -> None:
-            reply.error, reply.error_code = str(error), error.code
-
-        self._send_reply(kind, source, request, fill)
-
-    def _send_reply(self, kind: RequestKind, source: str, request: Any, fill: Callable[[Any], None]) -> None:
-        reply = kind.reply()
-        reply.request_id, reply.requester = request.request_id, request.requester
-        fill(reply)
-        try:
-            self._send(lcm_channel(self._prefix, source, f"{kind.name}_REPLY"), reply.encode())
-        except OutputError as error:
-            self.losses[source].lost(error.cause, str(error), frames=0)
-
-
-def _decoded(kind: RequestKind, data: bytes) -> Any | None:
-    """Return ``data`` as a request; None if it is malformed."""
-    try:
-        request = kind.request.decode(data)
-    except Exception:  # noqa: BLE001 - lcm-gen's decoders raise anything
-        return None
-    return request if len(request.requester.encode()) <= MAX_REQUESTER_BYTES else None
-
-
-def parameter_requests(service: QueryService) -> RequestKind:
-    """Return the requests for parameters, which ``service`` answers."""
-
-    async def answer(source: str, request: Any) -> ReplyContent:
-        parameters = await service.parameters(source, request.sections, fresh=request.fresh)
+    async def _answer_parameters(self, source: str, request: Any) -> ReplyContent:
+        parameters = await self._service.parameters(source, request.sections, fresh=request.fresh)
 
         def fill(reply: Any) -> None:
             reply.xml, reply.age_s = xml_text(parameters.xml), parameters.age_s
@@ -237,53 +216,36 @@ def parameter_requests(service: QueryService) -> RequestKind:
 
         return ReplyContent(len(parameters.xml), fill)
 
-    return RequestKind("PARAMETERS", rtc3d.parameters_request_t, rtc3d.parameters_reply_t, answer)
+    async def _answer_command(self, source: str, request: Any) -> ReplyContent:
+        """Return the answer to a command.
 
-
-MAX_REMEMBERED: Final = 64
-"""How many commands are remembered with their results, for requests that are repeated."""
-
-_Identity = tuple[Any, ...]
-
-
-class LcmCommands:
-    """Answers ``command_request_t`` with ``service``.
-
-    Requests and replies can be lost on LCM, so their senders repeat them. A command that changes something is
-    carried out once nevertheless: equal requests get the result of the first.
-    """
-
-    def __init__(self, service: QueryService) -> None:
-        self.kind = RequestKind("COMMAND", rtc3d.command_request_t, rtc3d.command_reply_t, self._answer_once)
-        """The requests that ``service`` answers."""
-        self._service = service
-        self._remembered: OrderedDict[_Identity, asyncio.Task[ReplyContent]] = OrderedDict()
-
-    def close(self) -> None:
-        """Cancel the commands in progress."""
-        for task in self._remembered.values():
-            task.cancel()
-
-    async def _answer_once(self, source: str, request: Any) -> ReplyContent:
-        options = _options(request)
+        Requests and replies can be lost on LCM, so their senders repeat them. A command that changes
+        something is carried out once nevertheless: equal requests get the result of the first.
+        """
+        options = {}
+        for option in request.options:
+            name, separator, value = option.partition("=")
+            if not separator:
+                raise QueryError(f"option {quoted(option)} is not accepted; accepted: NAME=VALUE")
+            options[name] = value
         if CONTROL_OPTION not in options:
-            return await self._answer(source, request.command, options)
+            return await self._carry_out(source, request.command, options)
         identity = (source, request.request_id, request.requester, request.command, *request.options)
         task = self._remembered.get(identity)
         if task is None:
-            task = asyncio.create_task(self._answer(source, request.command, options))
+            task = asyncio.create_task(self._carry_out(source, request.command, options))
             self._remembered[identity] = task
             task.add_done_callback(lambda done: self._finish(identity, done))
         return await asyncio.shield(task)
 
-    def _finish(self, identity: _Identity, task: asyncio.Task[ReplyContent]) -> None:
+    def _finish(self, identity: tuple[Any, ...], task: asyncio.Task[ReplyContent]) -> None:
         """Forget a command that failed, because it may be tried again, and the oldest of too many."""
         if task.cancelled() or task.exception() is not None:
             del self._remembered[identity]
         while len(self._remembered) > MAX_REMEMBERED:
             self._remembered.popitem(last=False)
 
-    async def _answer(self, source: str, command: str, options: dict[str, str]) -> ReplyContent:
+    async def _carry_out(self, source: str, command: str, options: dict[str, str]) -> ReplyContent:
         if command not in self._service.commands():
             accepted = ", ".join(self._service.commands())
             raise QueryError(f"unknown command {quoted(command)}; accepted on LCM: {accepted}")
@@ -302,13 +264,28 @@ class LcmCommands:
 
         return ReplyContent(len(content), fill)
 
+    # In the event loop, or in the thread that sends what is long.
 
-def _options(request: Any) -> dict[str, str]:
-    """Return the options by name. Raises QueryError if one is no NAME=VALUE."""
-    options = {}
-    for option in request.options:
-        name, separator, value = option.partition("=")
-        if not separator:
-            raise QueryError(f"option {quoted(option)} is not accepted; accepted: NAME=VALUE")
-        options[name] = value
-    return options
+    def _send_error(self, kind: RequestKind, source: str, request: Any, error: QueryError) -> None:
+        def fill(reply: Any) -> None:
+            reply.error, reply.error_code = str(error), error.code
+
+        self._send_reply(kind, source, request, fill)
+
+    def _send_reply(self, kind: RequestKind, source: str, request: Any, fill: Callable[[Any], None]) -> None:
+        reply = kind.reply()
+        reply.request_id, reply.requester = request.request_id, request.requester
+        fill(reply)
+        try:
+            self._sender.send(lcm_channel(self._prefix, source, f"{kind.name}_REPLY"), reply.encode())
+        except OutputError as error:
+            self._losses[source].lost(error.cause, str(error), frames=0)
+
+
+def _decoded(kind: RequestKind, data: bytes) -> Any | None:
+    """Return ``data`` as a request; None if it is malformed."""
+    try:
+        request = kind.request.decode(data)
+    except Exception:  # noqa: BLE001 - lcm-gen's decoders raise anything
+        return None
+    return request if len(request.requester.encode()) <= MAX_REQUESTER_BYTES else None

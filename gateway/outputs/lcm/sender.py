@@ -7,19 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, Final
+from typing import Final
 
 import lcm
 
 from gateway.errors import OutputError
 from gateway.logs.failures import HOLD_S, FailureLog
-from gateway.outputs.lcm.connection import (
-    BLOCKING_SCHEMES,
-    open_lcm,
-    open_lcm_to_send,
-    scheme_of,
-    send_problem,
-)
+from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm_to_send, scheme_of, send_problem
 from gateway.workers import WorkerThread
 
 _NEVER: Final = float("inf")
@@ -83,10 +77,11 @@ class LcmSender:
 
     def send(self, channel: str, message: bytes, source: str = "") -> None:  # noqa: ARG002 - nothing waits
         """Publish on ``channel``. Raises OutputError on failure; the next message may succeed."""
-        if self._lcm is None:
+        connection = self._lcm  # another thread may close it
+        if connection is None:
             raise OutputError(self.problem, cause="not open")
         try:
-            self._lcm.publish(channel, message)
+            connection.publish(channel, message)
         except OSError as error:
             self.problem = send_problem(self._url, error)
             self._sending.failed(self.problem)
@@ -121,32 +116,31 @@ class LcmThreadSender:
 
     def __init__(self, url: str, on_open: Callable[[], None], what: str = "messages") -> None:
         self._url = url
-        self._what = what
         self._on_open = on_open
-        self._problem = NOT_OPEN
+        self._sender = LcmSender(url, None, self._opened, what)  # used in the thread
         self._is_open = False
+        self._is_closed = False
         self._full = f"{url} does not take messages fast enough; check the peer of lcm.url"
         self._is_full = False  # the queue, when the last message came
-        self._lcm: lcm.LCM | None = None
         self._worker = WorkerThread("lcm-send", MAX_QUEUED_MESSAGES, MAX_QUEUED_BYTES)
-        self._opened: Future[None] | None = None
-        self._lock = threading.Lock()  # of the next two, and of what ``close`` sets last
+        self._opening: Future[None] | None = None
+        self._lock = threading.Lock()  # of the next two, and of _is_open
         self._waiting: Counter[str] = Counter()  # messages that LCM has not accepted yet, by source
         self._closing = threading.Event()
         self._has_given_up = False
-        self._opening = FailureLog(logger, "lcm")
-        self._sending = FailureLog(logger, "lcm", HOLD_S)
         self._queueing = FailureLog(logger, "lcm", HOLD_S)
 
     @property
     def problem(self) -> str:
         """Why nothing can be sent now, and what to do; "" if it can."""
-        return self._problem or (self._full if self._is_full else "")
+        if self._is_closed:
+            return CLOSED
+        return self._sender.problem or (self._full if self._is_full else "")
 
     def open(self) -> None:
         """Start the thread, which opens LCM and retries until it succeeds or ``close`` is called."""
-        self._problem = f"LCM has not opened {self._url} yet; check lcm.url"
-        self._opened = self._worker.submit(self._open)
+        self._sender.problem = f"LCM has not opened {self._url} yet; check lcm.url"
+        self._opening = self._worker.submit(self._open)
 
     def send(self, channel: str, message: bytes, source: str = "") -> None:
         """Queue a message about ``source``.
@@ -154,8 +148,8 @@ class LcmThreadSender:
         Raises OutputError if LCM is not open, sending fails or the queue is full.
         """
         if not self._is_open:
-            raise OutputError(self._problem, cause="not open")
-        if problem := self._problem:
+            raise OutputError(self.problem, cause="not open")
+        if problem := self._sender.problem:
             raise OutputError(problem, cause="send failed")
         self._count_waiting(source, 1)
         publish = functools.partial(self._publish, channel, message, source)
@@ -172,8 +166,8 @@ class LcmThreadSender:
 
     def maintain(self) -> None:
         """Open LCM again if no thread could be started; otherwise, the thread retries by itself."""
-        opened = self._opened
-        if opened is not None and opened.done() and not opened.cancelled() and opened.exception() is not None:
+        call = self._opening
+        if call is not None and call.done() and not call.cancelled() and call.exception() is not None:
             self.open()
 
     def close(self) -> Counter[str]:
@@ -185,71 +179,49 @@ class LcmThreadSender:
             self._is_open = False  # send() now raises
             self._closing.set()
         self._worker.finish(_JOIN_S)
+        self._is_closed = True
+        self._sender.close()  # LCM writes the end of a file when nothing refers to it
         with self._lock:
-            self._problem = CLOSED
-            self._lcm = None  # there is no close(); LCM writes the end of a file when nothing refers to it
             return +self._waiting
 
     # In the thread.
 
     def _open(self) -> None:
-        """Open LCM, with retries until ``close`` is called."""
-        while not self._closing.is_set():
-            try:
-                self._lcm = open_lcm(self._url)
-            except OutputError as error:
-                self._set_problem(str(error))
-                self._opening.failed(str(error))
+        while not self._closing.is_set() and not self._is_open:
+            self._sender.open()
+            if not self._is_open:
                 self._closing.wait(RETRY_S)
-                continue
-            with self._lock:
-                if self._closing.is_set():
-                    return
-                self._problem = ""
-                self._is_open = True
-            self._opening.succeeded(f"sending {self._what} to {self._url}")
+
+    def _opened(self) -> None:
+        with self._lock:
+            self._is_open = not self._closing.is_set()
+        if self._is_open:
             self._on_open()
-            return
 
     def _publish(self, channel: str, message: bytes, source: str) -> None:
         """Publish a message, with retries; give up when that fails after ``close`` was called."""
-        connection = self._lcm
-        while connection is not None and not self._has_given_up:
+        while not self._has_given_up:
             try:
-                connection.publish(channel, message)
-            except OSError as error:
-                problem = send_problem(self._url, error)
-                self._set_problem(problem)
-                self._sending.failed(problem)
+                self._sender.send(channel, message)
+            except OutputError:
                 self._has_given_up = self._closing.wait(RETRY_S)
             else:
                 self._count_waiting(source, -1)
-                self._set_problem("")
-                self._sending.recovered(f"sending {self._what} to {self._url}")
                 return
-
-    def _set_problem(self, problem: str) -> None:
-        with self._lock:
-            if not self._closing.is_set():  # close() sets the last one
-                self._problem = problem
 
 
 class LcmPublisher:
-    """Sends the messages of one topic of ``source`` on ``channel``."""
+    """Sends the messages of one topic of ``source`` on ``channel``, which leaves ``channels`` at the end."""
 
     wanted = True  # LCM cannot know who is subscribed
 
     def __init__(
-        self,
-        channel: str,
-        source: str,
-        send: Callable[[str, bytes, str], None],
-        forget: Callable[[Any], None],
+        self, channel: str, source: str, sender: LcmSender | LcmThreadSender, channels: set[str]
     ) -> None:
         self.channel = channel
         self._source = source
-        self._send = send
-        self._forget = forget
+        self._sender = sender
+        self._channels = channels
         self._is_closed = False
 
     def publish(self, message: bytes) -> None:
@@ -258,10 +230,10 @@ class LcmPublisher:
             raise OutputError(
                 f"LCM channel {self.channel} is closed; ask for a new publisher", cause="closed"
             )
-        self._send(self.channel, message, self._source)
+        self._sender.send(self.channel, message, self._source)
 
     def close(self) -> None:
         """Free the channel's name."""
         if not self._is_closed:
             self._is_closed = True
-            self._forget(self)
+            self._channels.discard(self.channel)

@@ -1,4 +1,4 @@
-"""The section ``lcm`` of the configuration."""
+"""The section ``lcm`` of the configuration, and the output in the registry."""
 
 import os
 from typing import Annotated, Final
@@ -11,6 +11,7 @@ from gateway.config.settings import OutputSettings
 from gateway.config.values import ByteLimit, ChannelPrefix, Host, MaxRates, QueryRate, Switch
 from gateway.config.words import join_or
 from gateway.messages.topics import DEFAULT_LCM_PREFIX
+from gateway.outputs.kind import OutputKind, imported_late
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
 
 DEFAULT_LCM_URL: Final = f"udpm://{DEFAULT_GROUP}:{DEFAULT_PORT}?ttl=0"
@@ -121,3 +122,15 @@ class LcmSettings(OutputSettings):
     def effective_queries_url(self) -> str:
         """``queries_url``, else the default for ``effective_url``."""
         return self.queries_url or lcm_queries_url(self.effective_url)
+
+
+LCM: Final = OutputKind(
+    name="lcm",
+    settings=LcmSettings,
+    create=imported_late("gateway.outputs.lcm.output:LcmOutput"),
+    subscribe=imported_late("gateway.outputs.lcm.subscriber:subscribe"),
+    checks=("route", "requests", "buffers"),
+    run_checks=imported_late("gateway.outputs.lcm.checks:check_lcm"),
+    leaves_host=imported_late("gateway.outputs.lcm.checks:leaves_host"),
+    demo=imported_late("gateway.outputs.lcm.subscriber:demo"),
+)

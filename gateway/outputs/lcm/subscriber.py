@@ -10,15 +10,14 @@ import lcm
 
 from gateway.logs.failures import FailureLog
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
-from gateway.outputs.kind import Receive, SubscriptionRequest
-from gateway.outputs.lcm.connection import open_lcm, receiving_url, reconnect
+from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRequest
+from gateway.outputs.lcm.connection import Waiting, open_lcm, receiving_url, reconnect
+from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.sender import RETRY_S
-from gateway.outputs.lcm.settings import effective_lcm_url
+from gateway.outputs.lcm.settings import LcmSettings, effective_lcm_url
 
 QUEUE_MESSAGES: Final = 10_000
 """With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""
-
-_POLL_MS: Final = 100
 
 logger = logging.getLogger(__name__)
 
@@ -49,31 +48,30 @@ class LcmSubscriber:
         self._is_connected = True
         self._failures = FailureLog(logger, "lcm")
         self._stop = threading.Event()
+        self._waiting = Waiting()
         self._thread = threading.Thread(target=self._receive, name="lcm-subscriber", daemon=True)
         self._thread.start()
 
     def _receive(self) -> None:
         while not self._stop.is_set():
             try:
-                self._lcm.handle_timeout(_POLL_MS)
+                if self._waiting.wait(self._lcm):
+                    self._lcm.handle_timeout(0)
             except OSError as error:
                 self._is_connected = False
                 self._failures.failed(f"the connection is lost, so no more messages arrive: {error}")
-                self._reconnect()
-
-    def _reconnect(self) -> None:
-        """Connect to the relay again, with retries, until ``close``."""
-        while not self._stop.wait(RETRY_S):
-            with contextlib.suppress(OSError):
-                reconnect(self._lcm, "RECONNECTED")
-                self._is_connected = True
-                self._failures.recovered("connected again")
-                return
+                while not self._is_connected and not self._stop.wait(RETRY_S):
+                    with contextlib.suppress(OSError):
+                        reconnect(self._lcm, "RECONNECTED")
+                        self._is_connected = True
+                        self._failures.recovered("connected again")
 
     def close(self) -> None:
         """End the thread and unsubscribe."""
         self._stop.set()
+        self._waiting.wake()
         self._thread.join()
+        self._waiting.close()
         if self._is_connected:  # LCM would connect again first, and let no other thread run meanwhile
             self._lcm.unsubscribe(self._subscription)
 
@@ -82,6 +80,18 @@ def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
     """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
     channels = channel_pattern(request.prefix or DEFAULT_LCM_PREFIX, request.source, request.component)
     return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)
+
+
+def demo(use_network: bool) -> DemoSide:
+    """Return LCM for the demo: in memory, or on multicast with ``use_network``."""
+    settings = LcmSettings(url=None if use_network else "memq://")
+    connection = open_lcm(receiving_url(settings.effective_url))
+
+    def subscribe_here(source: str, receive: Receive) -> Subscription:
+        return LcmSubscriber(connection, channel_pattern(settings.prefix, source, None), receive)
+
+    # memq:// connects only users of one LCM object, so the output and the subscriber share it.
+    return DemoSide(settings, LcmOutput(settings, None if use_network else connection), subscribe_here)
 
 
 def no_gateway_on_lcm(name: str, url: str) -> str:

@@ -17,12 +17,11 @@ from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
 from gateway.messages.host_time import HostClock, clock_difference_us, host_clock, now_steady_us
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
-from gateway.outputs.frame_output import FrameOutput
+from gateway.outputs.frame_output import FrameOutput, in_this_loop
 from gateway.outputs.kind import missing_package
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.source_streams import CapturedFrame, SourceStreams
 from gateway.outputs.lsl.supervisor import LslProcesses
-from gateway.outputs.threads import in_this_loop
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.workers import WorkerThread

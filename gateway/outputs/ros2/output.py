@@ -15,13 +15,12 @@ import zenoh
 from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic, unique_name
 from gateway.outputs.contract import FramePublisher, OutputHealth, Publisher, ServerParameters
-from gateway.outputs.frame_output import FrameOutput
+from gateway.outputs.frame_output import FrameOutput, in_this_loop
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
 from gateway.outputs.ros2.messages import DIAGNOSTIC_ARRAY, TF_MESSAGE
 from gateway.outputs.ros2.settings import MAX_PART_CHARS, Ros2Settings, ros_name
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosNode, RosTopic
-from gateway.outputs.threads import in_this_loop
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from gateway.workers import WorkerThread

@@ -22,12 +22,11 @@ from gateway.outputs.contract import (
     ServerParameters,
 )
 from gateway.outputs.findings import Check, Finding, MessageLoad
-from gateway.outputs.frame_output import PortOpener, ServerOutput
+from gateway.outputs.frame_output import LoopThread, PortOpener, ServerOutput, in_this_loop
 from gateway.outputs.listen_address import from_this_computer, listen_problem
 from gateway.outputs.rtc3d.client_filter import FILE, SLOW_CLIENT, SourceState
 from gateway.outputs.rtc3d.live_server import LiveServer
 from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
-from gateway.outputs.threads import LoopThread, in_this_loop
 from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout

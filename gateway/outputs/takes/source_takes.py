@@ -28,8 +28,7 @@ from gateway.errors import QueryError, TakeError
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.parameters_message import encode_parameters, published_again
+from gateway.outputs.contract import ServerParameters, encode_parameters, published_again
 from gateway.outputs.takes.disk import Storage, disk_result
 from gateway.outputs.takes.folder import ROLLING, StoredTake, TakePiece, add_c3d
 from gateway.outputs.takes.publisher import TakesPublisher

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
-from gateway.outputs.parameters_message import published_again
+from gateway.outputs.contract import published_again
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import free_stem, is_full, log_path
 from gateway.outputs.takes.publisher import TakesPublisher

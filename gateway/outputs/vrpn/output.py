@@ -13,9 +13,8 @@ from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
 from gateway.outputs.findings import Check, Finding, MessageLoad
-from gateway.outputs.frame_output import ServerOutput
+from gateway.outputs.frame_output import LoopThread, ServerOutput, in_this_loop
 from gateway.outputs.listen_address import from_this_computer, is_loopback
-from gateway.outputs.threads import LoopThread, in_this_loop
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START, encode_pose
 from gateway.outputs.vrpn.server import VrpnServer, bind, logger
 from gateway.outputs.vrpn.settings import VRPN, VrpnSettings

@@ -1,11 +1,10 @@
 """The Zenoh output: a key for each topic, JSON beside it, parameters and files, and answers to queries.
 
 Start with ``output``: it opens a session (``session``), which Zenoh itself keeps connected from then on, and
-gives each topic a ``publisher``. Messages are put from the event loop, because a put does not block; all that
-can wait for a peer is done in threads.
+gives each topic a ``publisher``, and each source liveliness tokens, a queryable, and publishers of parameters
+and files. Messages are put from the event loop, because a put does not block; all that can wait for a peer is
+done in threads.
 
-- ``declarations``: what is declared for each source besides its data: liveliness tokens, queryables, the
-  publishers of parameters and files.
 - ``answers``: from a query to its replies, which a thread sends. Too many queries, too large answers and
   peers that do not read are limited here, with ``outputs.query_admission``.
 - ``json_publishing``: KEY/json for subscribers that cannot decode LCM's types, made in a thread with a share

@@ -19,7 +19,7 @@ import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import zenoh
 
@@ -30,7 +30,8 @@ from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, KeyPath, QueryService
-from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, Refusal
+from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, QueryLimits, Refusal
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.workers import WorkerThread
 
 MAX_PENDING: Final = 4096
@@ -56,30 +57,21 @@ _REST: Final = 3.0
 So JSON for peers takes a quarter of a core at most.
 """
 
-Options = tuple[tuple[str, str], ...]
-
 logger = logging.getLogger(__name__)
 
 
-class _Question:
-    """Equal queries that get the same answers. More can join while it is open, which is until the answer."""
+class _Question(NamedTuple):
+    """What equal queries ask for. They get the same answers."""
 
-    def __init__(self, source: str, selected: str, options: Options) -> None:
-        self.source = source
-        self.selected = selected
-        self.options = options
-        self.queries: list[zenoh.Query] = []
+    source: str
+    selected: str
+    options: tuple[tuple[str, str], ...]
 
     @property
     def selector(self) -> str:
         """The key and the options."""
         options = ";".join(f"{name}={value}" for name, value in self.options)
         return f"{self.selected}?{options}" if options else self.selected
-
-    @property
-    def identity(self) -> tuple[str, str, Options]:
-        """What makes questions equal."""
-        return self.source, self.selected, self.options
 
 
 class ZenohAnswers:
@@ -92,22 +84,23 @@ class ZenohAnswers:
 
     def __init__(
         self,
-        prefix: str,
+        settings: ZenohSettings,
         service: QueryService,
         loop: asyncio.AbstractEventLoop,
-        admission: QueryAdmission,
         sender: WorkerThread,
         losses: defaultdict[str, Losses],
     ) -> None:
-        self._prefix = prefix
+        self._prefix = settings.prefix
         self._service = service
         self._loop = loop
-        self._admission = admission
+        self.admission = QueryAdmission(
+            QueryLimits.of("zenoh", "max_queries_per_key_per_s", settings, MAX_PENDING)
+        )
         self._sender = sender
         self._long_sender = WorkerThread("zenoh-send-long")
         self._losses = losses
         self._lock = threading.Lock()  # of the next three, shared with Zenoh's threads
-        self._open: dict[tuple[str, str, Options], _Question] = {}
+        self._open: dict[_Question, list[zenoh.Query]] = {}  # until there is an answer, more can join
         self._waiting: deque[_Question] = deque()
         self._is_scheduled = False  # the call of _start_next
         self._tasks: set[asyncio.Task[None]] = set()
@@ -130,7 +123,7 @@ class ZenohAnswers:
 
     def _is_admitted(self, source: str, query: zenoh.Query) -> bool:
         selected = str(query.key_expr)
-        refusal = self._admission.admit(source, selected[:MAX_KEY_CHARS])
+        refusal = self.admission.admit(source, selected[:MAX_KEY_CHARS])
         if refusal is not None:
             self._refuse(source, query, refusal)
             return False
@@ -143,32 +136,34 @@ class ZenohAnswers:
 
     def _refuse(self, source: str, query: zenoh.Query, refusal: Refusal) -> None:
         error = refusal.error
+
+        def reply() -> None:
+            with query:
+                _reply_error(query, error)
+
         if refusal.cause == "queue":
             text = f"a query is refused as busy, because {MAX_PENDING} others are in progress; ask less often"
             self._losses[source].lost("query beyond the queue", text, frames=0)
         else:
             self._losses[source].lost("query beyond the rate", f"a query is refused: {error}", frames=0)
-        end = functools.partial(_reply_refusal, query, error) if refusal.is_sent else query.drop
-        if not self._sender.offer(end):
+        if not self._sender.offer(reply if refusal.is_sent else query.drop):
             query.drop()  # this holds up the peers that ask, which is better than to store their queries
 
     def _add(self, question: _Question, query: zenoh.Query) -> None:
         with self._lock:
             is_closed = self._is_closed
+            is_new = not is_closed and question not in self._open
+            is_due = is_new and not self._is_scheduled
             if not is_closed:
-                joined = self._open.setdefault(question.identity, question)
-                joined.queries.append(query)
-                if joined is not question:
-                    return
+                self._open.setdefault(question, []).append(query)
+            if is_new:
                 self._waiting.append(question)
-                if self._is_scheduled:
-                    return
                 self._is_scheduled = True
         if is_closed:
             self._drop([query], question.source)
-            return
-        with contextlib.suppress(RuntimeError):  # the loop has just ended
-            self._loop.call_soon_threadsafe(self._start_next)
+        elif is_due:
+            with contextlib.suppress(RuntimeError):  # the loop has just ended
+                self._loop.call_soon_threadsafe(self._start_next)
 
     # In the event loop.
 
@@ -201,14 +196,14 @@ class ZenohAnswers:
         except QueryError as error:
             outcome = error
         except Exception as defect:  # noqa: BLE001 - every query gets a reply
-            outcome = self._log_defect(question.source, question.selector, defect)
+            outcome = self._defects.log(question.source, defect, f"query {safe_text(question.selector)}")
         finally:
             with self._lock:
-                self._open.pop(question.identity, None)
+                queries = self._open.pop(question)
         if outcome is None:  # the source has been removed
-            self._drop(question.queries, question.source)
+            self._drop(queries, question.source)
         else:
-            self._send(question.queries, question.source, outcome)
+            self._send(queries, question.source, outcome)
 
     async def _answers(self, question: _Question) -> dict[str, Answer]:
         """Return the answers by key. Raises QueryError if there is none."""
@@ -219,28 +214,34 @@ class ZenohAnswers:
             return {selected: await self._service.answer(source, path, options)}
         paths = _matching(selected, base, tuple(self._service.keys(source)))
         if not paths:
-            raise QueryError(self._nothing_matches(selected, base, source))
-        self._admission.count(len(paths) - 1)
+            for command in self._service.commands():
+                if selected.endswith(f"/{command}"):
+                    raise QueryError(
+                        f"{command} needs the name of one source, not a wildcard; accepted: {base}{command}"
+                    )
+            accepted = self._service.accepted_keys(source)
+            raise QueryError(
+                f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
+            )
+        self.admission.count(len(paths) - 1)
         answers = await self._service.answer_all(source, paths, options)
         return {base + "/".join(path): answer for path, answer in answers.items()}
-
-    def _nothing_matches(self, selected: str, base: str, source: str) -> str:
-        for command in self._service.commands():
-            if selected.endswith(f"/{command}"):
-                return f"{command} needs the name of one source, not a wildcard; accepted: {base}{command}"
-        accepted = self._service.accepted_keys(source)
-        return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
 
     async def close(self) -> None:
         """Drop the pending queries, and close the sender. Peers see at once that no reply follows."""
         with self._lock:
             self._is_closed = True
-            questions = list(self._open.values())
+            pending = list(self._open.items())
             self._waiting.clear()
+
+        def drop() -> None:
+            for question, queries in pending:
+                self._drop_now(queries, question.source)
+
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._sender.close(functools.partial(self._drop_all, questions))
+        self._sender.close(drop)
         self._long_sender.close()
 
     # In any thread.
@@ -248,7 +249,8 @@ class ZenohAnswers:
     def _send(
         self, queries: list[zenoh.Query], source: str, outcome: Mapping[str, Answer] | QueryError
     ) -> None:
-        num_bytes = 0 if isinstance(outcome, QueryError) else _num_bytes(outcome)
+        answers = () if isinstance(outcome, QueryError) else outcome.values()
+        num_bytes = sum(answer.num_bytes for answer in answers)
         sender = self._long_sender if num_bytes > LONG_ANSWER_BYTES else self._sender
         for query in queries:
             reply = functools.partial(self._reply, query, source, outcome)
@@ -268,19 +270,12 @@ class ZenohAnswers:
         if self._sender.submit(drop).cancelled():  # it is closed
             drop()
 
-    def _log_defect(self, source: str, selector: str, defect: Exception) -> QueryError:
-        return self._defects.log(source, defect, f"query {safe_text(selector)}")
-
     # In a thread that sends. Zenoh's calls may block.
-
-    def _drop_all(self, questions: list[_Question]) -> None:
-        for question in questions:
-            self._drop_now(question.queries, question.source)
 
     def _drop_now(self, queries: list[zenoh.Query], source: str) -> None:
         for query in queries:
             query.drop()
-            self._admission.finished(source, NO_REPLY)
+            self.admission.finished(source, NO_REPLY)
 
     def _reply(self, query: zenoh.Query, source: str, outcome: Mapping[str, Answer] | QueryError) -> None:
         result = "ok"
@@ -295,14 +290,14 @@ class ZenohAnswers:
                     _reply_error(query, error)
         except Exception as problem:  # noqa: BLE001 - the thread continues
             result = "defect"
-            self._log_defect(source, str(query.key_expr), problem)
+            self._defects.log(source, problem, f"query {safe_text(str(query.key_expr))}")
         finally:
-            self._admission.finished(source, result)
+            self.admission.finished(source, result)
 
     def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
         """Reply with each of the answers. Raises QueryError if there is none, or too many bytes."""
-        num_bytes = _num_bytes(answers)
-        self._admission.check_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
+        num_bytes = sum(answer.num_bytes for answer in answers.values())
+        self.admission.check_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
         num_replies, error = 0, None
         for key, answer in answers.items():
             try:
@@ -329,15 +324,6 @@ class ZenohAnswers:
             return answer.payload
         finally:
             self._rest_until_s = time.monotonic() + _REST * (time.thread_time() - begun_s)
-
-
-def _num_bytes(answers: Mapping[str, Answer]) -> int:
-    return sum(answer.num_bytes for answer in answers.values())
-
-
-def _reply_refusal(query: zenoh.Query, error: QueryError) -> None:
-    with query:
-        _reply_error(query, error)
 
 
 def _reply_error(query: zenoh.Query, error: QueryError) -> None:

@@ -20,8 +20,6 @@ from gateway.outputs.findings import Check, Finding, MessageLoad, counted, faili
 from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
-CHECKS: Final = ("link", "gateway")
-
 _ROUTER_REMEDY: Final = (
     "Start zenohd at that address, or correct connect/endpoints in zenoh.config. With TLS, check that all "
     "certificates come from one authority, have not expired and contain the address."
@@ -30,7 +28,7 @@ _LOCAL: Final = re.compile(r"unix|(tcp|tls|quic|udp|ws)/(127\.[\d.]+|\[::1\]|loc
 """The beginning of endpoints on this computer."""
 _POLL_S: Final = 0.05
 
-_LINK, _GATEWAY = (Check("zenoh", name) for name in CHECKS)
+_LINK, _GATEWAY = Check("zenoh", "link"), Check("zenoh", "gateway")
 
 
 def check_zenoh(
@@ -46,8 +44,11 @@ def check_zenoh(
     connect = endpoints(config, "connect")
     listen = [endpoint for endpoint in endpoints(config, "listen") if not endpoint.endswith(":0")]
     keys = {source: zenoh_key(settings.prefix, source, "alive") for source in sources}
+    own_config, timeout_ms = command_config(settings.config), str(round(1000 * seconds))
+    for key in ("connect/timeout_ms", "scouting/timeout", "transport/unicast/open_timeout"):
+        own_config.insert_json5(key, timeout_ms)
     try:
-        session = zenoh.open(_doctor_config(settings, seconds))
+        session = zenoh.open(own_config)
     except zenoh.ZError as error:
         return _no_link(f"the session does not open: {zenoh_reason(error)}", _ROUTER_REMEDY)
     try:
@@ -67,7 +68,16 @@ def check_zenoh(
             "Another program uses the address; `ss -ltnp` shows which one. Stop it, or change "
             "listen/endpoints in zenoh.config.",
         )
-    return [_link(mode, routers, peers), _gateway(served, sources)]
+    others = "a router" if mode == "client" else f"{counted(routers, 'router')} and {counted(peers, 'peer')}"
+    link = _LINK.passing(f"the session is open and connected to {others}")
+    missing = [source for source in sources if source not in served]
+    if missing:
+        text = (
+            f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix "
+            "and the router's access rules"
+        )
+        return [link, _GATEWAY.not_tested(text)]
+    return [link, _GATEWAY.passing(f"a gateway serves {', '.join(sources)}")]
 
 
 def leaves_host(settings: ZenohSettings) -> bool:
@@ -84,15 +94,6 @@ def leaves_host(settings: ZenohSettings) -> bool:
 def is_local(endpoint: str) -> bool:
     """Return whether an endpoint is on this computer."""
     return _LOCAL.match(endpoint) is not None
-
-
-def _doctor_config(settings: ZenohSettings, seconds: float) -> zenoh.Config:
-    """Return the configuration of the doctor's session, which waits for ``seconds`` at most."""
-    config = command_config(settings.config)
-    timeout_ms = str(round(1000 * seconds))
-    for key in ("connect/timeout_ms", "scouting/timeout", "transport/unicast/open_timeout"):
-        config.insert_json5(key, timeout_ms)
-    return config
 
 
 def _no_link(found: str, remedy: str) -> list[Finding]:
@@ -122,18 +123,3 @@ def _listen_problem(config: zenoh.Config, listen: Sequence[str]) -> str:
     except zenoh.ZError as error:
         return f"a gateway cannot listen on {mask_secrets_in_text(', '.join(listen))}: {zenoh_reason(error)}"
     return ""
-
-
-def _link(mode: str, routers: int, peers: int) -> Finding:
-    others = "a router" if mode == "client" else f"{counted(routers, 'router')} and {counted(peers, 'peer')}"
-    return _LINK.passing(f"the session is open and connected to {others}")
-
-
-def _gateway(served: Sequence[str], sources: Sequence[str]) -> Finding:
-    missing = [source for source in sources if source not in served]
-    if not missing:
-        return _GATEWAY.passing(f"a gateway serves {', '.join(sources)}")
-    return _GATEWAY.not_tested(
-        f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix and "
-        "the router's access rules",
-    )

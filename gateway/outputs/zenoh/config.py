@@ -154,17 +154,11 @@ def command_config(given: Path | Mapping[str, Any]) -> zenoh.Config:
         config.insert_json5("connect/exit_on_failure", "false")
         config.insert_json5("mode", '"peer"')
     config.insert_json5("listen/endpoints", "[]")
-    _show_certificate(config)
-    return config
-
-
-def _show_certificate(config: zenoh.Config) -> None:
-    """Use the certificate for incoming links in outgoing links, too, if there is none for them."""
     tls = json.loads(config.get_json(_TLS))
-    if tls["connect_certificate"] or not tls["listen_certificate"]:
-        return
-    for name in ("certificate", "private_key"):
-        config.insert_json5(f"{_TLS}/connect_{name}", json.dumps(tls[f"listen_{name}"]))
+    if tls["listen_certificate"] and not tls["connect_certificate"]:
+        for name in ("certificate", "private_key"):
+            config.insert_json5(f"{_TLS}/connect_{name}", json.dumps(tls[f"listen_{name}"]))
+    return config
 
 
 def mode_of(config: zenoh.Config) -> str:

@@ -55,7 +55,8 @@ class JsonConverter:
     def __init__(self, max_rate_hz: float) -> None:
         self._max_rate_hz = max_rate_hz
         self._parameters: dict[str, ServerParameters] = {}  # by the source's name
-        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))
+        self.losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))
+        """By the source's name, what cannot be sent as JSON."""
         self._lock = threading.Lock()
         self._waiting: defaultdict[str, _Waiting] = defaultdict(_Waiting)  # by the source's name
         self._used_s = 0.0  # what the source had used that was served last
@@ -75,18 +76,10 @@ class JsonConverter:
         """Take the labels from these parameters from now on."""
         self._parameters[source] = parameters
 
-    def count_losses(self, source: str, losses: Losses) -> None:
-        """Count in ``losses`` what cannot be sent as JSON."""
-        self._losses[source] = losses
-
     def parameters(self, source: str, version: int) -> Parameters | None:
         """Return the parameters of this version; None if they are not known, or not any more."""
         newest = self._parameters.get(source)
         return None if newest is None or newest.version != version else newest.parsed
-
-    def lost(self, source: str, cause: str, text: str) -> None:
-        """Count a message that is not sent as JSON."""
-        self._losses[source].lost(cause, text, frames=0)
 
     def offer(self, source: str, convert: Callable[[], None], num_bytes: int) -> bool:
         """Have the thread make a call, which holds ``num_bytes``; return False if too many wait."""
@@ -231,7 +224,7 @@ class JsonPublisher:
         return False
 
     def _count_loss(self, cause: str, text: str) -> None:
-        self._keys.lost(self._topic.source, cause, text)
+        self._keys.losses[self._topic.source].lost(cause, text, frames=0)
 
     # In the thread.
 
@@ -246,19 +239,15 @@ class JsonPublisher:
         if publisher is None or not self.wanted:
             return
         try:
-            publisher.put(self._text(message).encode())
+            decoded = decode(message)
+            text, description = json_text(decoded), self._description_of(decoded)
+            publisher.put((f"{text[:-1]},{description}}}" if description else text).encode())
         except zenoh.ZError as error:
             if self._publisher is not None:
                 self._count_loss("put failed", f"Zenoh did not take {self._key}: {zenoh_reason(error)}")
         except Exception as error:
             self._count_loss("json failed", f"a message for {self._key} cannot be converted: {error!r}")
             logger.debug("zenoh: %s", self._key, exc_info=error)
-
-    def _text(self, message: bytes) -> str:
-        decoded = decode(message)
-        description = self._description_of(decoded)
-        text = json_text(decoded)
-        return f"{text[:-1]},{description}}}" if description else text
 
     def _description_of(self, message: Any) -> str:
         """Return the fields with the labels and units, as JSON; "" if they are not known."""

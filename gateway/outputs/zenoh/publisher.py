@@ -104,7 +104,10 @@ class ZenohPublisher:
         """Pass ``message`` to Zenoh. Raises OutputError if it cannot be sent."""
         link = self._link
         if self._publisher is None or link.is_cut_off:
-            raise self._refusal()
+            if self._is_closed:
+                text = f"Zenoh key {self._key} is closed; ask for a new publisher"
+                raise OutputError(text, cause="closed")
+            raise link.refusal()
         if self.wanted:
             link.burst_bytes_left -= len(message)
             if link.burst_bytes_left < 0:
@@ -116,11 +119,6 @@ class ZenohPublisher:
         except zenoh.ZError as error:
             text = f"Zenoh did not take a message for {self._key}: {zenoh_reason(error)}"
             raise OutputError(text, cause="put failed") from error
-
-    def _refusal(self) -> OutputError:
-        if self._is_closed:
-            return OutputError(f"Zenoh key {self._key} is closed; ask for a new publisher", cause="closed")
-        return self._link.refusal()
 
     def close(self) -> None:
         """Undeclare the publisher."""

@@ -92,16 +92,10 @@ class SessionHolder:
         """Start the thread that opens the session."""
         thread_starts.start(self._opener)
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait until the thread has opened the session and declared everything, or was never started."""
-        if self._opener.is_alive():
-            self._opener.join(timeout_s)
-
     def _run(self) -> None:
         prepare_threads()
         while not self._closing.is_set():
             try:
-                _check_closing()
                 self._open()
             except OutputError as error:
                 self._problem = str(error)
@@ -118,6 +112,13 @@ class SessionHolder:
             self._closing.wait(_RETRY_S)
 
     def _open(self) -> None:
+        num_closing = sum(closer.is_alive() for closer in tuple(_closers))
+        if num_closing >= _MAX_CLOSING:
+            raise OutputError(
+                f"{num_closing} former Zenoh sessions are still closing, because programs connected to them "
+                "do not read; the next one opens after them",
+                cause="not open",
+            )
         session = zenoh.open(self._config)
         try:
             self._num_transports = 0
@@ -189,30 +190,19 @@ class SessionHolder:
 
 def close_session(session: zenoh.Session, output: str) -> None:
     """Close the session of an output; return when it is closed, or after _CLOSE_S."""
-    closer = threading.Thread(target=_close, args=(session, output), name=f"{output}-close", daemon=True)
+
+    def close() -> None:
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            logger.debug("%s: closing the session: %s", output, zenoh_reason(error))
+        finally:
+            _closers.discard(threading.current_thread())
+
+    closer = threading.Thread(target=close, name=f"{output}-close", daemon=True)
     _closers.add(closer)
     thread_starts.start(closer)
     closer.join(_CLOSE_S)
-
-
-def _check_closing() -> None:
-    """Raise OutputError while too many sessions are closing."""
-    num_closing = sum(closer.is_alive() for closer in tuple(_closers))
-    if num_closing >= _MAX_CLOSING:
-        raise OutputError(
-            f"{num_closing} former Zenoh sessions are still closing, because programs connected to them do "
-            "not read; the next one opens after them",
-            cause="not open",
-        )
-
-
-def _close(session: zenoh.Session, output: str) -> None:
-    try:
-        session.close()
-    except zenoh.ZError as error:
-        logger.debug("%s: closing the session: %s", output, zenoh_reason(error))
-    finally:
-        _closers.discard(threading.current_thread())
 
 
 _Event = TypeVar("_Event")

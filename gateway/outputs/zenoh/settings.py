@@ -1,4 +1,4 @@
-"""The section ``zenoh`` of the configuration."""
+"""The section ``zenoh`` of the configuration, and the output in the registry."""
 
 import json
 import re
@@ -13,6 +13,7 @@ from gateway.config.section import expects, validation_error
 from gateway.config.settings import OutputSettings
 from gateway.config.values import ByteLimit, MaxRates, QueryRate, Switch
 from gateway.config.words import describe
+from gateway.outputs.kind import OutputKind, imported_late
 from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_config, zenoh_reason
 
 DEFAULT_ZENOH_PREFIX: Final = "mocap"
@@ -123,3 +124,15 @@ class ZenohSettings(OutputSettings):
         """See OutputSettings. Reads the file of Zenoh's configuration; raises ConfigError."""
         tls = json.loads(zenoh_config(self.config).get_json("transport/link/tls"))
         return {key: Path(tls[key]) for key in _CERTIFICATES if tls[key]}
+
+
+ZENOH: Final = OutputKind(
+    name="zenoh",
+    settings=ZenohSettings,
+    create=imported_late("gateway.outputs.zenoh.output:ZenohOutput"),
+    subscribe=imported_late("gateway.outputs.zenoh.subscriber:subscribe"),
+    checks=("link", "gateway"),
+    run_checks=imported_late("gateway.outputs.zenoh.checks:check_zenoh"),
+    leaves_host=imported_late("gateway.outputs.zenoh.checks:leaves_host"),
+    demo=imported_late("gateway.outputs.zenoh.subscriber:demo"),
+)

@@ -1,18 +1,24 @@
 """Subscribing to a gateway's messages on Zenoh, for ``echo``, the demo and tests."""
 
+import contextlib
 import json
+import socket
 import threading
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Final
 
 import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.topics import escape_key_chunk, is_json_key, zenoh_key
-from gateway.outputs.discovery import missing_source
-from gateway.outputs.kind import Receive, SubscriptionRequest
+from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRequest, missing_source
 from gateway.outputs.zenoh.config import command_config, zenoh_config, zenoh_reason
-from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX, ZenohSettings
+
+_PORTS: Final = range(20_000, 32_768)
+"""Those of the demo. Linux gives the ports above to other sockets: one could get it before Zenoh listens."""
 
 
 def key_patterns(prefix: str, source: str | None, component: str | None) -> tuple[str, ...]:
@@ -85,6 +91,26 @@ def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber
     """Subscribe with a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
     keys = key_patterns(request.prefix or DEFAULT_ZENOH_PREFIX, request.source, request.component)
     return ZenohSubscriber(open_zenoh(request.address, request.config), keys, receive, owns_session=True)
+
+
+def demo(_use_network: bool) -> DemoSide:
+    """Return Zenoh for the demo: TCP on loopback without scouting, so that nothing leaves the machine."""
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    settings = ZenohSettings(
+        config={"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+    )
+
+    def subscribe_here(source: str, receive: Receive) -> Subscription:
+        return subscribe(SubscriptionRequest(source, prefix=settings.prefix, address=endpoint), receive)
+
+    return DemoSide(settings, ZenohOutput(settings), subscribe_here, endpoint)
+
+
+def _free_port() -> int:
+    for port in _PORTS:
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
+    return 0  # Zenoh will say that it cannot connect there
 
 
 def served_sources(session: zenoh.Session, prefix: str, timeout_s: float = 1.0) -> list[str]:

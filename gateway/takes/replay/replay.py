@@ -12,13 +12,11 @@ from typing import Final, NamedTuple
 from gateway.errors import OutputError, TakeError
 from gateway.outputs.contract import Output
 from gateway.outputs.kind import OutputKind, SubscriptionRequest
-from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.settings import LCM, LcmSettings
 from gateway.outputs.zenoh.config import command_config
-from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.settings import ZENOH, ZenohSettings
 from gateway.takes.replay.player import Player
 from gateway.takes.replay.publication import Publication, ReplayedSource, ReplayQueries
 from gateway.workers import WorkerThread

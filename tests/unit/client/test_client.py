@@ -12,9 +12,8 @@ from gateway.client.transport import Replies, Reply, silence_text
 from gateway.display.live import LiveData
 from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
-from gateway.outputs.contract import ServerParameters
+from gateway.outputs.contract import ServerParameters, encode_parameters
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.parameters_message import encode_parameters
 from tests.support.networks import lcm_url
 from tests.support.waiting import wait_until
 

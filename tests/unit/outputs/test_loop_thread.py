@@ -8,7 +8,7 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from gateway.outputs.threads import LoopThread, in_this_loop
+from gateway.outputs.frame_output import LoopThread, in_this_loop
 from gateway.workers import MAX_BYTES
 
 

@@ -10,14 +10,12 @@ from gateway.errors import OutputError
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output
 from gateway.outputs.kind import DemoSide, Subscription, SubscriptionRequest
-from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.settings import LCM, LcmSettings
 from gateway.outputs.lcm.subscriber import channel_pattern
 from gateway.outputs.registry import OUTPUTS
-from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.settings import ZENOH, ZenohSettings
 from gateway.outputs.zenoh.subscriber import key_patterns
 from tests.support.memory_output import MemoryOutput
 from tests.support.networks import (

@@ -23,7 +23,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.queries.service import SourceQueryService
 from tests.support.lcm_relay import LcmRelay
 from tests.support.networks import zenoh_keys
-from tests.support.waiting import wait_until_async
+from tests.support.waiting import wait_until, wait_until_async
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_zenoh_has_no_thread_for_each_key() -> None:
     """With three sources of 256 tools, no further thread could start, and the gateway stopped working."""
     output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
     output.start()
-    output.wait_until_open(30)
+    wait_until(lambda: not output._holder._opener.is_alive())
     threads = Path("/proc/self/task")
     num_before = len([*threads.iterdir()])
     publishers = [output.publisher(Topic("lab", ("6d", str(at)), "rtc3d.tool_pose_t")) for at in range(90)]
@@ -97,7 +97,7 @@ def test_zenoh_has_no_thread_for_each_source() -> None:
     with asyncio.Runner() as runner:
         runner.run(_serve_queries(output))
         output.start()
-        output.wait_until_open(30)
+        wait_until(lambda: not output._holder._opener.is_alive())
         threads = Path("/proc/self/task")
         num_before = len([*threads.iterdir()])
         for number in range(30):

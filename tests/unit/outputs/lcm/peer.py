@@ -13,7 +13,8 @@ from gateway.logs.failures import current_log_fields
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, decode, json_bytes
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
-from gateway.outputs.lcm.output import LcmOutput, LcmQueries
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.requests import LcmRequests
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.support.statuses import amounts
 from tests.support.waiting import wait_until_async
@@ -80,9 +81,9 @@ class Lab:
         self.output.start()
 
     @property
-    def queries(self) -> LcmQueries:
-        assert self.output._queries is not None
-        return self.output._queries
+    def requests(self) -> LcmRequests:
+        assert self.output._requests is not None
+        return self.output._requests
 
     def lost(self, source: str) -> dict[str, tuple[int, int]]:
         return amounts(self._losses[source].report())

@@ -11,8 +11,8 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.outputs.lcm import connection
-from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.receiver import NO_CHANNEL, LcmDatagrams, split_datagram
+from gateway.outputs.lcm.connection import Waiting, open_lcm, receiving_url
+from gateway.outputs.lcm.receiver import joined_socket, split_datagram
 from tests.support.lcm_relay import LcmRelay
 from tests.support.networks import lcm_url
 from tests.support.waiting import wait_until
@@ -89,54 +89,62 @@ def test_a_tcp_socket_of_another_thread_still_waits() -> None:
         (b"LC02\0\0\0\7CHANNEL\0", ("CHANNEL", b"")),
         (b"LC02\0\0\0\7\0x", ("", b"x")),
         (b"LC02\0\0\0\7\xff\0x", ("\ufffd", b"x")),
-        (b"LC02\0\0\0\7CHANNEL", None),
-        (b"LC02\0\0\0\0", None),
-        (b"LC02\0\0", None),
-        (b"LC03\0\0\0\7CHANNEL\0message", None),
-        (b"", None),
+        *((b"LC02\0\0\0" + end, ("", b"")) for end in (b"\7CHANNEL", b"\0", b"")),
+        (b"LC03\0\0\0\7CHANNEL\0message", ("", b"")),
+        (b"", ("", b"")),
     ],
 )
-def test_a_datagram_has_a_channel_and_a_message(datagram: bytes, expected: tuple[str, bytes] | None) -> None:
+def test_a_datagram_has_a_channel_and_a_message_or_counts_as_an_empty_one(
+    datagram: bytes, expected: tuple[str, bytes]
+) -> None:
     assert split_datagram(datagram) == expected
 
 
 @pytest.fixture
-def received() -> list[tuple[str, bytes]]:
-    return []
-
-
-@pytest.fixture
-def datagrams(received: list[tuple[str, bytes]]) -> Iterator[LcmDatagrams]:
-    datagrams = LcmDatagrams(URL, lambda channel, data: received.append((channel, data)))
-    yield datagrams
-    datagrams.close()
+def joined() -> Iterator[socket.socket]:
+    with joined_socket(URL) as joined:
+        joined.settimeout(5)
+        yield joined
 
 
 @pytest.mark.netns
-def test_it_receives_what_lcm_sends_while_another_program_receives_too(
-    datagrams: LcmDatagrams, received: list[tuple[str, bytes]]
-) -> None:
+def test_it_receives_what_lcm_sends_while_another_program_receives_too(joined: socket.socket) -> None:
     other: list[str] = []
     subscriber = lcm.LCM(URL)
     subscriber.subscribe("NAME", lambda channel, _: other.append(channel))
     lcm.LCM(URL).publish("NAME", b"message")
-    while ("NAME", b"message") not in received:  # LCM tests its connection with messages of its own
-        datagrams.handle_timeout(5000)
+    while split_datagram(joined.recv(100)) != ("NAME", b"message"):
+        pass  # LCM tests its connection with messages of its own
     subscriber.handle_timeout(5000)
     assert other == ["NAME"]
 
 
 @pytest.mark.netns
-def test_what_is_no_message_counts_as_an_empty_one(
-    datagrams: LcmDatagrams, received: list[tuple[str, bytes]]
-) -> None:
+def test_what_is_not_sent_to_the_group_is_not_received(joined: socket.socket) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for datagram in (b"", b"nothing of LCM", b"LC02\0\0\0\0NAME"):
-            sender.sendto(datagram, GROUP)
-            datagrams.handle_timeout(5000)
-        sender.sendto(b"LC02\0\0\0\0NAME\0", ("127.0.0.1", GROUP[1]))  # not to the group
-    datagrams.handle_timeout(1)  # nothing arrives
-    assert received == 3 * [(NO_CHANNEL, b"")]
+        sender.sendto(b"LC02\0\0\0\0NAME\0", ("127.0.0.1", GROUP[1]))
+        sender.sendto(b"", GROUP)
+    assert joined.recv(100) == b""
+
+
+@pytest.mark.netns
+def test_the_wait_for_messages_ends_when_one_arrives_when_woken_and_when_the_connection_is_closed(
+    joined: socket.socket,
+) -> None:
+    """So the thread costs nothing while nobody asks, and does not delay the end."""
+    waiting = Waiting()
+    for _ in range(1000):
+        waiting.wake()  # more often than the thread reads, and before it waits
+    assert not waiting.wait(joined)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b"datagram", GROUP)
+    while not waiting.wait(joined):
+        pass  # wakes that are left
+    joined.close()
+    with pytest.raises(OSError, match="not connected"):
+        waiting.wait(joined)
+    waiting.close()
+    waiting.wake()
 
 
 @pytest.mark.netns
@@ -149,5 +157,5 @@ def test_what_is_no_message_counts_as_an_empty_one(
 )
 def test_a_group_that_cannot_be_joined_is_reported_with_the_url(url: str, problem: str) -> None:
     with pytest.raises(OutputError, match=problem) as caught:
-        LcmDatagrams(url, lambda _channel, _data: None)
+        joined_socket(url)
     assert caught.value.cause == "not open"

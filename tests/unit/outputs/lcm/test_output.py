@@ -49,7 +49,7 @@ def test_a_channel_given_up_is_free_and_one_in_use_is_not(output: LcmOutput) -> 
 async def test_without_queries_nothing_is_received() -> None:
     lab = Lab(queries=False)
     lab.open()
-    assert not lab.queries._receiver._thread.is_alive()
+    assert not lab.requests.receiver._thread.is_alive()
     await lab.output.stop_queries()
 
 
@@ -153,7 +153,7 @@ async def test_long_parameters_are_sent_by_a_thread(lab: Lab, monkeypatch: pytes
     """Short ones must not overtake them: late subscribers would keep the old names."""
     monkeypatch.setattr(output_module, "LONG_REPLY_BYTES", 10)
     may_send = threading.Event()
-    lab.queries._long_sender.submit(may_send.wait)
+    lab.requests.long_sender.submit(may_send.wait)
     sent = lab.output.publish_parameters("lab", ServerParameters(b"<long enough/>", 3, 4))
     short = lab.output.publish_parameters("lab", ServerParameters(b"<a/>", 3, 5))
     may_send.set()

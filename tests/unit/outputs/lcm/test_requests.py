@@ -13,9 +13,8 @@ from gateway.errors import QueryError
 from gateway.messages.decode import C3D, JSON
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.lcm import requests
-from gateway.outputs.lcm.output import LcmQueries
 from gateway.outputs.lcm.receiver import LcmReceiver
-from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
+from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmRequests
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.token_bucket import TokenBucket
@@ -97,10 +96,10 @@ async def test_requests_beyond_the_rate_get_an_error_and_are_counted(lab: Lab) -
 @with_settings(max_queries_per_source_per_s=1.0)
 async def test_a_flood_of_requests_is_not_a_flood_of_errors(lab: Lab) -> None:
     is_sent = threading.Event()
-    lab.queries._requests._admission._refusals = TokenBucket(2.0, monotonic=Clock())
+    lab.requests.admission._refusals = TokenBucket(2.0, monotonic=Clock())
     for number in range(8):
         lab.send(request(number))
-    lab.queries._long_sender.offer(is_sent.set)
+    lab.requests.long_sender.offer(is_sent.set)
     await wait_until_async(is_sent.is_set)
     lab.deliver()
     assert [reply.error_code for reply in lab.replies].count("rate") == 2
@@ -110,7 +109,7 @@ async def test_a_long_reply_is_sent_by_a_thread(lab: Lab, monkeypatch: pytest.Mo
     """It would keep the frames of all sources waiting."""
     monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
     may_send = threading.Event()
-    lab.queries._long_sender.submit(may_send.wait)
+    lab.requests.long_sender.submit(may_send.wait)
     lab.send(request(1))
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
     lab.deliver()
@@ -138,7 +137,7 @@ async def test_malformed_requests_and_those_beyond_the_limits_are_counted_by_sou
     for data in (b"", request(5)[:-1], bytes(8) + request(6)[8:]):
         lab.send(data)
     assert (lab.lost("lab"), lab.lost("hall")) == ({"malformed request": (5, 0)}, {})
-    assert lab.queries._requests._admission.num_pending == 0
+    assert lab.requests.admission.num_pending == 0
 
 
 async def test_after_the_end_of_queries_no_request_is_answered() -> None:
@@ -160,16 +159,11 @@ async def test_a_request_after_the_end_of_the_event_loop_is_ignored(lab: Lab) ->
     loop = asyncio.new_event_loop()
     loop.close()
     sender = LcmSender("memq://", lab.lcm, lambda: None)
-    queries = LcmQueries(
-        LcmSettings(url="memq://"),
-        lab.service,  # type: ignore[arg-type]  # it has the methods that LCM calls
-        loop,
-        sender,
-        lab.lcm,
-    )
-    queries.add("lab")
+    settings, service = LcmSettings(url="memq://"), lab.service
+    late = LcmRequests(settings, service, loop, sender, lab.lcm, {})  # type: ignore[arg-type]  # it has the methods that LCM calls
+    late.add("lab")
     lab.send(request())
-    await queries.close()
+    await late.close()
 
 
 @pytest.mark.parametrize(
@@ -198,7 +192,7 @@ async def test_an_error_is_the_reply_and_a_defect_is_logged(
 
 def test_messages_on_other_channels_leave_room_for_requests() -> None:
     """On udpm://, the gateway's own messages arrive, too: they must not delay the replies."""
-    receiver = LcmReceiver("udpm://", "MOCAP", None, 64, lambda: None)
+    receiver = LcmReceiver("udpm://", "MOCAP", None, lambda: None)
     receiver._received = bucket = TokenBucket(100.0, monotonic=Clock(0.0))
     requests: list[bytes] = []
     receiver.add("MOCAP_LAB_COMMAND_REQUEST", requests.append)

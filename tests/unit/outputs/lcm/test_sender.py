@@ -212,20 +212,26 @@ def test_what_is_not_multicast_has_no_multicast_problem(url: str) -> None:
 # Publishers ----------------------------------------------------------------------------------
 
 
-def test_a_closed_publisher_says_so_and_frees_its_channel_once() -> None:
-    sent: list[tuple[str, bytes, str]] = []
-    forgotten: list[LcmPublisher] = []
-    publisher = LcmPublisher("MOCAP_LAB_3D", "lab", lambda *each: sent.append(each), forgotten.append)
+def test_a_closed_publisher_says_so_and_frees_its_channel_once(shared: lcm.LCM) -> None:
+    received: list[tuple[str, bytes]] = []
+    shared.subscribe(".*", lambda *each: received.append(each))
+    sender, channels = LcmSender("memq://", shared, lambda: None), {"MOCAP_LAB_3D"}
+    sender.open()
+    publisher = LcmPublisher("MOCAP_LAB_3D", "lab", sender, channels)
     assert publisher.wanted
     publisher.publish(b"message")
     publisher.close()
+    assert channels == set()
+    channels.add("MOCAP_LAB_3D")  # another publisher has it now
     publisher.close()
+    assert channels == {"MOCAP_LAB_3D"}
     assert refusal(lambda: publisher.publish(b"late")) == (
         "LCM channel MOCAP_LAB_3D is closed; ask for a new publisher",
         "closed",
     )
-    assert sent == [("MOCAP_LAB_3D", b"message", "lab")]
-    assert forgotten == [publisher]
+    while shared.handle_timeout(0):
+        pass
+    assert received == [("MOCAP_LAB_3D", b"message")]
 
 
 # An interface that is too slow ---------------------------------------------------------------

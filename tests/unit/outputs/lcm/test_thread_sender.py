@@ -49,7 +49,7 @@ class FakeLcm:
 @pytest.fixture
 def lcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeLcm]:
     fake = FakeLcm()
-    monkeypatch.setattr(sender_module, "open_lcm", fake.open)
+    monkeypatch.setattr(sender_module, "open_lcm_to_send", fake.open)
     monkeypatch.setattr(sender_module, "RETRY_S", 0.001)
     monkeypatch.setattr(sender_module, "_JOIN_S", 0.01)
     yield fake

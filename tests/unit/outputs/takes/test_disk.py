@@ -15,8 +15,7 @@ import pytest
 from gateway.errors import OutputError, QueryError
 from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.parameters_message import encode_parameters
+from gateway.outputs.contract import ServerParameters, encode_parameters
 from gateway.outputs.takes import disk as disk_calls
 from gateway.outputs.takes import disk as disk_module
 from gateway.outputs.takes.disk import Disk

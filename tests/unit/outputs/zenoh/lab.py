@@ -14,7 +14,7 @@ from gateway.errors import QueryError
 from gateway.logs.failures import current_log_fields
 from gateway.logs.losses import Losses
 from gateway.outputs.contract import Answer, KeyPath
-from gateway.outputs.zenoh.declarations import SourceDeclarations
+from gateway.outputs.zenoh.answers import ZenohAnswers
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
@@ -92,7 +92,7 @@ class Lab:
         self.output.count_losses("lab", self.losses)
         self.output.start()
         wait_until(lambda: self.output.health().connected)
-        self.output.wait_until_open(30)  # it declares the queryables last
+        wait_until(lambda: not self.output._holder._opener.is_alive())
 
     def subscribe(self, keys: str) -> zenoh.Subscriber[None]:
         return self.peer.declare_subscriber(keys, self.samples.append)
@@ -120,9 +120,9 @@ class QueriedLab(Lab):
         self.output.announce("lab")
 
     @property
-    def declarations(self) -> SourceDeclarations:
-        assert self.output._declarations is not None
-        return self.output._declarations
+    def answers(self) -> ZenohAnswers:
+        assert self.output._answers is not None
+        return self.output._answers
 
     async def query(self, selector: str) -> Reply:
         return await query(self.peer, selector)

@@ -22,7 +22,7 @@ def lab(queried: QueriedLab) -> QueriedLab:
 @pytest.fixture
 def at_once(lab: QueriedLab, monkeypatch: pytest.MonkeyPatch) -> None:
     """All queries arrive within a moment."""
-    monkeypatch.setattr(lab.declarations._admission, "_monotonic", lambda: 1000.0)
+    monkeypatch.setattr(lab.answers.admission, "_monotonic", lambda: 1000.0)
 
 
 async def test_equal_queries_share_an_answer_until_there_is_one(lab: QueriedLab) -> None:
@@ -35,7 +35,7 @@ async def test_equal_queries_share_an_answer_until_there_is_one(lab: QueriedLab)
     for _ in range(50):
         lab.peer.get("mocap/lab/status?a=1;b=2;_time=x", receive, timeout=20)
         lab.peer.get("mocap/lab/status?b=2;a=1", receive, timeout=20)
-    await wait_until_async(lambda: lab.declarations._admission.num_pending == 100)
+    await wait_until_async(lambda: lab.answers.admission.num_pending == 100)
     await wait_until_async(lambda: len(lab.service.received) == 1)
     lab.service.may_answer.set()
     await wait_until_async(lambda: len(replies) == 100)
@@ -67,7 +67,7 @@ async def test_more_different_questions_than_are_answered_at_a_time_wait(
     monkeypatch.setattr(answers_module, "MAX_QUESTIONS", 2)
     lab.service.may_answer.clear()
     waiting = [asyncio.create_task(lab.query(f"mocap/lab/status?a={n}")) for n in range(5)]
-    await wait_until_async(lambda: lab.declarations._admission.num_pending == 5)
+    await wait_until_async(lambda: lab.answers.admission.num_pending == 5)
     await wait_until_async(lambda: len(lab.service.received) == 2)
     lab.service.may_answer.set()
     replies = await asyncio.gather(*waiting)
@@ -80,7 +80,7 @@ async def test_a_query_with_wildcards_counts_once_for_each_of_its_keys(
     """Otherwise a peer could ask for everything at the price of one query."""
     monkeypatch.setattr(lab.service, "keys", lambda _source: [("a",), ("b",), ("c",)])
     counted: list[int] = []
-    monkeypatch.setattr(lab.declarations._admission, "count", counted.append)
+    monkeypatch.setattr(lab.answers.admission, "count", counted.append)
     assert len(await lab.query_all("mocap/lab/*")) == 3
     assert counted == [2]  # besides the query itself
 
@@ -106,7 +106,7 @@ async def test_queries_beyond_the_rate_get_an_error_and_are_counted(
 async def test_a_flood_of_queries_is_not_a_flood_of_errors(
     lab: QueriedLab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lab.declarations._admission, "_refusals", TokenBucket(2.0, monotonic=Clock()))
+    monkeypatch.setattr(lab.answers.admission, "_refusals", TokenBucket(2.0, monotonic=Clock()))
     assert await lab.codes("mocap/lab/status", 30) == {"ok": 10, "rate": 2}
 
 

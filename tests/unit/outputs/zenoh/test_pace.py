@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 
 from gateway.errors import OutputError
-from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.zenoh import declarations as declarations_module
-from gateway.outputs.zenoh.declarations import SourceDeclarations
+from gateway.outputs.zenoh import output as output_module
 from gateway.outputs.zenoh.json_publishing import JsonConverter
+from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.publisher import BURST_BYTES, BURST_S, ZenohLink
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.support.clocks import Clock, run_in_virtual_time
@@ -64,13 +63,12 @@ def test_the_thread_for_json_rests_four_times_as_long_as_a_conversion_took(clock
     assert clock.waits_s == pytest.approx([0.01, 0.04])
 
 
-class Queries(SourceDeclarations):
+class PublishingOutput(ZenohOutput):
     """Publishes the parameters of "lab" in a list instead of on Zenoh, with the time."""
 
     def __init__(self) -> None:
-        loop = asyncio.get_running_loop()
-        super().__init__(ZenohSettings(), None, loop)  # type: ignore[arg-type]  # nobody asks
-        self.count_losses("lab", Losses(declarations_module.logger, "lab to zenoh"))
+        super().__init__(ZenohSettings())
+        self.serve_queries(None)  # type: ignore[arg-type]  # nobody asks
         self._parameters["lab"] = PARAMETERS
         self.published_s: list[float] = []
 
@@ -88,15 +86,15 @@ def test_parameters_are_published_for_new_subscribers_at_most_twice_a_second(
 
     async def appear() -> list[float]:
         loop = asyncio.get_running_loop()
-        monkeypatch.setattr(declarations_module, "time", SimpleNamespace(monotonic=loop.time))
-        declarations = Queries()
+        monkeypatch.setattr(output_module, "time", SimpleNamespace(monotonic=loop.time))
+        output = PublishingOutput()
         for _ in range(12):
             for _ in range(3):
-                declarations._publish_soon("lab")
+                output._publish_soon("lab")
             await asyncio.sleep(0.1)
         await asyncio.sleep(10)
-        await declarations.close()
-        return declarations.published_s
+        await output.stop_queries()
+        return output.published_s
 
     published_s = run_in_virtual_time(appear())
     assert published_s == [0, 0.5, 1.0, 1.5]
@@ -106,13 +104,13 @@ def test_parameters_have_arrived_when_nothing_can_overtake_them() -> None:
     """Messages of streams have a higher priority: for 50 ms, they may be delivered first."""
 
     async def publish() -> float:
-        declarations = Queries()
+        output = PublishingOutput()
         loop = asyncio.get_running_loop()
         began_s = loop.time()
-        arrived = declarations.publish_parameters("lab", PARAMETERS)
+        arrived = output.publish_parameters("lab", PARAMETERS)
         assert arrived is not None
         await arrived
-        await declarations.close()
+        await output.stop_queries()
         return loop.time() - began_s
 
     assert run_in_virtual_time(publish()) == pytest.approx(0.05)

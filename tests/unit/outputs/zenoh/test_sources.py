@@ -14,7 +14,6 @@ from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
-from gateway.outputs.zenoh import declarations as declarations_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.support.networks import open_zenoh, zenoh_keys
@@ -120,8 +119,8 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
     monkeypatch.setattr(answers_module, "LONG_ANSWER_BYTES", 8)
     used: list[str] = []
     for name, sender in (
-        ("short", lab.declarations._sender),
-        ("long", lab.declarations._answers._long_sender),
+        ("short", lab.output._sender),
+        ("long", lab.answers._long_sender),
     ):
         offer = sender.offer
 
@@ -215,28 +214,27 @@ async def test_an_output_without_queries_has_no_results() -> None:
 
 
 async def test_an_event_loop_that_has_ended_is_no_error(lab: QueriedLab) -> None:
-    loop = asyncio.new_event_loop()
-    loop.close()
-    declarations = declarations_module.SourceDeclarations(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
-    declarations.open(lab.peer, [])
-    await declarations.close()
+    late = QueriedLab()
+    late.output._loop = asyncio.new_event_loop()
+    late.output._loop.close()
+    late.output._declare_all(lab.peer)
+    await late.stop()
 
 
 async def test_what_zenoh_does_not_publish_is_counted_and_logged(
     lab: QueriedLab, caplog: pytest.LogCaptureFixture
 ) -> None:
     session = open_zenoh("client", connect=lab.endpoint)
-    loop = asyncio.get_running_loop()
-    declarations = declarations_module.SourceDeclarations(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
-    losses = Losses(logging.getLogger("test"), "lab, zenoh")
-    declarations.count_losses("lab", losses)
-    declarations.open(session, ["lab"])
+    late, losses = QueriedLab(), Losses(logging.getLogger("test"), "lab, zenoh")
+    late.output.count_losses("lab", losses)
+    late.output._holder.session = session
+    late.output._declare_all(session)
     await asyncio.sleep(0)  # the event loop publishes what was there before: nothing
     session.close()
     caplog.clear()
-    declarations.publish_parameters("lab", ServerParameters(XML, 1, 1))
-    declarations.announce_file("lab", {"name": "late.c3d"})
+    late.output.publish_parameters("lab", ServerParameters(XML, 1, 1))
+    late.output.announce_file("lab", ServerFile(Path("late.c3d"), 7))
     await wait_until_async(lambda: amounts(losses.report()) == {"put failed": (2, 0)})
-    await declarations.close()
+    await late.stop()
     text = "lab, zenoh: Zenoh did not take parameters or an announcement: session closed"
     assert caplog.messages == [text]
