@@ -4,51 +4,40 @@ This module needs no numpy, so that a command line can name the components witho
 """
 
 from enum import IntEnum
-from typing import Final, NamedTuple
-
-
-class _Names(NamedTuple):
-    """The names of one component."""
-
-    key: str
-    command_word: str
-    item_noun: str
+from typing import Final
 
 
 class ComponentType(IntEnum):
-    """The component types of §7.2; ``_NAMES`` below has their names."""
+    """The component types of §7.2, with their names."""
 
-    MARKERS = 1
-    ANALOG = 2
-    FORCE = 3
-    TOOLS = 4
-    EVENT = 5
+    key: str
+    """The name in keys, in channels (upper-case) and in settings."""
+    command_word: str
+    """The name in commands (§5.3.5)."""
+    item_noun: str
+    """What the items are called."""
 
-    @property
-    def key(self) -> str:
-        """The name in keys, in channels (upper-case) and in settings: 3d, 6d, analog, force or event."""
-        return _NAMES[self].key
+    def __new__(cls, number: int, key: str, command_word: str, item_noun: str) -> "ComponentType":
+        """Return the member with this number and these names."""
+        member = int.__new__(cls, number)
+        member._value_ = number
+        member.key, member.command_word, member.item_noun = key, command_word, item_noun
+        return member
 
-    @property
-    def command_word(self) -> str:
-        """The name in commands (§5.3.5): 3D, 6D, Analog, Force or Events."""
-        return _NAMES[self].command_word
-
-    @property
-    def item_noun(self) -> str:
-        """What the items are called: markers, tools, channels, plates or events."""
-        return _NAMES[self].item_noun
+    MARKERS = 1, "3d", "3D", "markers"
+    ANALOG = 2, "analog", "Analog", "channels"
+    FORCE = 3, "force", "Force", "plates"
+    TOOLS = 4, "6d", "6D", "tools"
+    EVENT = 5, "event", "Events", "events"
 
 
-_NAMES: Final = {
-    ComponentType.MARKERS: _Names("3d", "3D", "markers"),
-    ComponentType.TOOLS: _Names("6d", "6D", "tools"),
-    ComponentType.ANALOG: _Names("analog", "Analog", "channels"),
-    ComponentType.FORCE: _Names("force", "Force", "plates"),
-    ComponentType.EVENT: _Names("event", "Events", "events"),
-}
-
-WIRE_ORDER: Final = tuple(_NAMES)
+WIRE_ORDER: Final = (
+    ComponentType.MARKERS,
+    ComponentType.TOOLS,
+    ComponentType.ANALOG,
+    ComponentType.FORCE,
+    ComponentType.EVENT,
+)
 """All components, in the order in which servers put them into a frame (field note 5)."""
 
 COMPONENTS_BY_KEY: Final = {component.key: component for component in WIRE_ORDER}

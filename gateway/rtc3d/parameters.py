@@ -304,19 +304,25 @@ class Section(NamedTuple):
     """The name in SendParameters (§5.3.3)."""
     field: str
     """The field of Parameters."""
+    items_field: str = ""
+    """The field with the items in the section; "" if it has none."""
 
     def of(self, parameters: Parameters) -> Any:
         """Return this section of ``parameters``, for example a Parameters3D; None if it is absent."""
         return getattr(parameters, self.field)
 
+    def items_of(self, parameters: Parameters) -> tuple[Any, ...]:
+        """Return the markers, tools, channels, plates or events; () if ``parameters`` lack them."""
+        return getattr(self.of(parameters), self.items_field, ())
+
 
 SECTIONS: Final = {
     "general": Section("General", "general"),
-    "3d": Section("3D", "markers"),
-    "6d": Section("6D", "tools"),
-    "analog": Section("Analog", "analog"),
-    "force": Section("Force", "force"),
-    "events": Section("Events", "events"),
+    "3d": Section("3D", "markers", "markers"),
+    "6d": Section("6D", "tools", "tools"),
+    "analog": Section("Analog", "analog", "channels"),
+    "force": Section("Force", "force", "plates"),
+    "events": Section("Events", "events", "events"),
 }
 """The sections of §6 by the names that they have in the gateway's keys, messages and commands."""
 
@@ -358,7 +364,9 @@ _MAX_NAMED: Final = 3
 
 def differ_in_statistics_only(before: bytes, after: bytes) -> bool:
     """Return whether two XML replies are the same except for the statistics of §6.1. Cheap for long XML."""
-    return _without(before, _statistics(before)) == _without(after, _statistics(after))
+    parts = ((xml, _statistics(xml)) for xml in (before, after))
+    rest_before, rest_after = (xml[: part.start] + xml[part.stop :] for xml, part in parts)
+    return rest_before == rest_after
 
 
 def statistics_xml(xml: bytes) -> bytes:
@@ -374,10 +382,6 @@ def _statistics(xml: bytes) -> slice:
     return slice(0, 0) if start < 0 or end < 0 else slice(start, end + len(b"</Stats>"))
 
 
-def _without(xml: bytes, part: slice) -> bytes:
-    return xml[: part.start] + xml[part.stop :]
-
-
 def describe_renames(before: Parameters, after: Parameters) -> str:
     """Return which markers and tools have another name than before; "" if none has.
 
@@ -385,28 +389,18 @@ def describe_renames(before: Parameters, after: Parameters) -> str:
     the same position are compared. The text is bounded, and control characters are escaped.
     """
     texts = []
-    for section in ("3d", "6d"):
-        labels = zip(_labels(before, section), _labels(after, section), strict=False)
-        renamed = [f"{quoted(old)} to {quoted(new)}" for old, new in labels if old != new]
+    for key in ("3d", "6d"):
+        items = zip(SECTIONS[key].items_of(before), SECTIONS[key].items_of(after), strict=False)
+        renamed = [
+            f"{quoted(old.label)} to {quoted(new.label)}" for old, new in items if old.label != new.label
+        ]
         if renamed:
             rest = f" and {len(renamed) - _MAX_NAMED} more" if len(renamed) > _MAX_NAMED else ""
-            texts.append(f"{section} {', '.join(renamed[:_MAX_NAMED])}{rest}")
+            texts.append(f"{key} {', '.join(renamed[:_MAX_NAMED])}{rest}")
     return "; ".join(texts)
 
 
 def changed_sections(before: Parameters, after: Parameters) -> list[str]:
     """Return the sections that differ in more than the statistics and the names of markers and tools."""
-    before, after = _without_labels(before), _without_labels(after)
+    before, after = (relabelled(without_statistics(each), lambda _: "") for each in (before, after))
     return [name for name, section in SECTIONS.items() if section.of(before) != section.of(after)]
-
-
-def _labels(parameters: Parameters, section: str) -> list[str]:
-    match SECTIONS[section].of(parameters):
-        case Parameters3D(markers=items) | Parameters6D(tools=items):
-            return [item.label for item in items]
-    return []
-
-
-def _without_labels(parameters: Parameters) -> Parameters:
-    """Return the parameters without statistics, and without the labels of markers and tools."""
-    return relabelled(without_statistics(parameters), lambda _: "")

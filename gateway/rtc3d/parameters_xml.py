@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from itertools import islice
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
@@ -239,7 +239,10 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
     if star:
         found_items = element.iterfind(head)
         if kind in LAYOUT:
-            found_items = _first_items(found_items, head, notes)
+            found_items = list(islice(found_items, MAX_ITEMS + 1))
+            if len(found_items) > MAX_ITEMS:
+                _note(notes, f"more than {MAX_ITEMS} elements {head}: the others are left out")
+                del found_items[MAX_ITEMS]
         items = (_value(item, rest.removeprefix("/"), kind, notes) for item in found_items)
         # Only a number can be None here; NaN takes its place in the row.
         return tuple(math.nan if item is None else item for item in items)
@@ -252,15 +255,6 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
         return _read(kind, found, notes)
     text = (found.text or "").strip()
     return (_cut(text, notes) or None) if kind is str else _number(found, text, kind, notes)
-
-
-def _first_items(items: Iterable[etree._Element], path: str, notes: list[str]) -> Iterator[etree._Element]:
-    """Yield the first MAX_ITEMS of ``items``, which are at ``path``; note if there are more."""
-    for number, item in enumerate(items):
-        if number == MAX_ITEMS:
-            _note(notes, f"more than {MAX_ITEMS} elements {path}: the others are left out")
-            return
-        yield item
 
 
 def _cut(text: str, notes: list[str]) -> str:
@@ -291,16 +285,11 @@ def encode_parameters(parameters: Parameters) -> bytes:
     Leaves out characters that XML cannot represent, and numbers that are None.
     """
     root = etree.Element(ROOT, Ver="1.00")
-    _write(parameters, root)
+    _write(parameters, root, "")
     return etree.tostring(root, pretty_print=True)
 
 
-def _write(dataclass: object, element: etree._Element) -> None:
-    for field in LAYOUT[type(dataclass)]:
-        _write_value(getattr(dataclass, field.name), element, field.path)
-
-
-def _write_value(value: Any, element: etree._Element, path: str) -> None:
+def _write(value: Any, element: etree._Element, path: str) -> None:
     if value is None:
         return
     head, star, rest = path.partition("*")
@@ -309,11 +298,13 @@ def _write_value(value: Any, element: etree._Element, path: str) -> None:
         parent = _descend(element, container)
         for number, item in enumerate(value, start=1):
             # Every repeated element of §6 is numbered; an id in the dataclass replaces the number.
-            _write_value(item, etree.SubElement(parent, tag, id=str(number)), rest.removeprefix("/"))
+            _write(item, etree.SubElement(parent, tag, id=str(number)), rest.removeprefix("/"))
     elif path == "@id":
         element.set("id", _xml_text(value))
     elif type(value) in LAYOUT:
-        _write(value, _descend(element, path))
+        parent = _descend(element, path)
+        for field in LAYOUT[type(value)]:
+            _write(getattr(value, field.name), parent, field.path)
     else:
         _descend(element, path).text = _xml_text(str(value))
 
