@@ -11,7 +11,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.stream.plan import Components, StreamPlan, announced_rates_hz, plan_streams
 from gateway.stream.rate_check import AnnouncedRates
-from gateway.stream.state import StreamState
+from gateway.stream.state import Phase, StreamState
 from gateway.stream.supervisor import Listener, Supervisor
 
 _MAX_FURTHER_FAILURES: Final = 2
@@ -132,7 +132,7 @@ class _Further:
         """Close the connection."""
         if self.task is not None and self.is_running:
             self.task.cancel()
-            self.stream.status.stopped(reason)
+            self.stream.status.enter(Phase.WAITING, "the gateway ends the connection", reason)
 
     async def _run_after(self, former: asyncio.Task[None] | None) -> None:
         if former is not None:
