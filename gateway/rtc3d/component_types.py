@@ -8,36 +8,39 @@ from typing import Final
 
 
 class ComponentType(IntEnum):
-    """The component types of §7.2, with their names."""
+    """The component types of §7.2; ``_NAMES`` below has their names."""
 
-    key: str
-    """The name in keys, in channels (upper-case) and in settings."""
-    command_word: str
-    """The name in commands (§5.3.5)."""
-    item_noun: str
-    """What the items are called."""
+    MARKERS = 1
+    ANALOG = 2
+    FORCE = 3
+    TOOLS = 4
+    EVENT = 5
 
-    def __new__(cls, number: int, key: str, command_word: str, item_noun: str) -> "ComponentType":
-        """Return the member with this number and these names."""
-        member = int.__new__(cls, number)
-        member._value_ = number
-        member.key, member.command_word, member.item_noun = key, command_word, item_noun
-        return member
+    @property
+    def key(self) -> str:
+        """The name in keys, in channels (upper-case) and in settings: 3d, 6d, analog, force or event."""
+        return _NAMES[self][0]
 
-    MARKERS = 1, "3d", "3D", "markers"
-    ANALOG = 2, "analog", "Analog", "channels"
-    FORCE = 3, "force", "Force", "plates"
-    TOOLS = 4, "6d", "6D", "tools"
-    EVENT = 5, "event", "Events", "events"
+    @property
+    def command_word(self) -> str:
+        """The name in commands (§5.3.5): 3D, 6D, Analog, Force or Events."""
+        return _NAMES[self][1]
+
+    @property
+    def item_noun(self) -> str:
+        """What the items are called: markers, tools, channels, plates or events."""
+        return _NAMES[self][2]
 
 
-WIRE_ORDER: Final = (
-    ComponentType.MARKERS,
-    ComponentType.TOOLS,
-    ComponentType.ANALOG,
-    ComponentType.FORCE,
-    ComponentType.EVENT,
-)
+_NAMES: Final = {
+    ComponentType.MARKERS: ("3d", "3D", "markers"),
+    ComponentType.TOOLS: ("6d", "6D", "tools"),
+    ComponentType.ANALOG: ("analog", "Analog", "channels"),
+    ComponentType.FORCE: ("force", "Force", "plates"),
+    ComponentType.EVENT: ("event", "Events", "events"),
+}
+
+WIRE_ORDER: Final = tuple(_NAMES)
 """All components, in the order in which servers put them into a frame (field note 5)."""
 
 COMPONENTS_BY_KEY: Final = {component.key: component for component in WIRE_ORDER}

@@ -23,7 +23,7 @@ MAX_RECOVERED: Final = 20
 """The highest number of entries in ``ParsedParameters.recovered``."""
 _PADDING: Final = b"\0 \t\r\n"
 """Bytes at both ends of an XML reply that are ignored (field note 9)."""
-_SECTION_TAGS: Final = {field.name: field.path for field in LAYOUT[Parameters]}
+_SECTION_TAGS: Final = {name: at.path for name, at in LAYOUT[Parameters].items()}
 _MAX_NOTE_CHARACTERS: Final = 200
 _MAX_QUOTED_BYTES: Final = 60
 
@@ -226,10 +226,10 @@ def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) 
 
 def _read(kind: type, element: etree._Element, notes: list[str]) -> Any:
     """Return the dataclass ``kind`` that ``element`` describes; absent fields have their defaults."""
-    values = {field.name: _value(element, field.path, field.kind, notes) for field in LAYOUT[kind]}
-    for field in LAYOUT[kind]:
-        if field.may_be_empty and values[field.name] is None and element.find(field.path) is not None:
-            values[field.name] = ""
+    values = {name: _value(element, at.path, at.kind, notes) for name, at in LAYOUT[kind].items()}
+    for name, at in LAYOUT[kind].items():
+        if at.may_be_empty and values[name] is None and element.find(at.path) is not None:
+            values[name] = ""
     return kind(**{name: value for name, value in values.items() if value is not None})
 
 
@@ -237,12 +237,10 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
     """Return the value at ``path`` below ``element``; None if it is absent or cannot be read."""
     head, star, rest = path.partition("*")
     if star:
-        found_items = element.iterfind(head)
-        if kind in LAYOUT:
-            found_items = list(islice(found_items, MAX_ITEMS + 1))
-            if len(found_items) > MAX_ITEMS:
-                _note(notes, f"more than {MAX_ITEMS} elements {head}: the others are left out")
-                del found_items[MAX_ITEMS]
+        found_items = list(islice(element.iterfind(head), MAX_ITEMS + 1 if kind in LAYOUT else None))
+        if kind in LAYOUT and len(found_items) > MAX_ITEMS:
+            _note(notes, f"more than {MAX_ITEMS} elements {head}: the others are left out")
+            del found_items[MAX_ITEMS]
         items = (_value(item, rest.removeprefix("/"), kind, notes) for item in found_items)
         # Only a number can be None here; NaN takes its place in the row.
         return tuple(math.nan if item is None else item for item in items)
@@ -303,8 +301,8 @@ def _write(value: Any, element: etree._Element, path: str) -> None:
         element.set("id", _xml_text(value))
     elif type(value) in LAYOUT:
         parent = _descend(element, path)
-        for field in LAYOUT[type(value)]:
-            _write(getattr(value, field.name), parent, field.path)
+        for name, at in LAYOUT[type(value)].items():
+            _write(getattr(value, name), parent, at.path)
     else:
         _descend(element, path).text = _xml_text(str(value))
 
