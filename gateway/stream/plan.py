@@ -172,28 +172,21 @@ class LagControl:
             self._since_s = now_s
             return False
         held_s = now_s - self._since_s
-        if is_late:
-            return held_s >= LATE_S and self._step_down(now_s)
-        return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
+        if is_late and held_s >= LATE_S and self.halvings < self._max_halvings:
+            self.halvings += 1
+            if self._stepped_up_s is not None:
+                failed = now_s - self._stepped_up_s < self.wait_s
+                self.wait_s = min(2 * self.wait_s, MAX_WAIT_S) if failed else FIRST_WAIT_S
+                self._stepped_up_s = None
+        elif not is_late and held_s >= self.wait_s and self.halvings > 0:
+            self.halvings -= 1
+            self._stepped_up_s = now_s
+        else:
+            return False
+        self._since_s = now_s
+        return True
 
     def restart(self) -> None:
         """Forget how late the previous frames were, because the next ones do not continue them."""
         self.is_late = False
         self._since_s = None
-
-    def _step_down(self, now_s: float) -> bool:
-        if self.halvings >= self._max_halvings:
-            return False
-        if self._stepped_up_s is not None:
-            failed = now_s - self._stepped_up_s < self.wait_s
-            self.wait_s = min(2 * self.wait_s, MAX_WAIT_S) if failed else FIRST_WAIT_S
-            self._stepped_up_s = None
-        self.halvings += 1
-        self._since_s = now_s
-        return True
-
-    def _step_up(self, now_s: float) -> bool:
-        self.halvings -= 1
-        self._stepped_up_s = now_s
-        self._since_s = now_s
-        return True
