@@ -11,25 +11,7 @@ import numpy.typing as npt
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS, Parameters, Parameters3D, only_sections
 
-__all__ = [
-    "COMPONENTS_BY_KEY",
-    "COMPONENT_HEADER",
-    "COMPONENT_HEADER_BYTES",
-    "FRAME_NUMBER_AND_TIMESTAMP",
-    "ITEM_DTYPES",
-    "LONG_EVENT",
-    "MISSING",
-    "MISSING_MARKER",
-    "MISSING_RELIABILITY",
-    "SHORT_EVENT",
-    "WIRE_ORDER",
-    "ByteOrder",
-    "Component",
-    "ComponentType",
-    "Items",
-    "big_endian_content",
-    "encode_component",
-]
+__all__ = ["COMPONENTS_BY_KEY", "WIRE_ORDER", "ComponentType"]  # those of component_types
 
 ByteOrder = Literal["big", "little"]
 Items: TypeAlias = npt.NDArray[Any]

@@ -232,9 +232,6 @@ class ServerClock:
         self._samples.clear()
         self._late_samples.clear()
         self._scatter_us = math.inf
-        self._begin_window(arrival_us)
-
-    def _begin_window(self, arrival_us: int) -> None:
         self._window_end_us = arrival_us + _WINDOW_US
         self._least_lag_us = math.inf
 
@@ -242,7 +239,8 @@ class ServerClock:
         """End the current window: add its sample to the others or to the late ones, and fit the line."""
         lag_us = self._least_lag_us
         least = Sample(self._least_timestamp_us, self._least_offset_us)
-        self._begin_window(arrival_us)
+        self._window_end_us = arrival_us + _WINDOW_US
+        self._least_lag_us = math.inf
         late_us = _STEP_US + 4 * self._scatter_us
         if lag_us < late_us:
             self._samples.append(least)
