@@ -134,11 +134,6 @@ class Frame:
             content,
         )
 
-    @property
-    def unknown_types(self) -> tuple[int, ...]:
-        """The types of the skipped components, which §7.2 does not define."""
-        return self.layout.unknown_types
-
 
 def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     """Split a type-3 packet's body into components (§7.1).

@@ -120,7 +120,11 @@ class StreamRequests:
         if self._requested is not None and not self._session.has_data and not self._only_events:
             await self._ask_again(self._requested)
             return
-        probe = self._session.replies.answered(Version, SendParameters, SetByteOrder, StopStreaming)
+        answered, kinds = (
+            self._session.replies.answered,
+            (Version, SendParameters, SetByteOrder, StopStreaming),
+        )
+        probe = next((answered[kind] for kind in kinds if kind in answered), None)
         if self._requested is not None and (probe is None or isinstance(probe, StopStreaming)):
             probe = self._requested  # the server accepted it, so it answers it again
         if probe is None:
@@ -147,7 +151,7 @@ class StreamRequests:
     async def _request_any(self, forms: Sequence[StreamFrames]) -> None:
         """Request frames in one form after the other, until the server accepts one or sends frames."""
         session = self._session
-        has_answered = session.replies.has_answered
+        has_answered = bool(session.replies.answered)
         ignored: list[StreamFrames] = []
         for form in forms:
             outcome = await self._request(form)
@@ -164,7 +168,7 @@ class StreamRequests:
                     f"{verb} StreamFrames in every form that the protocol has; "
                     "check its real-time output settings"
                 )
-                if not session.replies.has_answered:
+                if not session.replies.answered:
                     text = "accepts connections and answers no command; restart its application"
                 raise RequestError(f"{session.server} {text}")
             self.accepted = self._requested = forms[-1]
