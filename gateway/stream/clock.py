@@ -245,21 +245,17 @@ class ServerClock:
         if lag_us < late_us:
             self._samples.append(least)
         else:
-            self._late_samples.append(least)
-            if not self._stays_late(min(lag_us / 4, late_us)):
+            late = self._late_samples
+            late.append(least)
+            # Whether a clock was set: point 4 of the module's docstring.
+            newest = islice(reversed(late), _STEP_WINDOWS)
+            spread_us = max(sample.offset_us for sample in newest) - min(sample.offset_us for sample in late)
+            is_stable = len(late) >= _STEP_WINDOWS and spread_us < min(lag_us / 4, late_us)
+            if not is_stable and len(late) < _KEPT_WINDOWS:
                 return
-            self._samples = self._late_samples.copy()
+            self._samples = late.copy()
         self._late_samples.clear()
         self._fit_line()
-
-    def _stays_late(self, tolerance_us: float) -> bool:
-        """Return whether the late samples show that a clock was set: point 4 of the module's docstring."""
-        late = self._late_samples
-        if len(late) < _STEP_WINDOWS:
-            return False
-        newest = islice(reversed(late), _STEP_WINDOWS)
-        spread_us = max(sample.offset_us for sample in newest) - min(sample.offset_us for sample in late)
-        return spread_us < tolerance_us or len(late) == _KEPT_WINDOWS
 
     def _fit_line(self) -> None:
         """Fit the line to the samples, and check whether its slope can be that of a clock."""
