@@ -18,7 +18,7 @@ from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.plan import StreamPlan, plan_streams
 from gateway.stream.process_clock import running_clock
 from gateway.stream.replies import Connection
-from gateway.stream.session import IgnoredFiles, Session
+from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_requests import StreamRequests
 from gateway.stream.supervisor import component_keys, stream_name
@@ -107,7 +107,7 @@ class ObservedStream:
         self.status = StreamStatus(self.component_keys, name=stream_name(source, stream.components))
         self.parsed: ParsedParameters | None = None
         self.observed: dict[ComponentType, ObservedComponent] = {}
-        self.session = Session(source, stream, self.status, self._on_frames, IgnoredFiles())
+        self.session = Session(source, stream, self.status, self._on_frames)
         self.control = StreamRequests(
             source, stream, self.status, self.session, self._read_parameters, self._planned_components
         )
@@ -152,8 +152,8 @@ class ObservedStream:
         loads = [component.message_load for component in self.observed.values()]
         return sum(load.rate_hz * load.largest_bytes for load in loads)
 
-    def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
-        self.status.frames_received(len(frames), utime)
+    def _on_frames(self, frames: list[Frame], _utime: int, steady_us: int) -> None:
+        self.status.frames_in += len(frames)
         for frame in frames:
             for component in frame.components:
                 if component.type in self.settings.components:

@@ -101,7 +101,18 @@ class CoordinateFrame:
             for q0, qx, qy, qz, x, y, z, error in tools.tolist()
         ]
         if not self.only_scales:
-            poses = list(map(self._moved, poses))
+            tx, ty, tz = self.translation_m
+            (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._rows
+            poses = [
+                (
+                    xx * x + xy * y + xz * z + tx,
+                    yx * x + yy * y + yz * z + ty,
+                    zx * x + zy * y + zz * z + tz,
+                    *product(self.rotation_xyzw, (qx, qy, qz, qw)),
+                    error_m,
+                )
+                for x, y, z, qx, qy, qz, qw, error_m in poses
+            ]
         return [pose if _is_complete(pose, accept_zeros) else None for pose in poses]
 
     @property
@@ -109,18 +120,6 @@ class CoordinateFrame:
         if self.metres_per_unit is None:
             raise ValueError("the unit of length is unknown")
         return self.metres_per_unit
-
-    def _moved(self, pose: Pose) -> Pose:
-        x, y, z, qx, qy, qz, qw, error_m = pose
-        tx, ty, tz = self.translation_m
-        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._rows
-        return (
-            xx * x + xy * y + xz * z + tx,
-            yx * x + yy * y + yz * z + ty,
-            zx * x + zy * y + zz * z + tz,
-            *product(self.rotation_xyzw, (qx, qy, qz, qw)),
-            error_m,
-        )
 
     @cached_property
     def _rows(self) -> list[list[float]]:

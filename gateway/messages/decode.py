@@ -6,7 +6,6 @@ markers, in which no frame is published. It is not faster either: for 1000 marke
 """
 
 import json
-import math
 from functools import cache
 from json.encoder import encode_basestring
 from typing import Any, Final, NamedTuple
@@ -146,10 +145,4 @@ def to_json(value: Any) -> Any:
 
     NaN and infinity become None.
     """
-    if hasattr(value, "__slots__"):
-        return {name: to_json(getattr(value, name)) for name in value.__slots__}
-    if isinstance(value, list | tuple):
-        return [to_json(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json.loads(json_text(value))

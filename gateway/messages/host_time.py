@@ -57,8 +57,7 @@ class HostClock:
 
         Their difference is exactly the same in every reading until the wall clock changes.
         """
-        utime = now_utime()
-        steady_us = now_steady_us()
+        utime, steady_us = time.time_ns() // 1000, time.clock_gettime_ns(_STEADY_CLOCK) // 1000
         change_us = utime - steady_us - self.offset_us
         if change_us > _TOLERANCE_US or change_us < -_TOLERANCE_US:
             self._follow(steady_us)

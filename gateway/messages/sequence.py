@@ -177,9 +177,14 @@ class SequenceCheck:
         if is_restart:
             num_lost = max(0, sequence) if self._counts_first else 0
         if num_lost:
-            current.gap = Gap(utime, num_lost, sequence)
-            self._add_gap(current.gap)
-            gaps.append(current.gap)
+            current.gap = gap = Gap(utime, num_lost, sequence)
+            gaps.append(gap)
+            self.num_gaps += 1
+            self.num_lost += num_lost
+            if len(self._listed) < self._max_listed:
+                self._listed.append(gap)
+            if self._max_listed and (self._largest is None or num_lost > self._largest.missing):
+                self._largest = gap
         self._former.append(current)
         self._current = _Numbering(sequence, utime, 1, gaps)
 
@@ -191,7 +196,7 @@ class SequenceCheck:
         if current.num_messages > 1:
             return None
         # The message between may have been damaged or late, and the one after it lost.
-        followed = [each for each in (*self._former, current) if _follows(each, sequence)]
+        followed = [each for each in (*self._former, current) if 0 < sequence - each.newest <= _MAX_GAP]
         nearest = max(followed, key=lambda each: each.newest, default=current)
         return None if nearest is current else nearest
 
@@ -211,16 +216,3 @@ class SequenceCheck:
         current.gap, current.is_restart = None, False
         self._former.append(current)
         self._current = former
-
-    def _add_gap(self, gap: Gap) -> None:
-        self.num_gaps += 1
-        self.num_lost += gap.missing
-        if len(self._listed) < self._max_listed:
-            self._listed.append(gap)
-        if self._max_listed and (self._largest is None or gap.missing > self._largest.missing):
-            self._largest = gap
-
-
-def _follows(numbering: _Numbering, sequence: int) -> bool:
-    """Return whether a number comes after those of ``numbering``, with a gap that is plausible."""
-    return 0 < sequence - numbering.newest <= _MAX_GAP

@@ -8,9 +8,9 @@ import rtc3d
 
 from gateway.errors import ParametersError
 from gateway.logs.losses import counts_text
-from gateway.messages.source_report import LossReport, OutputReport, SourceReport, StreamReport, source_report
+from gateway.messages.source_report import LossReport, SourceReport, source_report
 from gateway.messages.texts import xml_bytes
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4
@@ -71,19 +71,19 @@ def summarise_xml(xml: bytes) -> str:
 
 def described_items(parameters: Parameters, event: str = "event") -> str:
     """Return what parameters describe, such as "24 markers, 1 tool"; ``event`` is the word for events."""
-    sections = (
-        ("marker", parameters.markers, "markers"),
-        ("tool", parameters.tools, "tools"),
-        ("analog channel", parameters.analog, "channels"),
-        ("force plate", parameters.force, "plates"),
-        (event, parameters.events, "events"),
-    )
-    texts = []
-    for name, section, items in sections:
-        if section is not None:
-            count = len(getattr(section, items))
-            texts.append(f"{count} {name}{'' if count == 1 else 's'}")
-    return ", ".join(texts)
+    nouns = {
+        "3d": "marker",
+        "6d": "tool",
+        "analog": "analog channel",
+        "force": "force plate",
+        "events": event,
+    }
+    counts = [
+        (len(SECTIONS[key].items_of(parameters)), noun)
+        for key, noun in nouns.items()
+        if SECTIONS[key].of(parameters) is not None
+    ]
+    return ", ".join(f"{count} {noun}{'' if count == 1 else 's'}" for count, noun in counts)
 
 
 def _frame_content(message: Any, units: Sequence[str]) -> str:
@@ -101,9 +101,13 @@ def _frame_content(message: Any, units: Sequence[str]) -> str:
             voltages = _first(message.voltages, _number, ", ", units)
             text = f"{message.num_channels} channels, voltages {voltages}"
         case rtc3d.forces_t():
-            text = f"{message.num_plates} plates, forces {_first(message.plates, _force, '; ', units)}"
+            forces = [(plate.fx, plate.fy, plate.fz) for plate in message.plates]
+            text = f"{message.num_plates} plates, forces {_first(forces, _vector, '; ', units)}"
         case _:
-            text = f"{message.num_events} events: {_first(message.events, _event, '; ')}"
+            events = [
+                f"id {each.id:#x} ({each.param1}, {each.param2}, {each.param3})" for each in message.events
+            ]
+            text = f"{message.num_events} events: {_first(events, str, '; ')}"
     return text
 
 
@@ -133,14 +137,6 @@ def _with_unit(text: str, unit: Sequence[str]) -> str:
     return " ".join([text, *filter(None, unit)])
 
 
-def _force(plate: Any) -> str:
-    return _vector((plate.fx, plate.fy, plate.fz))
-
-
-def _event(event: Any) -> str:
-    return f"id {event.id:#x} ({event.param1}, {event.param2}, {event.param3})"
-
-
 def _vector(values: Sequence[float]) -> str:
     return "(" + ", ".join(map(_number, values)) + ")"
 
@@ -162,21 +158,17 @@ def _clock(clock: Any) -> str:
 
 
 def _status(report: SourceReport) -> str:
-    streams = "; ".join(map(_stream_summary, report.streams))
-    outputs = "; ".join(map(_output_summary, report.outputs))
-    return f"#{report.sequence} {report.name} at {report.server}: {streams}; outputs: {outputs}"
-
-
-def _stream_summary(stream: StreamReport) -> str:
-    error = f", last error: {stream.last_error}" if stream.last_error else ""
-    return (
+    streams = "; ".join(
         f"[{stream.components}] {stream.state} {stream.frame_rate_hz:.1f} Hz, {stream.num_frames} frames, "
-        f"{stream.num_reconnects} reconnects{_lost(stream.losses)}{error}"
+        f"{stream.num_reconnects} reconnects{_lost(stream.losses)}"
+        f"{stream.last_error and f', last error: {stream.last_error}'}"
+        for stream in report.streams
     )
-
-
-def _output_summary(output: OutputReport) -> str:
-    return f"{output.output} {'ok' if output.is_connected else output.problem}{_lost(output.losses)}"
+    outputs = "; ".join(
+        f"{output.output} {'ok' if output.is_connected else output.problem}{_lost(output.losses)}"
+        for output in report.outputs
+    )
+    return f"#{report.sequence} {report.name} at {report.server}: {streams}; outputs: {outputs}"
 
 
 def _lost(losses: Sequence[LossReport]) -> str:

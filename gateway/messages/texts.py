@@ -50,24 +50,18 @@ def _limited(value: Any, type_name: str, *, with_numbers: bool) -> Any:
     if type_name == "string":
         return safe_text(value)
     if type_name in _MAX_BITS:
-        return _limited_integer(value, 1 << _MAX_BITS[type_name])
+        end = 1 << _MAX_BITS[type_name]
+        return max(-end, min(value, end - 1))
     if type_name in {"float", "double"}:
-        return _limited_float(value, _MAX_FLOAT if type_name == "float" else math.inf)
+        largest = _MAX_FLOAT if type_name == "float" else math.inf
+        try:
+            number = float(value)
+        except OverflowError:  # of an integer beyond all floats
+            number = math.inf if value > 0 else -math.inf
+        # Infinity and NaN stay, because IEEE 754 has them in both sizes.
+        return max(-largest, min(number, largest)) if math.isfinite(number) else number
     _limit(value, with_numbers=with_numbers)
     return value
-
-
-def _limited_integer(value: int, end: int) -> int:
-    return max(-end, min(value, end - 1))
-
-
-def _limited_float(value: float, largest: float) -> float:
-    """Return the nearest float; infinity and NaN stay, because IEEE 754 has them in both sizes."""
-    try:
-        number = float(value)
-    except OverflowError:  # of an integer beyond all floats
-        number = math.inf if value > 0 else -math.inf
-    return max(-largest, min(number, largest)) if math.isfinite(number) else number
 
 
 _DECLARED_ENCODING: Final = re.compile(r"""\s*<\?xml[^>]*\sencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")

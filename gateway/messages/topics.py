@@ -56,7 +56,7 @@ def lcm_channel(prefix: str, source: str, *path: str) -> str:
     After ``prefix`` it has only upper-case ASCII letters, digits and ``_``. Two labels can give the same
     channel: see ``unique_name``.
     """
-    names = (_channel_name(name) for name in (source, *path))
+    names = (re.sub(r"[^A-Z0-9]+", "_", name.upper()).strip("_") or "_" for name in (source, *path))
     return "_".join([prefix, *names])[:MAX_CHANNEL_LENGTH]
 
 
@@ -71,7 +71,3 @@ def unique_name(name: str, taken: Container[str], max_length: int = MAX_CHANNEL_
         suffix = f"_{number}"
         candidate = name[: max_length - len(suffix)] + suffix
     return candidate
-
-
-def _channel_name(text: str) -> str:
-    return re.sub(r"[^A-Z0-9]+", "_", text.upper()).strip("_") or "_"

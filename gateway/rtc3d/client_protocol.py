@@ -23,6 +23,7 @@ from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, encod
 from gateway.rtc3d.frames import Frame, FrameReader, announced_components, detect_byte_order, encode_frame
 from gateway.rtc3d.packets import (
     ALL_PACKETS,
+    DATA,
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
     FilePiece,
@@ -60,44 +61,25 @@ class ProtocolInput(Enum):
     CONNECTION_ENDED = "the connection ended"
 
 
-_TRANSITIONS: Final[dict[tuple[ProtocolState, ProtocolInput], ProtocolState]] = {
-    (ProtocolState.IDLE, ProtocolInput.REQUEST_SENT): ProtocolState.REQUESTED,
-    (ProtocolState.STOPPED, ProtocolInput.REQUEST_SENT): ProtocolState.REQUESTED,
-    (ProtocolState.REQUESTED, ProtocolInput.REQUEST_REFUSED): ProtocolState.IDLE,
+_UNSTOPPED: Final = {
+    ProtocolState.IDLE,
+    ProtocolState.REQUESTED,
+    ProtocolState.STREAMING,
+    ProtocolState.NO_MEASUREMENT,
+}
+_TRANSITIONS: Final[dict[ProtocolInput, tuple[set[ProtocolState], ProtocolState]]] = {
+    ProtocolInput.REQUEST_SENT: ({ProtocolState.IDLE, ProtocolState.STOPPED}, ProtocolState.REQUESTED),
+    ProtocolInput.REQUEST_REFUSED: ({ProtocolState.REQUESTED}, ProtocolState.IDLE),
     # A reply does not always say what it answers (field note 20). What the server sends shows the truth: if
     # frames arrive although the server seems to have refused them, it has not.
-    (ProtocolState.IDLE, ProtocolInput.FRAME_RECEIVED): ProtocolState.STREAMING,
-    (ProtocolState.IDLE, ProtocolInput.NO_DATA_RECEIVED): ProtocolState.NO_MEASUREMENT,
-    (ProtocolState.REQUESTED, ProtocolInput.FRAME_RECEIVED): ProtocolState.STREAMING,
-    (ProtocolState.REQUESTED, ProtocolInput.NO_DATA_RECEIVED): ProtocolState.NO_MEASUREMENT,
-    (ProtocolState.STREAMING, ProtocolInput.NO_DATA_RECEIVED): ProtocolState.NO_MEASUREMENT,
-    (ProtocolState.NO_MEASUREMENT, ProtocolInput.FRAME_RECEIVED): ProtocolState.STREAMING,
-    **{
-        (state, stop): after
-        for state in (
-            ProtocolState.IDLE,
-            ProtocolState.REQUESTED,
-            ProtocolState.STREAMING,
-            ProtocolState.NO_MEASUREMENT,
-        )
-        for stop, after in (
-            (ProtocolInput.STOP_ACCEPTED, ProtocolState.STOPPED),
-            (ProtocolInput.STOP_UNANSWERED, ProtocolState.IDLE),  # the next frame shows if it was ignored
-        )
-    },
-    (ProtocolState.IDLE, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
-    (ProtocolState.REQUESTED, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
-    (ProtocolState.STREAMING, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
-    (ProtocolState.NO_MEASUREMENT, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
-    (ProtocolState.STOPPED, ProtocolInput.BYE_SENT): ProtocolState.CLOSING,
-    **{(state, ProtocolInput.CONNECTION_ENDED): ProtocolState.CLOSED for state in ProtocolState},
+    ProtocolInput.FRAME_RECEIVED: (_UNSTOPPED, ProtocolState.STREAMING),
+    ProtocolInput.NO_DATA_RECEIVED: (_UNSTOPPED, ProtocolState.NO_MEASUREMENT),
+    ProtocolInput.STOP_ACCEPTED: (_UNSTOPPED, ProtocolState.STOPPED),
+    ProtocolInput.STOP_UNANSWERED: (_UNSTOPPED, ProtocolState.IDLE),  # the next frame shows if it was ignored
+    ProtocolInput.BYE_SENT: (_UNSTOPPED | {ProtocolState.STOPPED}, ProtocolState.CLOSING),
+    ProtocolInput.CONNECTION_ENDED: (set(ProtocolState), ProtocolState.CLOSED),
 }
-
-
-def next_state(state: ProtocolState, protocol_input: ProtocolInput) -> ProtocolState:
-    """Return the state after ``protocol_input``; an input that is not in the table changes nothing."""
-    return _TRANSITIONS.get((state, protocol_input), state)
-
+"""In which states each input changes the state, and to which. In other states, it changes nothing."""
 
 _MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
@@ -184,7 +166,7 @@ class ClientProtocol:
         self._frame_reader: FrameReader | None = None  # None before the first frame that has a component
         self._replies = ReplyMatcher()
         self._agreed_byte_order: ByteOrder = "big"
-        self._outgoing = bytearray()
+        self._outgoing = b""
         self.state = ProtocolState.IDLE
 
     @property
@@ -240,8 +222,7 @@ class ClientProtocol:
 
     def bytes_to_send(self) -> bytes:
         """Return the bytes to write to the server since the last call."""
-        data = bytes(self._outgoing)
-        self._outgoing.clear()
+        data, self._outgoing = self._outgoing, b""
         return data
 
     def end(self) -> None:
@@ -264,7 +245,7 @@ class ClientProtocol:
         frames: list[Frame] = []
         events: list[ProtocolEvent] = []
         for packet in self._packet_reader.feed(data, max_packets):
-            if packet.is_data_frame:
+            if packet.type == DATA:
                 self._on_data(packet, frames, events)
             else:
                 self._on_packet(packet, events)
@@ -280,11 +261,17 @@ class ClientProtocol:
             raise ClosedError(f"{unsent} not sent: the connection is {self.state.value}")
 
     def _apply(self, protocol_input: ProtocolInput) -> None:
-        self.state = next_state(self.state, protocol_input)
+        states, after = _TRANSITIONS[protocol_input]
+        if self.state in states:
+            self.state = after
 
     def _on_data(self, packet: Packet, frames: list[Frame], events: list[ProtocolEvent]) -> None:
+        reader = self._frame_reader
         try:
-            frame = self._read_frame(packet.body, events)
+            if reader is not None:
+                frame = reader.read(packet.body)
+            else:
+                frame = self._read_first_frame(packet.body, events)
         except FrameError as error:
             byte_order = self.byte_order or self._agreed_byte_order
             events.append(FrameRejected(error, announced_components(packet.body, byte_order)))
@@ -299,9 +286,7 @@ class ClientProtocol:
             self._apply(ProtocolInput.FRAME_RECEIVED)
         frames.append(frame)
 
-    def _read_frame(self, body: bytes, events: list[ProtocolEvent]) -> Frame:
-        if self._frame_reader is not None:
-            return self._frame_reader.read(body)
+    def _read_first_frame(self, body: bytes, events: list[ProtocolEvent]) -> Frame:
         byte_order = detect_byte_order(body, self._agreed_byte_order)
         reader = FrameReader(byte_order)
         frame = reader.read(body)
@@ -326,28 +311,27 @@ class ClientProtocol:
                 return False
 
     def _on_packet(self, packet: Packet, events: list[ProtocolEvent]) -> None:
+        pending = self._replies.pending
         match packet.type:
-            case PacketType.COMMAND | PacketType.ERROR:
-                self._on_text(packet, events)
-            case PacketType.XML:
-                self._on_xml(packet, events)
+            case PacketType.COMMAND | PacketType.ERROR | PacketType.XML:
+                match = self._replies.match(packet)
+                if pending is None or match is Match.NO:
+                    events.append(UnexpectedPacket(packet))
+                elif match is Match.MAYBE:
+                    events.append(PossibleReply(pending))
+                else:
+                    self._on_reply(packet, events)
             case PacketType.NO_DATA:
-                self._on_no_data(packet, events)
+                if not isinstance(pending, SendCurrentFrame) or self.state is not ProtocolState.IDLE:
+                    self._apply(ProtocolInput.NO_DATA_RECEIVED)
+                if isinstance(pending, StreamFrames | SendCurrentFrame):
+                    self._replies.finish_by_data()
+                    events.append(Answered(pending, packet))
             case _:
                 events.append(packet if isinstance(packet, FilePiece) else UnexpectedPacket(packet))
 
-    def _on_text(self, packet: Packet, events: list[ProtocolEvent]) -> None:
-        match = self._replies.match_text(packet)
-        pending = self._replies.pending
-        if pending is None or match is Match.NO:
-            events.append(UnexpectedPacket(packet))
-        elif match is Match.MAYBE:
-            events.append(PossibleReply(pending))
-        else:
-            self._on_reply(packet, events)
-
     def _on_reply(self, packet: Packet, events: list[ProtocolEvent]) -> None:
-        """Process a text that answers the pending command."""
+        """Process a text or XML that answers the pending command."""
         command = self._replies.pending
         if command is None:
             return
@@ -363,19 +347,3 @@ class ClientProtocol:
         elif isinstance(command, StopStreaming):
             self._apply(ProtocolInput.STOP_ACCEPTED)
         events.append(Answered(command, packet))
-
-    def _on_xml(self, packet: Packet, events: list[ProtocolEvent]) -> None:
-        command = self._replies.match_xml(packet)
-        if command is None:
-            events.append(UnexpectedPacket(packet))
-        else:
-            self._replies.finish_by_reply()
-            events.append(Answered(command, packet))
-
-    def _on_no_data(self, packet: Packet, events: list[ProtocolEvent]) -> None:
-        pending = self._replies.pending
-        if not isinstance(pending, SendCurrentFrame) or self.state is not ProtocolState.IDLE:
-            self._apply(ProtocolInput.NO_DATA_RECEIVED)
-        if isinstance(pending, StreamFrames | SendCurrentFrame):
-            self._replies.finish_by_data()
-            events.append(Answered(pending, packet))

@@ -21,6 +21,11 @@ _SECTION_BY_WORD: Final = {section.command_word: key for key, section in SECTION
 _KNOWN_COMMANDS: Final = (
     "known are Version, SetByteOrder, SendParameters, SendCurrentFrame, StreamFrames, Bye"
 )
+_USAGE: Final = {
+    "version": "Version takes one parameter n.n, as in: Version 1.0",
+    "setbyteorder": "SetByteOrder takes one parameter, BigEndian or LittleEndian",
+    "bye": "Bye takes no parameter",
+}
 _Named = TypeVar("_Named")
 _NUMBER: Final = re.compile(r"\d{1,9}(\.\d{1,20})?", re.ASCII)
 _OPTION: Final = re.compile(r"([a-z]+) *= *([^,]*)", re.IGNORECASE | re.ASCII)
@@ -168,50 +173,30 @@ def parse_command(body: bytes) -> Command:
     Ignores case, and NUL, LF and white space at the end (§5.2, field note 13). Raises CommandError, whose
     text says what is wrong and what is accepted; the server can send it to the client.
     """
-    words = decode_text(body).split()
-    if not words:
-        raise CommandError(f"Empty command; {_KNOWN_COMMANDS}")
-    verb, parameters = words[0].lower(), [word.lower() for word in words[1:]]
+    text = decode_text(body)
     command: Command
-    match verb:
-        case "version":
-            command = _parse_version(parameters)
-        case "setbyteorder":
-            command = _parse_byte_order(parameters)
-        case "sendparameters":
-            command = SendParameters(_parse_names(parameters, _SECTION_BY_WORD, "section"))
-        case "sendcurrentframe":
-            command = SendCurrentFrame(_parse_names(parameters, _COMPONENT_BY_WORD, "component"))
-        case "streamframes":
+    match text.lower().split():
+        case ["version", number] if re.fullmatch(r"\d{1,4}\.\d{1,4}", number, re.ASCII):
+            command = Version(number)
+        case ["setbyteorder", ("bigendian" | "littleendian") as order]:
+            command = SetByteOrder("big" if order == "bigendian" else "little")
+        case ["sendparameters", *names]:
+            command = SendParameters(_parse_names(names, _SECTION_BY_WORD, "section"))
+        case ["sendcurrentframe", *names]:
+            command = SendCurrentFrame(_parse_names(names, _COMPONENT_BY_WORD, "component"))
+        case ["streamframes", *parameters]:
             command = _parse_stream_frames(parameters)
-        case "bye":
-            command = _parse_bye(parameters)
-        case "recording":
-            command = _parse_recording(decode_text(body)[len(verb) :].strip())
+        case ["bye"]:
+            command = Bye()
+        case ["recording", *_]:
+            command = _parse_recording(text[len("recording") :].strip())
+        case [verb, *_]:
+            raise CommandError(
+                _USAGE.get(verb) or f"Unknown command {_quote(text.split()[0])}; {_KNOWN_COMMANDS}"
+            )
         case _:
-            raise CommandError(f"Unknown command {_quote(words[0])}; {_KNOWN_COMMANDS}")
+            raise CommandError(f"Empty command; {_KNOWN_COMMANDS}")
     return command
-
-
-def _parse_version(parameters: Sequence[str]) -> Version:
-    if len(parameters) != 1 or not re.fullmatch(r"\d{1,4}\.\d{1,4}", parameters[0], re.ASCII):
-        raise CommandError("Version takes one parameter n.n, as in: Version 1.0")
-    return Version(parameters[0])
-
-
-def _parse_byte_order(parameters: Sequence[str]) -> SetByteOrder:
-    match parameters:
-        case ["bigendian"]:
-            return SetByteOrder("big")
-        case ["littleendian"]:
-            return SetByteOrder("little")
-    raise CommandError("SetByteOrder takes one parameter, BigEndian or LittleEndian")
-
-
-def _parse_bye(parameters: Sequence[str]) -> Bye:
-    if parameters:
-        raise CommandError("Bye takes no parameter")
-    return Bye()
 
 
 def _parse_recording(parameter: str) -> ControlRecording:

@@ -4,15 +4,7 @@ This module needs no numpy, so that a command line can name the components witho
 """
 
 from enum import IntEnum
-from typing import Final, NamedTuple
-
-
-class _Names(NamedTuple):
-    """The names of one component."""
-
-    key: str
-    command_word: str
-    item_noun: str
+from typing import Final
 
 
 class ComponentType(IntEnum):
@@ -27,25 +19,25 @@ class ComponentType(IntEnum):
     @property
     def key(self) -> str:
         """The name in keys, in channels (upper-case) and in settings: 3d, 6d, analog, force or event."""
-        return _NAMES[self].key
+        return _NAMES[self][0]
 
     @property
     def command_word(self) -> str:
         """The name in commands (§5.3.5): 3D, 6D, Analog, Force or Events."""
-        return _NAMES[self].command_word
+        return _NAMES[self][1]
 
     @property
     def item_noun(self) -> str:
         """What the items are called: markers, tools, channels, plates or events."""
-        return _NAMES[self].item_noun
+        return _NAMES[self][2]
 
 
 _NAMES: Final = {
-    ComponentType.MARKERS: _Names("3d", "3D", "markers"),
-    ComponentType.TOOLS: _Names("6d", "6D", "tools"),
-    ComponentType.ANALOG: _Names("analog", "Analog", "channels"),
-    ComponentType.FORCE: _Names("force", "Force", "plates"),
-    ComponentType.EVENT: _Names("event", "Events", "events"),
+    ComponentType.MARKERS: ("3d", "3D", "markers"),
+    ComponentType.TOOLS: ("6d", "6D", "tools"),
+    ComponentType.ANALOG: ("analog", "Analog", "channels"),
+    ComponentType.FORCE: ("force", "Force", "plates"),
+    ComponentType.EVENT: ("event", "Events", "events"),
 }
 
 WIRE_ORDER: Final = tuple(_NAMES)

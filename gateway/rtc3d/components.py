@@ -9,27 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
-from gateway.rtc3d.parameters import Parameters, Parameters3D, only_sections
+from gateway.rtc3d.parameters import SECTIONS, Parameters, Parameters3D, only_sections
 
-__all__ = [
-    "COMPONENTS_BY_KEY",
-    "COMPONENT_HEADER",
-    "COMPONENT_HEADER_BYTES",
-    "FRAME_NUMBER_AND_TIMESTAMP",
-    "ITEM_DTYPES",
-    "LONG_EVENT",
-    "MISSING",
-    "MISSING_MARKER",
-    "MISSING_RELIABILITY",
-    "SHORT_EVENT",
-    "WIRE_ORDER",
-    "ByteOrder",
-    "Component",
-    "ComponentType",
-    "Items",
-    "big_endian_content",
-    "encode_component",
-]
+__all__ = ["COMPONENTS_BY_KEY", "WIRE_ORDER", "ComponentType"]  # those of component_types
 
 ByteOrder = Literal["big", "little"]
 Items: TypeAlias = npt.NDArray[Any]
@@ -141,48 +123,25 @@ def described_rate_hz(parameters: Parameters, component: ComponentType) -> float
     For analog and force, this is the highest rate of a channel or plate. A number that cannot be a rate, such
     as 0 for "not measured", counts as none.
     """
-    rate_hz = _described_number(parameters, component)
-    return rate_hz if rate_hz is not None and _MIN_HZ <= rate_hz <= _MAX_HZ else None
-
-
-def _described_number(parameters: Parameters, component: ComponentType) -> float | None:
-    match component:
-        case ComponentType.MARKERS:
-            return parameters.markers.frequency_hz if parameters.markers else None
-        case ComponentType.TOOLS:
-            return parameters.tools.frequency_hz if parameters.tools else None
-        case ComponentType.ANALOG:
-            channels = parameters.analog.channels if parameters.analog else ()
-            return max((channel.frequency_hz or 0 for channel in channels), default=None)
-        case ComponentType.FORCE:
-            plates = parameters.force.plates if parameters.force else ()
-            return max((plate.frequency_hz or 0 for plate in plates), default=None)
-        case _:
-            return None
+    if component is ComponentType.EVENT:
+        return None
+    if component in {ComponentType.MARKERS, ComponentType.TOOLS}:
+        rates_hz = [getattr(SECTIONS[component.key].of(parameters), "frequency_hz", None)]
+    else:
+        rates_hz = [item.frequency_hz for item in SECTIONS[component.key].items_of(parameters)]
+    rate_hz: float = max((rate_hz or 0 for rate_hz in rates_hz), default=0)
+    return rate_hz if _MIN_HZ <= rate_hz <= _MAX_HZ else None
 
 
 def num_described_items(parameters: Parameters, component: ComponentType) -> int:
     """Return the number of markers, tools, channels or plates in the parameters; 0 for events."""
-    match component:
-        case ComponentType.MARKERS:
-            return len(parameters.markers.markers) if parameters.markers else 0
-        case ComponentType.TOOLS:
-            return len(parameters.tools.tools) if parameters.tools else 0
-        case ComponentType.ANALOG:
-            return len(parameters.analog.channels) if parameters.analog else 0
-        case ComponentType.FORCE:
-            return len(parameters.force.plates) if parameters.force else 0
-        case _:
-            return 0
+    return 0 if component is ComponentType.EVENT else len(SECTIONS[component.key].items_of(parameters))
 
 
 def described_labels(parameters: Parameters, component: ComponentType) -> list[str]:
     """Return the labels of the markers or tools, in their order in a frame; [] for other components."""
-    if component is ComponentType.MARKERS and parameters.markers:
-        return [marker.label for marker in parameters.markers.markers]
-    if component is ComponentType.TOOLS and parameters.tools:
-        return [tool.label for tool in parameters.tools.tools]
-    return []
+    has_labels = component in {ComponentType.MARKERS, ComponentType.TOOLS}
+    return [item.label for item in SECTIONS[component.key].items_of(parameters)] if has_labels else []
 
 
 def only_components(parameters: Parameters, components: Collection[ComponentType]) -> Parameters:

@@ -33,7 +33,7 @@ class PacketType(IntEnum):
 
 # These save time for every packet: an attribute look-up or a comparison with an IntEnum takes 0.1 µs.
 _unpack_header: Final = PACKET_HEADER.unpack_from
-_DATA: Final = int(PacketType.DATA)
+DATA: Final = int(PacketType.DATA)
 _C3D: Final = int(PacketType.C3D)
 
 
@@ -45,11 +45,6 @@ class Packet:
     def __init__(self, packet_type: int, body: bytes) -> None:
         self.type = packet_type
         self.body = body
-
-    @property
-    def is_data_frame(self) -> bool:
-        """Whether this is a data frame (type 3)."""
-        return self.type == _DATA
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Packet) and (self.type, self.body) == (other.type, other.body)
@@ -135,6 +130,8 @@ class PacketReader:
         self._missing_file_bytes = 0  # of that file
         self._rest = b""  # the read that ``feed`` did not finish, from _rest_start on
         self._rest_start = 0
+        self.has_more = False
+        """Whether ``feed`` has not looked at all bytes yet, because it returned as many packets as wanted."""
         self.error: PacketError | None = None
         """Set when a size field is below 8 or above its limit; the stream then has no further packets."""
 
@@ -142,11 +139,6 @@ class PacketReader:
     def buffered_bytes(self) -> int:
         """The number of bytes held of an incomplete packet; of a C3D file, those of an incomplete header."""
         return len(self._partial)
-
-    @property
-    def has_more(self) -> bool:
-        """Whether ``feed`` has not looked at all bytes yet, because it returned as many packets as wanted."""
-        return bool(self._rest)
 
     def feed(self, data: bytes, max_packets: int = ALL_PACKETS) -> list[Packet]:
         """Take the next bytes; return the packets that they complete and the pieces of files, in order.
@@ -158,9 +150,10 @@ class PacketReader:
             return []
         packets: list[Packet] = []
         used = 0
-        if self._rest:
+        if self.has_more:
             # Compiled code would copy the read to add b"".
             data, used, self._rest = self._rest + data if data else self._rest, self._rest_start, b""
+            self.has_more = False
         elif self._missing_file_bytes:
             used = self._take_file_piece(data, 0, packets)
             self._offset += used
@@ -201,15 +194,23 @@ class PacketReader:
         packet_type: int
         while available - start >= PACKET_HEADER_BYTES:
             if len(packets) >= max_packets:
-                self._rest, self._rest_start = data, start
+                self._rest, self._rest_start, self.has_more = data, start, True
                 self._offset += start - first
                 return
             size, packet_type = _unpack_header(data, start)
             limit = self._max_c3d_bytes if packet_type == _C3D else self._max_packet_bytes
             if not PACKET_HEADER_BYTES <= size <= limit:
-                begin = data[start : start + _MAX_BEGIN_BYTES]
+                is_small = size < PACKET_HEADER_BYTES
+                bound = f"less than the header's {PACKET_HEADER_BYTES}" if is_small else f"limit {limit}"
                 offset = self._offset + start - first
-                self.error = _size_error(size, packet_type, offset, limit, begin)
+                self.error = PacketError(
+                    f"packet size {size} ({bound}), type {packet_type}, at byte {offset} of the stream: "
+                    "this is not an RTC3D server, or the connection is corrupt; check host and port",
+                    size=size,
+                    packet_type=packet_type,
+                    offset=offset,
+                    first_bytes=data[start : start + _MAX_BEGIN_BYTES],
+                )
                 return
             end = start + size
             if packet_type == _C3D:
@@ -226,16 +227,3 @@ class PacketReader:
         self._offset += start - first
         if start < available:
             self._partial += data[start:]
-
-
-def _size_error(size: int, packet_type: int, offset: int, limit: int, first_bytes: bytes) -> PacketError:
-    is_small = size < PACKET_HEADER_BYTES
-    bound = f"less than the header's {PACKET_HEADER_BYTES}" if is_small else f"limit {limit}"
-    return PacketError(
-        f"packet size {size} ({bound}), type {packet_type}, at byte {offset} of the stream: "
-        "this is not an RTC3D server, or the connection is corrupt; check host and port",
-        size=size,
-        packet_type=packet_type,
-        offset=offset,
-        first_bytes=first_bytes,
-    )

@@ -9,94 +9,114 @@ server's own texts: numbers may start anywhere (field note 9), and an event's id
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from math import nan
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 from gateway.logs.safe_text import quoted
+
+
+class At(NamedTuple):
+    """The place of a dataclass's field in XML: ``path`` leads there from the dataclass's element.
+
+    If a step of ``path`` ends in *, the element is repeated and the field is a tuple. @id is the attribute.
+    ``kind`` is str, int, float or a dataclass in LAYOUT. If it ``may_be_empty``, an empty text does not
+    become the default. Elements that ``come_first`` are written before the others.
+    """
+
+    path: str
+    kind: type = str
+    may_be_empty: bool = False
+    comes_first: bool = False
+
+
+Id = Annotated[str, At("@id")]
+Label = Annotated[str, At("Label")]
+Description = Annotated[str, At("Description")]
+Frequency = Annotated[float | None, At("Frequency", float)]
 
 
 @dataclass(frozen=True, slots=True)
 class General:
     """§6.1: the server and its average streaming performance during a session."""
 
-    name: str = ""
-    version: str = ""
-    address: str = ""
-    port: int | None = None
-    frames_sent: int | None = None
-    frames_per_s: float | None = None
+    name: Annotated[str, At("Server/Name")] = ""
+    version: Annotated[str, At("Server/Ver")] = ""
+    address: Annotated[str, At("Server/IPadd")] = ""
+    port: Annotated[int | None, At("Server/Port", int)] = None
+    frames_sent: Annotated[int | None, At("Server/Stats/FramesSent", int)] = None
+    frames_per_s: Annotated[float | None, At("Server/Stats/FramesPerSec", float)] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Marker:
     """One marker of §6.2."""
 
-    id: str
-    label: str = ""
-    description: str = ""
+    id: Id
+    label: Label = ""
+    description: Description = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters3D:
     """§6.2: the markers, in the order of the 3D component."""
 
-    frequency_hz: float | None = None
-    unit: str = "mm"
-    markers: tuple[Marker, ...] = ()
+    frequency_hz: Frequency = None
+    unit: Annotated[str, At("Unit")] = "mm"
+    markers: Annotated[tuple[Marker, ...], At("Markers/Marker*", Marker)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Tool:
     """One tool of §6.3; ``marker_ids`` are ids of 3D markers, in the order of the tool's definition."""
 
-    id: str
-    label: str = ""
-    description: str = ""
-    marker_ids: tuple[str, ...] = ()
+    id: Id
+    label: Label = ""
+    description: Description = ""
+    marker_ids: Annotated[tuple[str, ...], At("Markers/Marker*/@id")] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters6D:
     """§6.3: the tools, in the order of the 6D component."""
 
-    frequency_hz: float | None = None
-    tools: tuple[Tool, ...] = ()
+    frequency_hz: Frequency = None
+    tools: Annotated[tuple[Tool, ...], At("Tools/Tool*", Tool)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class AnalogChannel:
     """One channel of §6.4."""
 
-    id: str
-    label: str = ""
-    description: str = ""
-    unit: str = "mV"
-    frequency_hz: float | None = None
+    id: Id
+    label: Label = ""
+    description: Description = ""
+    unit: Annotated[str, At("Unit", may_be_empty=True)] = "mV"
+    frequency_hz: Frequency = None
 
 
 @dataclass(frozen=True, slots=True)
 class ParametersAnalog:
     """§6.4: the channels, in the order of the Analog component."""
 
-    channels: tuple[AnalogChannel, ...] = ()
+    channels: Annotated[tuple[AnalogChannel, ...], At("Channels/Channel*", AnalogChannel)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
     """A position of §6.5, in ``unit``; a coordinate that the server did not send is NaN."""
 
-    x: float = nan
-    y: float = nan
-    z: float = nan
-    unit: str = "mm"
+    x: Annotated[float, At("Point/X", float)] = nan
+    y: Annotated[float, At("Point/Y", float)] = nan
+    z: Annotated[float, At("Point/Z", float)] = nan
+    unit: Annotated[str, At("Unit", comes_first=True)] = "mm"
 
 
 @dataclass(frozen=True, slots=True)
 class ForceChannel:
     """One force or moment channel of a plate (§6.5)."""
 
-    id: str
-    label: str = ""
-    unit: str = ""
+    id: Id
+    label: Label = ""
+    unit: Annotated[str, At("Unit", comes_first=True)] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,73 +128,75 @@ class Plate:
     a cell that cannot be read is NaN.
     """
 
-    id: str
-    label: str = ""
-    frequency_hz: float | None = None
-    corners: tuple[Point, ...] = ()
-    origin: Point | None = None
-    channels: tuple[ForceChannel, ...] = ()
-    analog_channel_ids: tuple[str, ...] = ()
-    excitation_voltage_v: float | None = None
-    amplifier_gain: float | None = None
-    calibration_unit: str = ""
-    calibration_matrix: tuple[tuple[float, ...], ...] = ()
+    id: Id
+    label: Label = ""
+    frequency_hz: Annotated[float | None, At("Frequency", float, comes_first=True)] = None
+    corners: Annotated[tuple[Point, ...], At("Location/Corner*", Point)] = ()
+    origin: Annotated[Point | None, At("Origin", Point)] = None
+    channels: Annotated[tuple[ForceChannel, ...], At("Channels/Channel*", ForceChannel)] = ()
+    analog_channel_ids: Annotated[tuple[str, ...], At("AnalogChannels/Channel*/@id")] = ()
+    excitation_voltage_v: Annotated[float | None, At("ExcitationVoltage", float)] = None
+    amplifier_gain: Annotated[float | None, At("AmplifierGain", float)] = None
+    calibration_unit: Annotated[str, At("Calibration_Matrix/Unit")] = ""
+    calibration_matrix: Annotated[
+        tuple[tuple[float, ...], ...], At("Calibration_Matrix/Row*/Col*", float)
+    ] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class ParametersForce:
     """§6.5: the plates, in the order of the Force component."""
 
-    plates: tuple[Plate, ...] = ()
+    plates: Annotated[tuple[Plate, ...], At("Plates/Plate*", Plate)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedValue:
     """One of the values that an event's parameter can have (§6.6)."""
 
-    id: str
-    value: str = ""
-    label: str = ""
-    description: str = ""
+    id: Id
+    value: Annotated[str, At("Value")] = ""
+    label: Label = ""
+    description: Description = ""
 
 
 @dataclass(frozen=True, slots=True)
 class EventParameter:
     """One of up to three parameters of an event (§6.6); ``type`` is int, float or string (4 characters)."""
 
-    id: str
-    type: str = "int"
-    description: str = ""
-    expected_values: tuple[ExpectedValue, ...] = ()
+    id: Id
+    type: Annotated[str, At("Type")] = "int"
+    description: Description = ""
+    expected_values: Annotated[tuple[ExpectedValue, ...], At("ExpValues/ExpValue*", ExpectedValue)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class EventDefinition:
     """One kind of event of §6.6; ``id`` is the server's text, decimal or 0x…."""
 
-    id: str
-    label: str = ""
-    description: str = ""
-    parameters: tuple[EventParameter, ...] = ()
+    id: Id
+    label: Label = ""
+    description: Description = ""
+    parameters: Annotated[tuple[EventParameter, ...], At("Params/Param*", EventParameter)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class ParametersEvents:
     """§6.6: the events that the server is ready to send."""
 
-    events: tuple[EventDefinition, ...] = ()
+    events: Annotated[tuple[EventDefinition, ...], At("Event*", EventDefinition)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """The content of one XML reply; a section that it lacks is None. SECTIONS below lists the sections."""
 
-    general: General | None = None
-    markers: Parameters3D | None = None
-    tools: Parameters6D | None = None
-    analog: ParametersAnalog | None = None
-    force: ParametersForce | None = None
-    events: ParametersEvents | None = None
+    general: Annotated[General | None, At("General", General)] = None
+    markers: Annotated[Parameters3D | None, At("The_3D", Parameters3D)] = None
+    tools: Annotated[Parameters6D | None, At("The_6D", Parameters6D)] = None
+    analog: Annotated[ParametersAnalog | None, At("Analog", ParametersAnalog)] = None
+    force: Annotated[ParametersForce | None, At("Force", ParametersForce)] = None
+    events: Annotated[ParametersEvents | None, At("Events", ParametersEvents)] = None
 
     @property
     def length_unit(self) -> str:
@@ -185,107 +207,32 @@ class Parameters:
 ROOT: Final = "RT_Parameters"
 
 
-class Field(NamedTuple):
-    """The place of a dataclass's field in XML: ``path`` leads there from the dataclass's element.
-
-    If a step of ``path`` ends in *, the element is repeated and the field is a tuple. @id is the attribute.
-    ``kind`` is str, int, float or a dataclass in LAYOUT. If it ``may_be_empty``, an empty text does not
-    become the default.
-    """
-
-    name: str
-    path: str
-    kind: type = str
-    may_be_empty: bool = False
+def _places(dataclass: type) -> dict[str, At]:
+    places = {name: annotated.__metadata__[0] for name, annotated in dataclass.__annotations__.items()}
+    return dict(sorted(places.items(), key=lambda item: not item[1].comes_first))
 
 
-_ID_LABEL_DESCRIPTION: Final = (
-    Field("id", "@id"),
-    Field("label", "Label"),
-    Field("description", "Description"),
-)
-LAYOUT: Final[dict[type, tuple[Field, ...]]] = {
-    Parameters: (
-        Field("general", "General", General),
-        Field("markers", "The_3D", Parameters3D),
-        Field("tools", "The_6D", Parameters6D),
-        Field("analog", "Analog", ParametersAnalog),
-        Field("force", "Force", ParametersForce),
-        Field("events", "Events", ParametersEvents),
-    ),
-    General: (
-        Field("name", "Server/Name"),
-        Field("version", "Server/Ver"),
-        Field("address", "Server/IPadd"),
-        Field("port", "Server/Port", int),
-        Field("frames_sent", "Server/Stats/FramesSent", int),
-        Field("frames_per_s", "Server/Stats/FramesPerSec", float),
-    ),
-    Parameters3D: (
-        Field("frequency_hz", "Frequency", float),
-        Field("unit", "Unit"),
-        Field("markers", "Markers/Marker*", Marker),
-    ),
-    Marker: _ID_LABEL_DESCRIPTION,
-    Parameters6D: (
-        Field("frequency_hz", "Frequency", float),
-        Field("tools", "Tools/Tool*", Tool),
-    ),
-    Tool: (*_ID_LABEL_DESCRIPTION, Field("marker_ids", "Markers/Marker*/@id")),
-    ParametersAnalog: (Field("channels", "Channels/Channel*", AnalogChannel),),
-    AnalogChannel: (
-        *_ID_LABEL_DESCRIPTION,
-        Field("unit", "Unit", may_be_empty=True),
-        Field("frequency_hz", "Frequency", float),
-    ),
-    ParametersForce: (Field("plates", "Plates/Plate*", Plate),),
-    Plate: (
-        Field("id", "@id"),
-        Field("frequency_hz", "Frequency", float),
-        Field("label", "Label"),
-        Field("corners", "Location/Corner*", Point),
-        Field("origin", "Origin", Point),
-        Field("channels", "Channels/Channel*", ForceChannel),
-        Field("analog_channel_ids", "AnalogChannels/Channel*/@id"),
-        Field("excitation_voltage_v", "ExcitationVoltage", float),
-        Field("amplifier_gain", "AmplifierGain", float),
-        Field("calibration_unit", "Calibration_Matrix/Unit"),
-        Field("calibration_matrix", "Calibration_Matrix/Row*/Col*", float),
-    ),
-    Point: (
-        Field("unit", "Unit"),
-        Field("x", "Point/X", float),
-        Field("y", "Point/Y", float),
-        Field("z", "Point/Z", float),
-    ),
-    ForceChannel: (Field("id", "@id"), Field("unit", "Unit"), Field("label", "Label")),
-    ParametersEvents: (Field("events", "Event*", EventDefinition),),
-    EventDefinition: (*_ID_LABEL_DESCRIPTION, Field("parameters", "Params/Param*", EventParameter)),
-    EventParameter: (
-        Field("id", "@id"),
-        Field("type", "Type"),
-        Field("description", "Description"),
-        Field("expected_values", "ExpValues/ExpValue*", ExpectedValue),
-    ),
-    ExpectedValue: (
-        Field("id", "@id"),
-        Field("value", "Value"),
-        Field("label", "Label"),
-        Field("description", "Description"),
-    ),
+LAYOUT: Final[dict[type, dict[str, At]]] = {
+    dataclass: _places(dataclass)
+    for dataclass in (
+        *(Parameters, General, Parameters3D, Marker, Parameters6D, Tool, ParametersAnalog, AnalogChannel),
+        *(ParametersForce, Plate, Point, ForceChannel),
+        *(ParametersEvents, EventDefinition, EventParameter, ExpectedValue),
+    )
 }
+"""The place of each field of each dataclass in XML, in the order in which they are written."""
 
 
 def _child_and_parent_tags(kind: type, tag: str) -> Iterator[tuple[str, str]]:
     """Yield (tag, parent's tag) of every element below an element ``tag`` that holds a ``kind``."""
-    for field in LAYOUT[kind]:
+    for at in LAYOUT[kind].values():
         parent = tag
-        for step in field.path.replace("*", "").split("/"):
+        for step in at.path.replace("*", "").split("/"):
             if step != "@id":
                 yield step, parent
                 parent = step
-        if field.kind in LAYOUT:
-            yield from _child_and_parent_tags(field.kind, parent)
+        if at.kind in LAYOUT:
+            yield from _child_and_parent_tags(at.kind, parent)
 
 
 _TAG_PAIRS: Final = frozenset(_child_and_parent_tags(Parameters, ROOT))
@@ -304,19 +251,25 @@ class Section(NamedTuple):
     """The name in SendParameters (§5.3.3)."""
     field: str
     """The field of Parameters."""
+    items_field: str = ""
+    """The field with the items in the section; "" if it has none."""
 
     def of(self, parameters: Parameters) -> Any:
         """Return this section of ``parameters``, for example a Parameters3D; None if it is absent."""
         return getattr(parameters, self.field)
 
+    def items_of(self, parameters: Parameters) -> tuple[Any, ...]:
+        """Return the markers, tools, channels, plates or events; () if ``parameters`` lack them."""
+        return getattr(self.of(parameters), self.items_field, ())
+
 
 SECTIONS: Final = {
     "general": Section("General", "general"),
-    "3d": Section("3D", "markers"),
-    "6d": Section("6D", "tools"),
-    "analog": Section("Analog", "analog"),
-    "force": Section("Force", "force"),
-    "events": Section("Events", "events"),
+    "3d": Section("3D", "markers", "markers"),
+    "6d": Section("6D", "tools", "tools"),
+    "analog": Section("Analog", "analog", "channels"),
+    "force": Section("Force", "force", "plates"),
+    "events": Section("Events", "events", "events"),
 }
 """The sections of §6 by the names that they have in the gateway's keys, messages and commands."""
 
@@ -358,7 +311,9 @@ _MAX_NAMED: Final = 3
 
 def differ_in_statistics_only(before: bytes, after: bytes) -> bool:
     """Return whether two XML replies are the same except for the statistics of §6.1. Cheap for long XML."""
-    return _without(before, _statistics(before)) == _without(after, _statistics(after))
+    parts = ((xml, _statistics(xml)) for xml in (before, after))
+    rest_before, rest_after = (xml[: part.start] + xml[part.stop :] for xml, part in parts)
+    return rest_before == rest_after
 
 
 def statistics_xml(xml: bytes) -> bytes:
@@ -374,10 +329,6 @@ def _statistics(xml: bytes) -> slice:
     return slice(0, 0) if start < 0 or end < 0 else slice(start, end + len(b"</Stats>"))
 
 
-def _without(xml: bytes, part: slice) -> bytes:
-    return xml[: part.start] + xml[part.stop :]
-
-
 def describe_renames(before: Parameters, after: Parameters) -> str:
     """Return which markers and tools have another name than before; "" if none has.
 
@@ -385,28 +336,18 @@ def describe_renames(before: Parameters, after: Parameters) -> str:
     the same position are compared. The text is bounded, and control characters are escaped.
     """
     texts = []
-    for section in ("3d", "6d"):
-        labels = zip(_labels(before, section), _labels(after, section), strict=False)
-        renamed = [f"{quoted(old)} to {quoted(new)}" for old, new in labels if old != new]
+    for key in ("3d", "6d"):
+        items = zip(SECTIONS[key].items_of(before), SECTIONS[key].items_of(after), strict=False)
+        renamed = [
+            f"{quoted(old.label)} to {quoted(new.label)}" for old, new in items if old.label != new.label
+        ]
         if renamed:
             rest = f" and {len(renamed) - _MAX_NAMED} more" if len(renamed) > _MAX_NAMED else ""
-            texts.append(f"{section} {', '.join(renamed[:_MAX_NAMED])}{rest}")
+            texts.append(f"{key} {', '.join(renamed[:_MAX_NAMED])}{rest}")
     return "; ".join(texts)
 
 
 def changed_sections(before: Parameters, after: Parameters) -> list[str]:
     """Return the sections that differ in more than the statistics and the names of markers and tools."""
-    before, after = _without_labels(before), _without_labels(after)
+    before, after = (relabelled(without_statistics(each), lambda _: "") for each in (before, after))
     return [name for name, section in SECTIONS.items() if section.of(before) != section.of(after)]
-
-
-def _labels(parameters: Parameters, section: str) -> list[str]:
-    match SECTIONS[section].of(parameters):
-        case Parameters3D(markers=items) | Parameters6D(tools=items):
-            return [item.label for item in items]
-    return []
-
-
-def _without_labels(parameters: Parameters) -> Parameters:
-    """Return the parameters without statistics, and without the labels of markers and tools."""
-    return relabelled(without_statistics(parameters), lambda _: "")

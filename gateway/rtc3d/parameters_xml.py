@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from itertools import islice
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
@@ -23,7 +23,7 @@ MAX_RECOVERED: Final = 20
 """The highest number of entries in ``ParsedParameters.recovered``."""
 _PADDING: Final = b"\0 \t\r\n"
 """Bytes at both ends of an XML reply that are ignored (field note 9)."""
-_SECTION_TAGS: Final = {field.name: field.path for field in LAYOUT[Parameters]}
+_SECTION_TAGS: Final = {name: at.path for name, at in LAYOUT[Parameters].items()}
 _MAX_NOTE_CHARACTERS: Final = 200
 _MAX_QUOTED_BYTES: Final = 60
 
@@ -226,10 +226,10 @@ def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) 
 
 def _read(kind: type, element: etree._Element, notes: list[str]) -> Any:
     """Return the dataclass ``kind`` that ``element`` describes; absent fields have their defaults."""
-    values = {field.name: _value(element, field.path, field.kind, notes) for field in LAYOUT[kind]}
-    for field in LAYOUT[kind]:
-        if field.may_be_empty and values[field.name] is None and element.find(field.path) is not None:
-            values[field.name] = ""
+    values = {name: _value(element, at.path, at.kind, notes) for name, at in LAYOUT[kind].items()}
+    for name, at in LAYOUT[kind].items():
+        if at.may_be_empty and values[name] is None and element.find(at.path) is not None:
+            values[name] = ""
     return kind(**{name: value for name, value in values.items() if value is not None})
 
 
@@ -237,9 +237,10 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
     """Return the value at ``path`` below ``element``; None if it is absent or cannot be read."""
     head, star, rest = path.partition("*")
     if star:
-        found_items = element.iterfind(head)
-        if kind in LAYOUT:
-            found_items = _first_items(found_items, head, notes)
+        found_items = list(islice(element.iterfind(head), MAX_ITEMS + 1 if kind in LAYOUT else None))
+        if kind in LAYOUT and len(found_items) > MAX_ITEMS:
+            _note(notes, f"more than {MAX_ITEMS} elements {head}: the others are left out")
+            del found_items[MAX_ITEMS]
         items = (_value(item, rest.removeprefix("/"), kind, notes) for item in found_items)
         # Only a number can be None here; NaN takes its place in the row.
         return tuple(math.nan if item is None else item for item in items)
@@ -252,15 +253,6 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
         return _read(kind, found, notes)
     text = (found.text or "").strip()
     return (_cut(text, notes) or None) if kind is str else _number(found, text, kind, notes)
-
-
-def _first_items(items: Iterable[etree._Element], path: str, notes: list[str]) -> Iterator[etree._Element]:
-    """Yield the first MAX_ITEMS of ``items``, which are at ``path``; note if there are more."""
-    for number, item in enumerate(items):
-        if number == MAX_ITEMS:
-            _note(notes, f"more than {MAX_ITEMS} elements {path}: the others are left out")
-            return
-        yield item
 
 
 def _cut(text: str, notes: list[str]) -> str:
@@ -291,16 +283,11 @@ def encode_parameters(parameters: Parameters) -> bytes:
     Leaves out characters that XML cannot represent, and numbers that are None.
     """
     root = etree.Element(ROOT, Ver="1.00")
-    _write(parameters, root)
+    _write(parameters, root, "")
     return etree.tostring(root, pretty_print=True)
 
 
-def _write(dataclass: object, element: etree._Element) -> None:
-    for field in LAYOUT[type(dataclass)]:
-        _write_value(getattr(dataclass, field.name), element, field.path)
-
-
-def _write_value(value: Any, element: etree._Element, path: str) -> None:
+def _write(value: Any, element: etree._Element, path: str) -> None:
     if value is None:
         return
     head, star, rest = path.partition("*")
@@ -309,11 +296,13 @@ def _write_value(value: Any, element: etree._Element, path: str) -> None:
         parent = _descend(element, container)
         for number, item in enumerate(value, start=1):
             # Every repeated element of §6 is numbered; an id in the dataclass replaces the number.
-            _write_value(item, etree.SubElement(parent, tag, id=str(number)), rest.removeprefix("/"))
+            _write(item, etree.SubElement(parent, tag, id=str(number)), rest.removeprefix("/"))
     elif path == "@id":
         element.set("id", _xml_text(value))
     elif type(value) in LAYOUT:
-        _write(value, _descend(element, path))
+        parent = _descend(element, path)
+        for name, at in LAYOUT[type(value)].items():
+            _write(getattr(value, name), parent, at.path)
     else:
         _descend(element, path).text = _xml_text(str(value))
 

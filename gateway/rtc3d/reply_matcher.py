@@ -15,6 +15,7 @@ and the matcher remembers earlier commands whose replies may still arrive. The r
 
 import re
 from collections import deque
+from collections.abc import Sequence
 from enum import Enum
 from typing import Final
 
@@ -75,8 +76,8 @@ class ReplyMatcher:
             self._outstanding.append(self.pending)
             self.pending = self.possible = None
 
-    def match_text(self, packet: Packet) -> Match:
-        """Return whether a type 0 or 1 packet answers the pending command."""
+    def match(self, packet: Packet) -> Match:
+        """Return whether a packet of type 0, 1 or 2 answers the pending command."""
         candidates = self._candidates(packet)
         if not candidates:
             return Match.NO
@@ -88,15 +89,6 @@ class ReplyMatcher:
             return Match.NO
         self.possible = packet
         return Match.MAYBE
-
-    def match_xml(self, packet: Packet) -> Command | None:
-        """Return the pending command if a type 2 packet answers it, otherwise None."""
-        command = self._command_of_xml(packet)
-        if command is self.pending:
-            return command
-        if command is not None:  # a late reply
-            self._outstanding.remove(command)
-        return None
 
     def finish_by_reply(self) -> None:
         """End the pending command, which a text or XML has answered."""
@@ -118,8 +110,10 @@ class ReplyMatcher:
             self._answered.append(self.pending)
             self.pending = self.possible = None
 
-    def _candidates(self, packet: Packet) -> list[Command]:
-        """Return the unanswered commands that a text may answer, oldest first."""
+    def _candidates(self, packet: Packet) -> Sequence[Command]:
+        """Return the unanswered commands that a packet may answer, oldest first."""
+        if packet.type == PacketType.XML:
+            return self._candidates_for_xml(packet.body)
         text = decode_text(packet.body[:_MAX_TEXT_BYTES]).lower()
         unanswered = [*self._outstanding, *([] if self.pending is None else [self.pending])]
         echoed = [command for command in (*unanswered, *self._answered) if str(command).lower() in text]
@@ -137,8 +131,8 @@ class ReplyMatcher:
             return unanswered
         return [command for command in unanswered if _verb(command) == acknowledged[1]]
 
-    def _command_of_xml(self, packet: Packet) -> Command | None:
-        """Return the SendParameters that the XML answers: the pending or an outstanding one."""
+    def _candidates_for_xml(self, xml: bytes) -> Sequence[Command]:
+        """Return the SendParameters that the XML answers, the pending or an outstanding one; [] for none."""
         pending = [self.pending] if isinstance(self.pending, SendParameters) else []
         outstanding = [
             command
@@ -146,20 +140,16 @@ class ReplyMatcher:
             if isinstance(command, SendParameters) and command not in pending
         ]
         if not outstanding:
-            # Accept any sections: some servers always send all of them, some leave sections out.
-            return pending[0] if pending else None
-        sections = named_sections(packet.body)
-        return max((*outstanding, *pending), key=lambda command: _similarity(sections, command))
+            return pending  # with any sections: some servers always send all of them, some leave sections out
+        sections = named_sections(xml)
+
+        def similarity(command: SendParameters) -> int:
+            # 2 if the sections are those requested, 1 if some are missing (field note 9), else 0.
+            requested = frozenset(command.sections or SECTIONS)
+            return 2 if sections == requested else int(sections < requested)
+
+        return [max((*outstanding, *pending), key=similarity)]
 
 
 def _verb(command: Command) -> str:
     return str(command).split()[0].lower()
-
-
-def _similarity(received: frozenset[str], command: SendParameters) -> int:
-    """Return how well the received sections fit those requested: 2 if equal, 1 if some are missing, else 0.
-
-    Servers leave out sections that they do not have (field note 9).
-    """
-    requested = frozenset(command.sections or SECTIONS)
-    return 2 if received == requested else int(received < requested)

@@ -290,7 +290,7 @@ class Source:
             if version != self.history.parameters_version:
                 self.history.parameters_version = version
                 for stream in self._streams.known:
-                    stream.status.parameters_changed(version)
+                    stream.status.parameters_version = version
                     if answer is not None:
                         stream.status.replace_limitation(UNANSWERED, "")
                 self._streams.parameters_changed(self._parsed)

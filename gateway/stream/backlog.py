@@ -13,7 +13,7 @@ from typing import Final
 
 from gateway.rtc3d.frames import Frame
 from gateway.stream.clock import ServerClock
-from gateway.stream.process_clock import RunningClock, running_clock
+from gateway.stream.process_clock import running_clock
 
 _MAX_WAIT_S: Final = 0.005
 """The longest time between two frames, so that gaps and low rates do not delay a backlog."""
@@ -78,7 +78,6 @@ class Backlog:
         self._on_waiting = on_waiting
         self._on_defect = on_defect
         self._timer: asyncio.Handle | None = None  # set while frames wait
-        self._running: RunningClock | None = None  # looking it up costs a system call
         self._frames: list[Frame] = []  # waiting, without those before _next
         self._next = 0
         self._utime = 0  # when they arrived
@@ -133,16 +132,14 @@ class Backlog:
         return num_frames * self._frame_s <= _TURN_S
 
     def _publish_together(self, frames: list[Frame], utime: int, steady_us: int) -> None:
-        began_s = self._now_s()
+        began_us = self._read_clocks()[1]
         self._publish(frames, utime, steady_us)
-        self._frame_s = (self._now_s() - began_s) / len(frames)
+        self._frame_s = (self._read_clocks()[1] - began_us) * 1e-6 / len(frames)
 
     def _publish_part(self) -> None:
         """Publish the part of the backlog that is due, and let the session read when nothing is left."""
         self._timer = None
-        running = self._running
-        if running is None:
-            running = self._running = running_clock()
+        running = running_clock()
         try:
             wait_s = self._publish_due()
             # What follows has not been read yet, so silence and unanswered commands mean nothing.
@@ -157,19 +154,21 @@ class Backlog:
 
     def _publish_due(self) -> float | None:
         """Publish what is due. Return in how many s to call again, or None if nothing waits any more."""
-        now_s = self._now_s()
+        now_s = self._read_clocks()[1] * 1e-6
         end_s = now_s + _TURN_S
         self._due_s = max(self._due_s, now_s - _MAX_LATE_S)
         while self._frames and now_s < end_s:
             end = self._end_of_due(now_s)
             if end == self._next:
                 return self._due_s - now_s
-            self._publish_until(end)
-            now_s = self._now_s()
+            frames = self._frames[self._next : end]
+            self._next = end
+            if end == len(self._frames):
+                self._frames = []
+                self._next = 0
+            self._publish_together(frames, self._utime, self._arrival_us)
+            now_s = self._read_clocks()[1] * 1e-6
         return 0.0 if self._frames else None
-
-    def _now_s(self) -> float:
-        return self._read_clocks()[1] * 1e-6
 
     def _end_of_due(self, now_s: float) -> int:
         """Return the index after the last of the next frames that is due; plan when the one after it is."""
@@ -201,15 +200,6 @@ class Backlog:
         if before_us is None or timestamp_us <= before_us:
             return 0.0
         return min((timestamp_us - before_us) / (1e6 * speed), _MAX_WAIT_S)
-
-    def _publish_until(self, end: int) -> None:
-        frames = self._frames[self._next : end]
-        if end == len(self._frames):
-            self._frames = []
-            self._next = 0
-        else:
-            self._next = end
-        self._publish_together(frames, self._utime, self._arrival_us)
 
 
 LONG_READ_BYTES: Final = 64 * 1024
@@ -266,13 +256,11 @@ class Reading:
 
     def _continue(self) -> None:
         self._is_called_soon = False
-        if self._has_backlog:
-            return  # set_backlog calls again
-        self._waits_for_turn = False
-        utime, steady_us = self._arrival
-        if self._process(b"", utime, steady_us):
-            self.wait_for_turn(utime, steady_us)
-        self._pause_or_resume()
+        if not self._has_backlog:  # otherwise set_backlog calls again
+            self._waits_for_turn = False
+            if self._process(b"", *self._arrival):
+                self.wait_for_turn(*self._arrival)
+            self._pause_or_resume()
 
     def _pause_or_resume(self) -> None:
         transport = self._transport

@@ -152,7 +152,11 @@ class ServerClock:
         restarted = False
         is_irregular = timestamp_us <= self._timestamp_us or frame_number < self._frame_number
         if is_irregular and self._is_without_time(timestamp_us, frame_number):
-            return self._observe_without_time(frame_number, arrival_us)
+            self._is_interrupted = self._is_interrupted or self.has_clock
+            self.has_clock = False
+            self._frame_number = frame_number
+            self._capture_us = arrival_us
+            return arrival_us, 0.0, False
         if self._is_interrupted:
             self._is_interrupted = False
             self.has_clock = True
@@ -195,15 +199,6 @@ class ServerClock:
         is_first = self._timestamp_us == _NO_TIMESTAMP_US
         return timestamp_us in _NO_TIMES_US and not is_first and frame_number >= self._frame_number
 
-    def _observe_without_time(self, frame_number: int, arrival_us: int) -> tuple[int, float, bool]:
-        """Return the reading for a frame without a time; ``has_clock`` is False until one has a time."""
-        if self.has_clock:
-            self._is_interrupted = True
-            self.has_clock = False
-        self._frame_number = frame_number
-        self._capture_us = arrival_us
-        return arrival_us, 0.0, False
-
     def _handle_irregular(self, timestamp_us: int, frame_number: int, arrival_us: int) -> bool:
         """Handle the first frame, or one that does not follow the last; return whether it is a restart."""
         if self._timestamp_us == _NO_TIMESTAMP_US:
@@ -211,7 +206,11 @@ class ServerClock:
             return False
         if frame_number >= self._frame_number:
             if timestamp_us == self._timestamp_us:
-                self._handle_repeated(timestamp_us, arrival_us)
+                # Duplicate frames and coarse time stamps still come from a clock; frozen ones do not.
+                if timestamp_us != self._repeated_us:
+                    self._repeated_us, self._repeated_since_us = timestamp_us, self._arrival_us
+                if arrival_us - self._repeated_since_us > _FROZEN_US:
+                    self._start(timestamp_us, arrival_us, has_clock=False)
                 return False
             advance_us = timestamp_us + _WRAP_US - self._timestamp_us
             elapsed_us = arrival_us - self._arrival_us
@@ -233,43 +232,30 @@ class ServerClock:
         self._samples.clear()
         self._late_samples.clear()
         self._scatter_us = math.inf
-        self._begin_window(arrival_us)
-
-    def _begin_window(self, arrival_us: int) -> None:
         self._window_end_us = arrival_us + _WINDOW_US
         self._least_lag_us = math.inf
-
-    def _handle_repeated(self, timestamp_us: int, arrival_us: int) -> None:
-        # Duplicate frames and coarse time stamps still come from a clock; a frozen time stamp does not.
-        if timestamp_us != self._repeated_us:
-            self._repeated_us, self._repeated_since_us = timestamp_us, self._arrival_us
-        if arrival_us - self._repeated_since_us > _FROZEN_US:
-            self._start(timestamp_us, arrival_us, has_clock=False)
 
     def _close_window(self, arrival_us: int) -> None:
         """End the current window: add its sample to the others or to the late ones, and fit the line."""
         lag_us = self._least_lag_us
         least = Sample(self._least_timestamp_us, self._least_offset_us)
-        self._begin_window(arrival_us)
+        self._window_end_us = arrival_us + _WINDOW_US
+        self._least_lag_us = math.inf
         late_us = _STEP_US + 4 * self._scatter_us
         if lag_us < late_us:
             self._samples.append(least)
         else:
-            self._late_samples.append(least)
-            if not self._stays_late(min(lag_us / 4, late_us)):
+            late = self._late_samples
+            late.append(least)
+            # Whether a clock was set: point 4 of the module's docstring.
+            newest = islice(reversed(late), _STEP_WINDOWS)
+            spread_us = max(sample.offset_us for sample in newest) - min(sample.offset_us for sample in late)
+            is_stable = len(late) >= _STEP_WINDOWS and spread_us < min(lag_us / 4, late_us)
+            if not is_stable and len(late) < _KEPT_WINDOWS:
                 return
-            self._samples = self._late_samples.copy()
+            self._samples = late.copy()
         self._late_samples.clear()
         self._fit_line()
-
-    def _stays_late(self, tolerance_us: float) -> bool:
-        """Return whether the late samples show that a clock was set: point 4 of the module's docstring."""
-        late = self._late_samples
-        if len(late) < _STEP_WINDOWS:
-            return False
-        newest = islice(reversed(late), _STEP_WINDOWS)
-        spread_us = max(sample.offset_us for sample in newest) - min(sample.offset_us for sample in late)
-        return spread_us < tolerance_us or len(late) == _KEPT_WINDOWS
 
     def _fit_line(self) -> None:
         """Fit the line to the samples, and check whether its slope can be that of a clock."""
@@ -303,16 +289,14 @@ def envelope_slope(samples: Sequence[Sample]) -> float:
     """
     hull: list[Sample] = []
     for sample in samples:
-        while len(hull) > 1 and not _turns_up(hull[-2], hull[-1], sample):
+        while len(hull) > 1:
+            (first_us, first_offset_us), (second_us, second_offset_us) = hull[-2:]
+            rise_us, rise_on_us = second_offset_us - first_offset_us, sample.offset_us - first_offset_us
+            if rise_us * (sample.timestamp_us - first_us) < rise_on_us * (second_us - first_us):
+                break  # the path over the three turns up
             hull.pop()
         hull.append(sample)
     # Without a division, because a float may be larger than all time stamps that it is the mean of.
     total_us = sum(sample.timestamp_us for sample in samples)
     left, right = next(edge for edge in pairwise(hull) if edge[1].timestamp_us * len(samples) >= total_us)
     return (right.offset_us - left.offset_us) / (right.timestamp_us - left.timestamp_us)
-
-
-def _turns_up(first: Sample, second: Sample, third: Sample) -> bool:
-    """Return whether the path from ``first`` over ``second`` to ``third`` bends upwards."""
-    run_us, run_on_us = second.timestamp_us - first.timestamp_us, third.timestamp_us - first.timestamp_us
-    return (second.offset_us - first.offset_us) * run_on_us < (third.offset_us - first.offset_us) * run_us

@@ -71,7 +71,11 @@ class FrameNumbers:
         self._run += 1
         if self._run == _PROOF_FRAMES and not self._period_us and step > 0:
             self._period_us = (timestamp_us - self._run_start_us) / _PROOF_FRAMES
-        return self._confirmed() if self._missing else 0
+        if not self._missing or self._run < _CONFIRMATION_FRAMES:
+            return 0
+        missing = self._missing
+        self._missing = self._unconfirmed = self._gaps_in_a_row = 0
+        return missing
 
     def _learn(self, step: int, timestamp_us: int) -> None:
         """Begin to learn the steps, because they are not regular, or no longer."""
@@ -93,13 +97,6 @@ class FrameNumbers:
                 if self._gaps_in_a_row <= _MAX_GAPS_IN_A_ROW and self._unconfirmed <= _MAX_UNCONFIRMED_FRAMES:
                     return
         self._learn(step, timestamp_us)
-
-    def _confirmed(self) -> int:
-        if self._run < _CONFIRMATION_FRAMES:
-            return 0
-        missing = self._missing
-        self._missing = self._unconfirmed = self._gaps_in_a_row = 0
-        return missing
 
 
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
@@ -151,7 +148,8 @@ class Ingest:
         self._timestamp_us = 0
         self._num_followed = 0  # how many frames began with a component of _followed_type
         # With Frequency:n the server chooses the frames, so that gaps in the numbers are normal.
-        self._numbers = None if isinstance(stream.rate, Frequency) else FrameNumbers()
+        self._counts_gaps = not isinstance(stream.rate, Frequency)
+        self._numbers = FrameNumbers()
         self._num_state_changes = status.num_state_changes
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
         self._began_us: int | None = None  # when the first frame of this session arrived, on the steady clock
@@ -189,8 +187,9 @@ class Ingest:
         time stamps are not those of a clock, frames are late if more than MAX_TOGETHER arrive together.
         """
         status = self._status
-        status.frames_received(len(frames), utime)
-        if status.num_state_changes != self._num_state_changes and self._numbers is not None:
+        status.frames_in += len(frames)
+        status.last_frame_utime = utime
+        if status.num_state_changes != self._num_state_changes:
             self._num_state_changes = status.num_state_changes
             self._numbers.interrupt()
         newest: list[frozenset[ComponentType]] | None = None
@@ -210,7 +209,9 @@ class Ingest:
                 self._publish_newest(frame, stamp, newest[index])
             else:
                 self._publish(frame, stamp, self._wanted)
-        status.components_received("" if has_wanted else self._unwanted)
+        unwanted = "" if has_wanted else self._unwanted
+        if unwanted != status.unwanted_components:
+            status.components_received(unwanted)
 
     def _is_late(self, num_together: int, steady_us: int) -> bool:
         """Return whether the frame that was stamped last is late; ``num_together`` arrived with it."""
@@ -236,37 +237,46 @@ class Ingest:
         if newest:
             published, skipped = published | newest, skipped - newest
         self._publish(frame, stamp, published)
-        num_lost = self._skip(frame, stamp, skipped)
-        if num_lost:
+        if num_lost := self._skip(frame, stamp, skipped):
             self._status.frame_skipped(num_lost)
 
     def _set_layout(self, layout: FrameLayout) -> None:
         types = [component.type for component in layout.components]
         self._layout = layout
         self._num_skippable = len(self._skippable.intersection(types))
+        self._unwanted = ""
         if self._wanted.isdisjoint(types):
             self._unwanted = " ".join(each.key for each in types) or "nothing"
-        else:
-            self._unwanted = ""
         if layout.num_extra_bytes:
             self._status.add_limitation("bytes after the last component of a frame are ignored")
 
     def _stamp(self, frame: Frame, utime: int, steady_us: int) -> Stamp:
+        """Return the times of a frame, with the session; count and report what its numbers and times show."""
+        status, clock, numbers = self._status, self._clock, self._numbers
         frame_number, timestamp_us = frame.number_and_timestamp
-        self._follow(frame.layout.first_component_type, frame_number, timestamp_us)
-        clock = self._clock
+        first_type, followed = frame.layout.first_component_type, self._followed_type
+        # Servers may number each type separately, so only one is followed: the first type that arrives, or
+        # the first after it if that was the event type.
+        if first_type is followed or followed is None or followed is _EVENT:
+            self._followed_type = followed = first_type
+            self._frame_number = frame_number
+            self._timestamp_us = timestamp_us
+            self._num_followed += 1
         capture_us, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, steady_us)
-        if self._numbers is not None and self._num_skippable:
-            self._count_unsent(self._numbers, frame, frame_number, timestamp_us)
+        if self._counts_gaps and self._num_skippable:
+            if first_type is not followed or first_type is _EVENT:
+                numbers.interrupt()  # this frame has no number of the followed type
+            elif num_missing := numbers.observe(frame_number, timestamp_us):
+                held_up_s = running_clock().longest_delay_s()
+                status.frames_unsent(num_missing, num_missing * self._num_skippable, held_up_s)
         if restarted:
-            if self._numbers is not None:
-                self._numbers.interrupt()
-            self._status.server_restarted()
+            numbers.interrupt()
+            status.restarts += 1
             self._lag.restart()
             if self._began_us is not None:  # otherwise the handshake has just been done
                 self._on_restart()
         elif clock.has_clock:
-            self._status.lag_measured(lag_s)
+            status.lag_s = lag_s
             if self._lag.observe(steady_us * 1e-6, lag_s):
                 self._on_lateness(self._lag.halvings)
         if self._began_us is None:
@@ -274,35 +284,7 @@ class Ingest:
         return Stamp(
             utime,
             capture_us + (utime - steady_us),
-            self._status.session,
-            self._status.parameters_version,
+            status.session,
+            status.parameters_version,
             clock.has_clock,
         )
-
-    def _count_unsent(
-        self, numbers: FrameNumbers, frame: Frame, frame_number: int, timestamp_us: int
-    ) -> None:
-        """Count the frames that the server's numbers prove to be missing."""
-        first_type = frame.layout.first_component_type
-        if first_type is not self._followed_type or first_type is _EVENT:
-            numbers.interrupt()  # this frame has no number of the followed type
-            return
-        num_missing = numbers.observe(frame_number, timestamp_us)
-        if num_missing:
-            held_up_s = running_clock().longest_delay_s()
-            self._status.frames_unsent(num_missing, num_missing * self._num_skippable, held_up_s)
-
-    def _follow(
-        self, first_component_type: ComponentType | None, frame_number: int, timestamp_us: int
-    ) -> None:
-        """Keep the frame's number and time stamp if the followed type comes first in it.
-
-        Servers may number each type separately, so only one is followed: the first type that arrives, or
-        the first after it if that was the event type.
-        """
-        followed = self._followed_type
-        if first_component_type is followed or followed is None or followed is _EVENT:
-            self._followed_type = first_component_type
-            self._frame_number = frame_number
-            self._timestamp_us = timestamp_us
-            self._num_followed += 1

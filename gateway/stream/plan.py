@@ -1,6 +1,7 @@
 """What to request from a server: which components share a connection (§5.3.5), and at which rate."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate, StreamFrames
@@ -57,28 +58,23 @@ def plan_streams(parameters: Parameters | None) -> StreamPlan:
         return StreamPlan(limitation=_no_rates("its components"))
     rates_hz = announced_rates_hz(parameters)
     described = [component for component in WIRE_ORDER if num_described_items(parameters, component)]
-    groups = _groups(rates_hz)
-    if not groups:
+    if not rates_hz:
         return StreamPlan(limitation="" if len(described) == 1 else _no_rates("its components"))
-    fast = {component for group in groups[1:] for component in group}
-    first = tuple(component for component in WIRE_ORDER if component not in fast)
+    groups: list[set[ComponentType]] = []  # each of one rate, the slowest first
+    slowest_hz = 0.0  # of the newest group
+    for component, rate_hz in sorted(rates_hz.items(), key=itemgetter(1)):
+        if not groups or rate_hz > slowest_hz * _SAME_RATE:
+            groups.append(set())
+            slowest_hz = rate_hz
+        groups[-1].add(component)
+    ordered = [tuple(each for each in WIRE_ORDER if each in group) for group in groups]
+    first = tuple(each for each in WIRE_ORDER if not any(each in group for group in groups[1:]))
     unrated = [component for component in described if component not in rates_hz]
     return StreamPlan(
-        (first, *groups[1:]),
-        tuple(rates_hz[group[0]] for group in groups),
+        (first, *ordered[1:]),
+        tuple(rates_hz[group[0]] for group in ordered),
         _no_rates(keys_text(unrated)) if unrated else "",
     )
-
-
-def _groups(rates_hz: Mapping[ComponentType, float]) -> list[Components]:
-    """Return the components with rates in groups of one rate, the slowest group first."""
-    groups: list[list[ComponentType]] = []
-    for component in sorted(rates_hz, key=lambda component: rates_hz[component]):
-        if groups and rates_hz[component] <= rates_hz[groups[-1][0]] * _SAME_RATE:
-            groups[-1].append(component)
-        else:
-            groups.append([component])
-    return [tuple(component for component in WIRE_ORDER if component in group) for group in groups]
 
 
 def _no_rates(components: str) -> str:
@@ -172,28 +168,21 @@ class LagControl:
             self._since_s = now_s
             return False
         held_s = now_s - self._since_s
-        if is_late:
-            return held_s >= LATE_S and self._step_down(now_s)
-        return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
+        if is_late and held_s >= LATE_S and self.halvings < self._max_halvings:
+            self.halvings += 1
+            if self._stepped_up_s is not None:
+                failed = now_s - self._stepped_up_s < self.wait_s
+                self.wait_s = min(2 * self.wait_s, MAX_WAIT_S) if failed else FIRST_WAIT_S
+                self._stepped_up_s = None
+        elif not is_late and held_s >= self.wait_s and self.halvings > 0:
+            self.halvings -= 1
+            self._stepped_up_s = now_s
+        else:
+            return False
+        self._since_s = now_s
+        return True
 
     def restart(self) -> None:
         """Forget how late the previous frames were, because the next ones do not continue them."""
         self.is_late = False
         self._since_s = None
-
-    def _step_down(self, now_s: float) -> bool:
-        if self.halvings >= self._max_halvings:
-            return False
-        if self._stepped_up_s is not None:
-            failed = now_s - self._stepped_up_s < self.wait_s
-            self.wait_s = min(2 * self.wait_s, MAX_WAIT_S) if failed else FIRST_WAIT_S
-            self._stepped_up_s = None
-        self.halvings += 1
-        self._since_s = now_s
-        return True
-
-    def _step_up(self, now_s: float) -> bool:
-        self.halvings -= 1
-        self._stepped_up_s = now_s
-        self._since_s = now_s
-        return True

@@ -44,11 +44,12 @@ class RunningClock:
 
     def tick(self) -> float:
         """Return what ``time`` returns; if the timer is due soon, tick now and save its wake-up."""
-        time_s = self.time()
-        if self._loop_time() - self._tick_s >= _TICK_S / 2:
-            self._timer.cancel()
-            self._tick()
-        return time_s
+        since_tick_s = self._loop_time() - self._tick_s
+        if since_tick_s < _TICK_S / 2:
+            return self._time_s + since_tick_s
+        self._timer.cancel()
+        self._tick()
+        return self._time_s
 
     def longest_delay_s(self, window_s: float = _DELAY_WINDOW_S) -> float:
         """Return the longest time in the last ``window_s`` for which the loop did not run, or 0.
@@ -117,7 +118,4 @@ class RunningTimeout:
 
     def _read_first(self) -> None:
         # The next turn of the loop begins with the sockets.
-        self._handle = self._clock.loop.call_soon(self._expire)
-
-    def _expire(self) -> None:
-        self._limit.reschedule(self._clock.loop.time())
+        self._handle = self._clock.loop.call_soon(lambda: self._limit.reschedule(self._clock.loop.time()))

@@ -102,48 +102,35 @@ class RateWatch:
         ``reports_sharing``, a component that is slower than announced because of another one in the same
         stream is a difference, too.
         """
-        self._forget_former_session()
-        conditions = self._conditions(stream, announced_hz, arrivals) if is_full_rate else None
-        start = self._start
-        if conditions is None or start is None or start.conditions != conditions:
-            self._start = None if conditions is None else _Start(now_s, arrivals, conditions)
+        status, start = self._status, self._start
+        if self._session != status.session:
+            status.replace_limitation(self._reported.text, "")
+            self._session, self._reported = status.session, _NO_DIFFERENCE
+        has_clock, followed = status.clock.has_clock, arrivals.followed
+        is_streaming = status.state is StreamState.STREAMING and followed not in {None, ComponentType.EVENT}
+        # These must not change during a measurement.
+        conditions = (
+            *(status.session, has_clock, status.restarts),
+            *(stream.components, dict(announced_hz), followed),
+        )
+        self._start = _Start(now_s, arrivals, conditions) if is_streaming and is_full_rate else None
+        if self._start is None or start is None or start.conditions != conditions:
             self._in_a_row = 0
             return
         num_frames = arrivals.num_frames - start.arrivals.num_frames
         num_followed = arrivals.num_followed - start.arrivals.num_followed
         if now_s - start.time_s < _WINDOW_S or min(num_frames, num_followed) < _MIN_FRAMES:
+            self._start = start
             return
-        self._start = _Start(now_s, arrivals, conditions)
         span_s = now_s - start.time_s
-        if self._status.clock.has_clock:
+        if has_clock:
             span_s = (arrivals.timestamp_us - start.arrivals.timestamp_us) / 1e6
             if span_s <= 0:
                 return  # the server's clock was set back
         difference = _compare(stream, announced_hz, arrivals, num_frames / span_s, num_followed / span_s)
-        if difference is None or (difference.kind is _Kind.SHARED and not reports_sharing):
+        if difference.kind is _Kind.SHARED and not reports_sharing:
             difference = _NO_DIFFERENCE
         self._note(difference)
-
-    def _forget_former_session(self) -> None:
-        if self._session != self._status.session:
-            self._status.replace_limitation(self._reported.text, "")
-            self._session, self._reported = self._status.session, _NO_DIFFERENCE
-
-    def _conditions(
-        self, stream: StreamSettings, announced_hz: AnnouncedRates, arrivals: Arrivals
-    ) -> tuple[object, ...] | None:
-        """Return what must not change during a measurement; None if there is nothing to measure."""
-        status = self._status
-        if status.state is not StreamState.STREAMING or arrivals.followed in {None, ComponentType.EVENT}:
-            return None
-        return (
-            status.session,
-            status.clock.has_clock,
-            status.restarts,
-            stream.components,
-            dict(announced_hz),
-            arrivals.followed,
-        )
 
     def _note(self, difference: RateDifference) -> None:
         self._in_a_row = self._in_a_row + 1 if difference.kind is self._newest_kind else 1
@@ -166,8 +153,8 @@ def _compare(
     arrivals: Arrivals,
     frames_hz: float,
     followed_hz: float,
-) -> RateDifference | None:
-    """Return how the rate differs; None if it is right.
+) -> RateDifference:
+    """Return how the rate differs, or that it does not.
 
     Frames are too slow only if all of them together are: a server may leave an empty component out. They are
     too fast only if those with the followed component are: a server may send each component in frames of
@@ -203,7 +190,7 @@ def _compare(
             f"{keys_text(shared)} {verb} at {_hz(frames_hz)} Hz instead of {_hz(fastest_hz)} Hz: a stream is "
             "as fast as its slowest component; use streams: auto, or list a stream for each rate",
         )
-    return None
+    return _NO_DIFFERENCE
 
 
 def _limited(stream: StreamSettings, rate_hz: float | None) -> float | None:

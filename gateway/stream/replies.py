@@ -34,7 +34,8 @@ class Replies:
         self._running = running_clock()
         self._reply: asyncio.Future[Packet] | None = None  # to the command that was sent
         self._assume_timer: asyncio.TimerHandle | None = None  # runs after a possible reply
-        self._answered: dict[type[Command], Command] = {}  # the newest that was answered, by type
+        self.answered: dict[type[Command], Command] = {}
+        """The newest command of each type that the server has answered or refused."""
 
     async def ask(self, command: Command, send: Callable[[], None]) -> Packet:
         """Call ``send`` to send ``command``, and return the packet that answers it.
@@ -51,11 +52,11 @@ class Replies:
                 f"{self._server} did not answer {command} within {self._timeout_s:g} s"
             ) from None
         except ServerError:
-            self._answered[type(command)] = command
+            self.answered[type(command)] = command
             raise
         finally:
             self._reply = None
-        self._answered[type(command)] = command
+        self.answered[type(command)] = command
         return packet
 
     def end(self, result: Packet | GatewayError) -> None:
@@ -73,15 +74,6 @@ class Replies:
             self._assume_timer.cancel()
         wait_s = min(_FURTHER_REPLY_S, self._timeout_s / 4)
         self._assume_timer = self._running.loop.call_later(wait_s, self._assume)
-
-    def answered(self, *kinds: type[Command]) -> Command | None:
-        """Return a command of the first of ``kinds`` that the server has answered or refused."""
-        return next((self._answered[kind] for kind in kinds if kind in self._answered), None)
-
-    @property
-    def has_answered(self) -> bool:
-        """Whether the server has answered, or refused, any command."""
-        return bool(self._answered)
 
     async def _wait(self, reply: "asyncio.Future[Packet]") -> Packet:
         """Wait for ``reply``; raise TimeoutError if the server does not answer within reply_timeout_s.

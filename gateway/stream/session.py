@@ -25,11 +25,11 @@ from gateway.rtc3d.client_protocol import (
 )
 from gateway.rtc3d.commands import Bye, Command, StopStreaming
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import FilePiece, Packet, decode_text
 from gateway.stream.backlog import LONG_READ_BYTES, Backlog, OnFrames, ReadClocks, Reading
 from gateway.stream.process_clock import RunningTimeout, running_clock
 from gateway.stream.replies import Replies
+from gateway.stream.state import Phase
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection, set_socket_options
 
@@ -51,16 +51,6 @@ class FileReceiver(Protocol):
         """Give up a file that is not complete, because the connection has ended."""
 
 
-class IgnoredFiles:
-    """A FileReceiver that keeps nothing."""
-
-    def receive(self, piece: FilePiece) -> None:
-        """Ignore a piece."""
-
-    def interrupt(self, reason: str) -> None:
-        """Do nothing."""
-
-
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
 
@@ -76,9 +66,9 @@ logger = logging.getLogger(__name__)
 class Session:
     """One connection of one stream: ``connect``, then ``ask`` and ``monitor``, then ``close``.
 
-    The event loop calls ``on_frames`` and ``files``, which must not block. ``connect`` opens the
-    connection, ``read_clocks`` dates what arrives. Time-outs count only the time during which this process
-    runs, so a stop of the process is not the server's silence.
+    The event loop calls ``on_frames`` and ``files``, which must not block; without ``files``, those of the
+    server are ignored. ``connect`` opens the connection, ``read_clocks`` dates what arrives. Time-outs count
+    only the time during which this process runs, so a stop of the process is not the server's silence.
 
     The first error ends the session, and so does ``close``. Every call that is waiting then, and every later
     call, raises that first error; later errors change nothing.
@@ -90,7 +80,7 @@ class Session:
         stream: StreamSettings,
         status: StreamStatus,
         on_frames: OnFrames,
-        files: FileReceiver,
+        files: FileReceiver | None = None,
         connect: Connect = open_connection,
         read_clocks: ReadClocks = host_clock.read,
     ) -> None:
@@ -101,12 +91,7 @@ class Session:
         speed = stream.backlog_speed if stream.backlog == "all" else None
         self._reading = Reading(self._process)
         self._frames = Backlog(
-            on_frames,
-            status.clock,
-            speed,
-            read_clocks,
-            on_waiting=self._reading.set_backlog,
-            on_defect=self._fail_by_defect,
+            on_frames, status.clock, speed, read_clocks, self._reading.set_backlog, self._fail_by_defect
         )
         self._files = files
         self._connect = connect
@@ -120,7 +105,7 @@ class Session:
         self._ended = asyncio.Event()  # _error is set
         self._lost = asyncio.Event()  # the transport is closed
         self._ask_lock = asyncio.Lock()  # held while a command is pending
-        self.replies: Replies = Replies(source, self._blocked_until_s, self._assume_reply)
+        self.replies = Replies(source, self._blocked_until_s, self._assume_reply)
         self._state_changed = asyncio.Event()  # set when the protocol's state changes
         self._quiet_since_s = 0.0  # when the stall time-out last started, on the running clock
         self._last_piece_s = 0.0  # when the newest piece of a file arrived: nothing can arrive before its end
@@ -225,7 +210,7 @@ class Session:
             reason = f"{text} although a measurement runs"
             if self.rejection:
                 text = reason = f"all frames from {self.server} are rejected: {self.rejection}"
-            self._status.silent(text)
+            self._status.enter(Phase.SILENT, "silence", text)
             raise SilenceError(f"{reason}; connecting again")
 
     @property
@@ -281,7 +266,7 @@ class Session:
     def data_received(self, data: bytes) -> None:
         """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""
         utime, steady_us = self._read_clocks()
-        self._status.bytes_received(len(data))
+        self._status.bytes_in += len(data)
         if self._process(data, utime, steady_us) or len(data) >= LONG_READ_BYTES:
             self._reading.wait_for_turn(utime, steady_us)
 
@@ -293,31 +278,23 @@ class Session:
             frames, events = protocol.receive(data, _MAX_PACKETS)
             for event in events:
                 self._on_event(event)
-            if protocol.has_more:
-                frames += self._receive_more()
+            has_more = protocol.has_more
+            end_us = self._read_clocks()[1] + _TURN_US if has_more else 0
+            while has_more and self._read_clocks()[1] < end_us:
+                further, events = protocol.receive(b"", _MAX_PACKETS)
+                frames += further
+                for event in events:
+                    self._on_event(event)
+                has_more = protocol.has_more
             if protocol.state is not state_before:
                 self._report_change(state_before)
             if frames:
-                self._quiet_since_s = self._running.tick()
-                self._status.frames_read(self._quiet_since_s)
+                self._status.last_frame_s = self._quiet_since_s = self._running.tick()
                 self._frames.receive(frames, utime, steady_us)
         except Exception as defect:  # noqa: BLE001 - a defect ends only this session
             self._fail_by_defect(defect)
             return False
-        return protocol.has_more
-
-    def _receive_more(self) -> list[Frame]:
-        """Process further packets of the read for a limited time; return the frames among them."""
-        frames = []
-        end_us = self._read_clocks()[1] + _TURN_US
-        while self._read_clocks()[1] < end_us:
-            further, events = self._protocol.receive(b"", _MAX_PACKETS)
-            frames += further
-            for event in events:
-                self._on_event(event)
-            if not self._protocol.has_more:
-                break
-        return frames
+        return has_more
 
     def eof_received(self) -> None:
         """Let the event loop close the connection: a server that sends no more is of no use."""
@@ -347,12 +324,15 @@ class Session:
                 self.replies.end(error)
             case PossibleReply():
                 self.replies.assume_soon()
-            case FrameRejected(frame_error, num_components):
+            case FrameRejected(frame_error, announced):
+                # The frame would have had so many messages, if its component count is true.
+                num_wanted = len(self._status.components.split())
+                num_lost = min(announced, num_wanted) if 0 < announced <= len(ComponentType) else 1
                 self._rejection, self._rejected_s = str(frame_error), self._running.time()
-                self._status.frame_rejected(self._rejection, self._num_lost(num_components))
-            case FilePiece():
-                if self._error is None:
-                    self._last_piece_s = self._running.time()
+                self._status.frame_rejected(self._rejection, num_lost)
+            case FilePiece() if self._error is None:
+                self._last_piece_s = self._running.time()
+                if self._files is not None:
                     self._files.receive(event)
             case ByteOrderMismatch(byte_order):
                 self._status.add_limitation(
@@ -367,11 +347,6 @@ class Session:
                     "%s: unexpected packet of type %d: %s",
                     self._source.name, packet.type, safe_text(decode_text(packet.body[:200])),
                 )  # fmt: skip
-
-    def _num_lost(self, announced: int) -> int:
-        """Return how many messages a rejected frame would have had, according to its component count."""
-        num_wanted = len(self._status.components.split())
-        return min(announced, num_wanted) if 0 < announced <= len(ComponentType) else 1
 
     def _assume_reply(self) -> None:
         """No further reply has followed: the newest one answers the pending command."""
@@ -391,7 +366,7 @@ class Session:
             return
         self._quiet_since_s = self._running.time()
         self._state_changed.set()
-        self._status.protocol_changed(self._protocol.state, self._protocol.byte_order or "", self.server)
+        self._status.protocol_changed(self._protocol.state, self.byte_order, self.server)
 
     def _check_open(self) -> None:
         """Raise the session's error if it has ended, ClosedError if it is not connected."""
@@ -407,7 +382,8 @@ class Session:
         self._state_changed.set()
         self.replies.end(error)
         try:
-            self._files.interrupt(str(error))
+            if self._files is not None:
+                self._files.interrupt(str(error))
             if isinstance(error, DefectError):  # which may be one in publishing
                 self._frames.drop()
             else:

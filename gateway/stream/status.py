@@ -97,8 +97,8 @@ class SourceWarnings:
 class StreamStatus:
     """The status of one stream, over all its connections.
 
-    Only the methods of this class change it, except for ``clock``, which Ingest updates with every frame.
-    Most methods are named after the event that they report.
+    What only has to be counted or noted is assigned to the fields. If more follows from an event, there is a
+    method, which is named after it.
     """
 
     components: str
@@ -187,16 +187,7 @@ class StreamStatus:
     def connecting(self, server: str) -> None:
         """Count an attempt to connect."""
         self.tries += 1
-        self._enter(Phase.CONNECTING, "connecting", server)
-
-    def components_changed(self, components: str, name: str, *, on_open_connection: bool) -> None:
-        """Note the components that the stream has from now on, and its new name.
-
-        Components that move to an open connection get a new session number there.
-        """
-        self.components, self.name = components, name
-        if on_open_connection:
-            self.session = self.sessions.next_after(self.session)
+        self.enter(Phase.CONNECTING, "connecting", server)
 
     def connected(self, server: str) -> None:
         """Count a new session, and forget what was agreed in the previous one."""
@@ -205,7 +196,7 @@ class StreamStatus:
         self.limitations.clear()
         self._unknown_types.clear()
         self.byte_order = self.rate = ""
-        self._enter(Phase.HANDSHAKING, "connected", server)
+        self.enter(Phase.HANDSHAKING, "connected", server)
 
     def handshake_done(self, protocol_state: ProtocolState, server: str, request: str) -> None:
         """Note that the server accepted ``request``, a StreamFrames; frames may have arrived already."""
@@ -224,10 +215,6 @@ class StreamStatus:
         self.byte_order = byte_order
         self._update_state(protocol_state, _PROTOCOL_EVENTS.get(protocol_state, "frames requested"), server)
 
-    def silent(self, text: str) -> None:
-        """Note that no frames arrive although a measurement runs."""
-        self._enter(Phase.SILENT, "silence", text)
-
     def disconnected(self, error: LinkError) -> None:
         """Note and log why the connection ended or could not be opened."""
         self.record_error(str(error))
@@ -235,7 +222,7 @@ class StreamStatus:
             self._defects.log(error.__cause__ or error, str(error))
         else:
             self._failures.failed(str(error))
-        self._enter(Phase.WAITING, "the connection ended", str(error))
+        self.enter(Phase.WAITING, "the connection ended", str(error))
 
     def defect(self, defect: Exception) -> None:
         """Log a defect that ends no connection."""
@@ -248,24 +235,7 @@ class StreamStatus:
             self._failures.recovered(f"{self.state.value} again")
         self.losses.check()
 
-    def stopped(self, reason: str) -> None:
-        """Note that the gateway closed the connection itself."""
-        self._enter(Phase.WAITING, "the gateway ends the connection", reason)
-
-    def reconnecting(self) -> None:
-        """Count an attempt to connect after the first."""
-        self.reconnects += 1
-
     # Reports about arriving data.
-
-    def bytes_received(self, count: int) -> None:
-        """Count the bytes of one read."""
-        self.bytes_in += count
-
-    def frames_received(self, count: int, utime: int) -> None:
-        """Count frames that arrived together at ``utime``, in µs since the Unix epoch."""
-        self.frames_in += count
-        self.last_frame_utime = utime
 
     def components_received(self, unwanted: str) -> None:
         """Note whether the frames of one read had a component of this stream.
@@ -275,18 +245,6 @@ class StreamStatus:
         if unwanted and not self.unwanted_components:
             self.unwanted_since_s = self.last_frame_s or 0.0
         self.unwanted_components = unwanted
-
-    def frames_read(self, now_s: float) -> None:
-        """Note that frames were read from the socket at ``now_s`` on the running clock."""
-        self.last_frame_s = now_s
-
-    def lag_measured(self, lag_s: float) -> None:
-        """Note how late the newest frame is."""
-        self.lag_s = lag_s
-
-    def server_restarted(self) -> None:
-        """Count a restart of the server's time or frame numbers."""
-        self.restarts += 1
 
     def frame_rejected(self, error: str, num_messages: int) -> None:
         """Count a frame that contradicts itself and would have had ``num_messages`` wanted components."""
@@ -307,10 +265,7 @@ class StreamStatus:
 
         ``held_up_s`` is how long the event loop of this gateway did not run lately.
         """
-        lag_ms = 1000 * lag_s
-        text = f"frames arrive {lag_ms:.0f} ms late"
-        if request:
-            text = f"frames arrive {lag_ms:.0f} ms late; {request}"
+        text = f"frames arrive {1000 * lag_s:.0f} ms late{request and f'; {request}'}"
         if held_up_s >= lag_s / 2:
             text = f"{text}; this gateway did not run for {held_up_s:.1f} s: check the load of this computer"
         self._warnings.failed(id(self), text)
@@ -347,30 +302,24 @@ class StreamStatus:
     def unknown_components_skipped(self, types: Sequence[int]) -> None:
         """Count components of one frame whose types §7.2 does not define."""
         if not self._unknown_types.issuperset(types):
-            self._remember_unknown(types)
+            new = sorted(set(types) - self._unknown_types)
+            # The server determines how many types there are, so up to MAX_UNKNOWN_TYPES are listed.
+            num_listed = MAX_UNKNOWN_TYPES - len(self._unknown_types)
+            self._unknown_types.update(new[:num_listed])
+            others = " and others" if len(new) > num_listed else ""
+            if self._unknown_text in self.limitations:
+                self.limitations.remove(self._unknown_text)
+            self._unknown_text = (
+                f"components of unknown type {sorted(self._unknown_types)}{others} are skipped"
+            )
+            self._list_limitation(self._unknown_text)
         self.losses.lost("unknown component", self._unknown_text, messages=len(types))
-
-    def _remember_unknown(self, types: Sequence[int]) -> None:
-        """List up to MAX_UNKNOWN_TYPES as a limitation; the server determines how many types there are."""
-        new = sorted(set(types) - self._unknown_types)
-        num_listed = MAX_UNKNOWN_TYPES - len(self._unknown_types)
-        self._unknown_types.update(new[:num_listed])
-        others = " and others" if len(new) > num_listed else ""
-        former = self._unknown_text
-        self._unknown_text = f"components of unknown type {sorted(self._unknown_types)}{others} are skipped"
-        if former in self.limitations:
-            self.limitations.remove(former)
-        self._list_limitation(self._unknown_text)
 
     def file_lost(self, text: str) -> None:
         """Count a C3D file that the server sent and that is not stored."""
         self.losses.lost("C3D file", text, frames=0, level=logging.ERROR)
 
     # What the server and the gateway agreed on, and errors.
-
-    def parameters_changed(self, version: int) -> None:
-        """Note the version of the server's parameters; the frames after this belong to it."""
-        self.parameters_version = version
 
     def parameters_repaired(self, repairs: Sequence[str]) -> None:
         """Log what was repaired in the server's parameters, once for each text unless there are many."""
@@ -379,10 +328,6 @@ class StreamStatus:
         if text not in self._warnings.logged:
             self._warnings.logged.append(text)
             self.events.log(logging.INFO, text, "parameters repaired")
-
-    def rate_agreed(self, rate: str) -> None:
-        """Note the rate at which the server streams; empty for its default, or while it does not stream."""
-        self.rate = rate
 
     def add_limitation(self, text: str) -> None:
         """Add something that the current connection lacks, unless there are MAX_LIMITATIONS already.
@@ -394,9 +339,9 @@ class StreamStatus:
             return
         if text in self._warnings.logged:
             logger.debug("%s: %s", self.name, text)
-            return
-        self._warnings.logged.append(text)
-        self.events.log(logging.WARNING, text, "limitation", MAX_LIMITATIONS)
+        else:
+            self._warnings.logged.append(text)
+            self.events.log(logging.WARNING, text, "limitation", MAX_LIMITATIONS)
 
     def _list_limitation(self, text: str) -> bool:
         """Add ``text`` to the limitations and return True, unless it is there or there are too many."""
@@ -418,7 +363,7 @@ class StreamStatus:
         self.last_error_utime = now_utime()
         self.last_error_s = time.monotonic()
 
-    def _enter(self, phase: Phase, event: str, cause: str) -> None:
+    def enter(self, phase: Phase, event: str, cause: str) -> None:
         """Enter a phase in which earlier frames or No Data from the server do not matter."""
         self._phase = phase
         if phase is Phase.WAITING:

@@ -25,7 +25,6 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.components import ComponentType, described_rate_hz
-from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.plan import halved, request_forms
 from gateway.stream.process_clock import running_clock
@@ -84,9 +83,9 @@ class StreamRequests:
 
         Also raises RequestError if the server accepts no form of StreamFrames (see ``request_forms``).
         """
-        await self._ask_optional(Version())
+        await self._ask(Version())
         if self._source.byte_order == "little":
-            await self._ask_optional(SetByteOrder("little"))
+            await self._ask(SetByteOrder("little"))
         parameters = await self._fetch_parameters()
         if parameters is not None:
             self._frequency_hz = described_rate_hz(parameters, ComponentType.MARKERS)
@@ -104,17 +103,11 @@ class StreamRequests:
 
     async def stop(self) -> bool:
         """Stop the frames (§5.3.5) and keep the connection; return whether the server has stopped them."""
-        try:
-            await self._session.ask(StopStreaming())
-        except ServerError as error:
-            self._status.add_limitation(f"the server refused {StopStreaming()}: {error}")
+        outcome = await self._ask(StopStreaming())
+        if outcome is _Outcome.REFUSED or (outcome is _Outcome.NO_ANSWER and self._session.has_data):
             return False
-        except ReplyTimeoutError:
-            self._status.add_limitation(f"the server did not answer {StopStreaming()}")
-            if self._session.has_data:
-                return False
         self._requested = None
-        self._status.rate_agreed("")
+        self._status.rate = ""
         return True
 
     async def check_silence(self) -> None:
@@ -127,7 +120,11 @@ class StreamRequests:
         if self._requested is not None and not self._session.has_data and not self._only_events:
             await self._ask_again(self._requested)
             return
-        probe = self._session.replies.answered(Version, SendParameters, SetByteOrder, StopStreaming)
+        answered, kinds = (
+            self._session.replies.answered,
+            (Version, SendParameters, SetByteOrder, StopStreaming),
+        )
+        probe = next((answered[kind] for kind in kinds if kind in answered), None)
         if self._requested is not None and (probe is None or isinstance(probe, StopStreaming)):
             probe = self._requested  # the server accepted it, so it answers it again
         if probe is None:
@@ -153,7 +150,8 @@ class StreamRequests:
 
     async def _request_any(self, forms: Sequence[StreamFrames]) -> None:
         """Request frames in one form after the other, until the server accepts one or sends frames."""
-        has_answered = self._session.replies.has_answered
+        session = self._session
+        has_answered = bool(session.replies.answered)
         ignored: list[StreamFrames] = []
         for form in forms:
             outcome = await self._request(form)
@@ -164,31 +162,23 @@ class StreamRequests:
                 ignored.append(form)
         else:
             # A late refusal need not say what it refuses, so the server may have accepted a form after all.
-            if not (self._is_slow and await self._session.wait_for_data(self._source.reply_timeout_s)):
-                raise self._request_error()
+            if not (self._is_slow and await session.wait_for_data(self._source.reply_timeout_s)):
+                verb = "refuses or ignores" if self._is_slow else "refuses"
+                text = (
+                    f"{verb} StreamFrames in every form that the protocol has; "
+                    "check its real-time output settings"
+                )
+                if not session.replies.answered:
+                    text = "accepts connections and answers no command; restart its application"
+                raise RequestError(f"{session.server} {text}")
             self.accepted = self._requested = forms[-1]
         if ignored and (not has_answered or ignored[0].components != self.accepted.components):
             # The server was not answering at all, or may have hung for a moment, so it may know the form that
             # it seemed to ignore. Without names, components of other rates have to share this connection.
-            await self._prefer(ignored[0])
-
-    async def _prefer(self, form: StreamFrames) -> None:
-        """Request a better form than the accepted one; return to that if the server does not accept it."""
-        if await self._request(form) is _Outcome.ACCEPTED:
-            self.accepted = form
-        else:
-            await self._request(self.accepted)
-
-    def _request_error(self) -> RequestError:
-        if not self._session.replies.has_answered:
-            return RequestError(
-                f"{self._session.server} accepts connections and answers no command; restart its application"
-            )
-        verb = "refuses or ignores" if self._is_slow else "refuses"
-        return RequestError(
-            f"{self._session.server} {verb} StreamFrames in every form that the protocol has; "
-            "check its real-time output settings"
-        )
+            if await self._request(ignored[0]) is _Outcome.ACCEPTED:
+                self.accepted = ignored[0]
+            else:
+                await self._request(self.accepted)
 
     async def _request(self, request: StreamFrames) -> _Outcome:
         """Request frames, and keep the request if the server accepts it.
@@ -197,20 +187,12 @@ class StreamRequests:
         """
         self._asked_again = False
         had_data = self._session.has_data
-        outcome = _Outcome.ACCEPTED
-        try:
-            await self._session.ask(request)
-        except ServerError as error:
-            self._status.add_limitation(f"the server refused {request}: {error}")
-            outcome = _Outcome.REFUSED
-        except ReplyTimeoutError:
-            self._is_slow = True
-            self._status.add_limitation(f"the server did not acknowledge {request}")
-            if had_data or not self._session.has_data:
-                outcome = _Outcome.NO_ANSWER
+        outcome = await self._ask(request)
+        if outcome is _Outcome.NO_ANSWER and not had_data and self._session.has_data:
+            outcome = _Outcome.ACCEPTED
         if outcome is _Outcome.ACCEPTED:
             self._requested = request
-            self._status.rate_agreed("" if request.rate is None else str(request.rate))
+            self._status.rate = "" if request.rate is None else str(request.rate)
         return outcome
 
     async def _fetch_parameters(self) -> Parameters | None:
@@ -230,16 +212,19 @@ class StreamRequests:
             return parsed.parameters
         return None
 
-    async def _ask_optional(self, command: Command) -> Packet | None:
-        """Send ``command``; return the answer, or None if the server refused or did not answer."""
+    async def _ask(self, command: Command) -> _Outcome:
+        """Send ``command``; if the server refuses or does not answer, add the limitation."""
         try:
-            return await self._session.ask(command)
+            await self._session.ask(command)
         except ServerError as error:
             self._status.add_limitation(f"the server refused {command}: {error}")
+            return _Outcome.REFUSED
         except ReplyTimeoutError:
             self._is_slow = True
-            self._status.add_limitation(f"the server did not answer {command}")
-        return None
+            verb = "acknowledge" if isinstance(command, StreamFrames) else "answer"
+            self._status.add_limitation(f"the server did not {verb} {command}")
+            return _Outcome.NO_ANSWER
+        return _Outcome.ACCEPTED
 
 
 DEMAND_POLL_S: Final = 0.05
@@ -288,9 +273,10 @@ class StreamTarget:
 
     def start(self) -> None:
         """Start to change the stream as needed. Call it after the handshake."""
-        self._start_task(self._apply_changes)
-        if self._stream.on_demand:
-            self._start_task(self._follow_demand)
+        works = (
+            [self._apply_changes, self._follow_demand] if self._stream.on_demand else [self._apply_changes]
+        )
+        self._tasks = [asyncio.create_task(self._run_until_error(work)) for work in works]
 
     def lateness_changed(self, halvings: int) -> None:
         """React to late frames: with ``adapt_rate``, start to request the rate halved ``halvings`` times.
@@ -320,15 +306,11 @@ class StreamTarget:
         for task in self._tasks:
             task.cancel()
 
-    def _start_task(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        self._tasks.append(asyncio.create_task(self._run_until_error(work)))
-
     async def _run_until_error(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run a task; end the session if it fails, because then nothing changes the stream any more."""
         try:
-            await (
-                work()
-            )  # called here: a task that is cancelled before it starts must leave no coroutine behind
+            # Called here: a task that is cancelled before it starts must leave no coroutine behind.
+            await work()
         except LinkError as error:
             logger.debug("%s: %s", self._status.name, error)  # the supervisor reports it
             self._session.fail(error)
@@ -359,7 +341,11 @@ class StreamTarget:
         """Request what is wanted now; return False if that must be repeated."""
         requests = self._requests
         if not self._is_wanted:
-            return requests.is_stopped or await self._stop()
+            if not requests.is_stopped:
+                if not await requests.stop():
+                    return False
+                self._status.events.log(logging.INFO, "no subscribers; the stream is stopped", "demand")
+            return True
         if requests.is_stopped:
             self._status.events.log(
                 logging.INFO, "a subscriber appeared; frames are requested again", "demand"
@@ -370,30 +356,20 @@ class StreamTarget:
             self._requested_halvings = 0
             await requests.request_components(components)
         if self._halvings != self._requested_halvings:
-            await self._change_rate()
+            lag_s = self._status.lag_s
+            await self._request_rate()  # if the server refuses, it keeps the rate, and may accept another one
+            request = f"asked the server for {self._status.rate or 'its default rate'}"
+            if 1000 * lag_s > self._source.max_lag_ms:
+                self._status.frames_late(lag_s, running_clock().longest_delay_s(), request)
+            elif self._halvings:
+                logger.debug("%s: frames arrive in time; %s", self._status.name, request)
+            else:
+                self._status.frames_in_time(f"; {request}")
         return True
-
-    async def _stop(self) -> bool:
-        is_stopped = await self._requests.stop()
-        if is_stopped:
-            self._status.events.log(logging.INFO, "no subscribers; the stream is stopped", "demand")
-        return is_stopped
 
     async def _request_rate(self) -> bool:
         self._requested_halvings = self._halvings
         return await self._requests.request(self._halvings)
-
-    async def _change_rate(self) -> None:
-        """Request another rate. If the server refuses, it keeps the rate, and another one may be accepted."""
-        lag_s = self._status.lag_s
-        await self._request_rate()
-        request = f"asked the server for {self._status.rate or 'its default rate'}"
-        if 1000 * lag_s > self._source.max_lag_ms:
-            self._status.frames_late(lag_s, running_clock().longest_delay_s(), request)
-        elif self._halvings:
-            logger.debug("%s: frames arrive in time; %s", self._status.name, request)
-        else:
-            self._status.frames_in_time(f"; {request}")
 
     async def _follow_demand(self) -> None:
         """Want no frames while there are no subscribers, and frames within DEMAND_POLL_S of the first one."""

@@ -11,7 +11,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.stream.plan import Components, StreamPlan, announced_rates_hz, plan_streams
 from gateway.stream.rate_check import AnnouncedRates
-from gateway.stream.state import StreamState
+from gateway.stream.state import Phase, StreamState
 from gateway.stream.supervisor import Listener, Supervisor
 
 _MAX_FURTHER_FAILURES: Final = 2
@@ -90,11 +90,6 @@ class _Verdict(NamedTuple):
     time_s: float
     is_final: bool
 
-    def holds_for(self, server: _Server | None) -> bool:
-        """Return whether another try is not worthwhile yet."""
-        is_recent = self.is_final or _now_s() - self.time_s < _RETRY_S
-        return is_recent and server == self.server
-
 
 class _Further:
     """A further connection, for one of the faster rates.
@@ -132,7 +127,7 @@ class _Further:
         """Close the connection."""
         if self.task is not None and self.is_running:
             self.task.cancel()
-            self.stream.status.stopped(reason)
+            self.stream.status.enter(Phase.WAITING, "the gateway ends the connection", reason)
 
     async def _run_after(self, former: asyncio.Task[None] | None) -> None:
         if former is not None:
@@ -212,18 +207,14 @@ class AutomaticStreams(Listener):
 
     def ended(self, stream: Supervisor, error: LinkError) -> None:
         """Count failures that several connections may have caused."""
-        if stream is self._first:
-            self._first_ended(error)
+        if stream is not self._first:
+            further = self._further[stream.settings.components]
+            if further.is_running:
+                further.failures = further.failures + 1 if further.age_s < _EARLY_END_S else 1
+                if further.failures >= _MAX_FURTHER_FAILURES and self._first.session is not None:
+                    reason = str(error).partition("; ")[0]
+                    self._use_one_connection(f"the server accepts one connection only ({reason})")
             return
-        further = self._further[stream.settings.components]
-        if not further.is_running:
-            return
-        further.failures = further.failures + 1 if further.age_s < _EARLY_END_S else 1
-        if further.failures >= _MAX_FURTHER_FAILURES and self._first.session is not None:
-            reason = str(error).partition("; ")[0]
-            self._use_one_connection(f"the server accepts one connection only ({reason})")
-
-    def _first_ended(self, error: LinkError) -> None:
         running = [further for further in self._further.values() if further.is_running]
         silent_s = self._stall_timeout_s if isinstance(error, SilenceError) else 0.0
         if any(further.age_s - silent_s < _SUSPICIOUS_S for further in running):
@@ -247,9 +238,11 @@ class AutomaticStreams(Listener):
     def _plan_for(self, parameters: Parameters | None) -> None:
         self._server = None if parameters is None else _server(parameters)
         self._wanted = plan = plan_streams(parameters)
-        if self._verdict is not None and len(plan.groups) > 1:
-            if self._verdict.holds_for(self._server):
-                plan = plan.on_one_connection(self._verdict.reason)
+        verdict = self._verdict
+        if verdict is not None and len(plan.groups) > 1:
+            is_recent = verdict.is_final or _now_s() - verdict.time_s < _RETRY_S
+            if is_recent and verdict.server == self._server:
+                plan = plan.on_one_connection(verdict.reason)
             else:
                 self._verdict = None
                 self._failures = 0

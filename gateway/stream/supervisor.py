@@ -98,14 +98,14 @@ class Supervisor:
         if components == self.settings.components:
             return
         self.settings = self.settings.model_copy(update={"components": components})
-        keys = component_keys(components)
-        self.status.components_changed(
-            keys, stream_name(self._source, components), on_open_connection=self.session is not None
-        )
-        self._log_fields["stream"] = keys
+        status, is_open = self.status, self.session is not None
+        status.components = self._log_fields["stream"] = component_keys(components)
+        status.name = stream_name(self._source, components)
+        if is_open:  # components that move to an open connection get a new session number there
+            status.session = status.sessions.next_after(status.session)
         if self._ingest is not None:
             self._ingest.want(components)
-        if self.session is not None and self._target is not None:
+        if is_open and self._target is not None:
             self._target.request_components(components)
 
     def check_rate(self, announced_hz: AnnouncedRates, *, reports_sharing: bool) -> None:
@@ -131,88 +131,54 @@ class Supervisor:
         server = f"{self._source.host}:{self._source.port}"
         with log_fields(source=self._source.name, stream=self.status.components, peer=server) as fields:
             self._log_fields = fields
-            await self._run_sessions()
-
-    async def _run_sessions(self) -> None:
-        loop = asyncio.get_running_loop()
-        backoff = Backoff(self._source.reconnect)
-        while True:
-            frames_before = self.status.frames_in
-            began_s = loop.time()
-            error = await self._run_session_to_its_end()
-            had_data = self.status.frames_in > frames_before or (
-                self.status.state is StreamState.NO_MEASUREMENT
-            )
-            self.status.disconnected(error)
-            self._listener.ended(self, error)
-            # The time that the attempt took counts as waiting. Otherwise a server that hung for long and has
-            # recovered would wait for its client even longer.
-            lasted_s = loop.time() - began_s
-            is_defect = isinstance(error, DefectError)
-            delay_s = backoff.delay_after(lasted_s, had_data=had_data and not is_defect)
-            await asyncio.sleep(max(delay_s - lasted_s, backoff.shortest_s))
-            self.status.reconnecting()
+            status, loop = self.status, asyncio.get_running_loop()
+            backoff = Backoff(self._source.reconnect)
+            while True:
+                frames_before = status.frames_in
+                began_s = loop.time()
+                error = await self._run_session_to_its_end()
+                had_data = status.frames_in > frames_before or status.state is StreamState.NO_MEASUREMENT
+                status.disconnected(error)
+                self._listener.ended(self, error)
+                # The time that the attempt took counts as waiting. Otherwise a server that hung for long and
+                # has recovered would wait for its client even longer.
+                lasted_s = loop.time() - began_s
+                is_defect = isinstance(error, DefectError)
+                delay_s = backoff.delay_after(lasted_s, had_data=had_data and not is_defect)
+                await asyncio.sleep(max(delay_s - lasted_s, backoff.shortest_s))
+                status.reconnects += 1
 
     async def _run_session_to_its_end(self) -> LinkError:
-        """Run one session; return why it ended."""
+        """Run one session; return why it ended. Raises CancelledError if the stream is cancelled."""
         try:
             await self._run_session()
         except LinkError as error:
             return error
-        except Exception as defect:  # noqa: BLE001 - a defect in one stream must not stop the others
-            self._check_cancelled(defect)
+        except (Exception, asyncio.CancelledError) as defect:  # noqa: BLE001 - ends only this connection  # noqa: BLE001 - see below
+            # A defect in one stream must not stop the others. One that happens while a session is closed must
+            # not replace the CancelledError, or the stream would never end. A CancelledError that nobody
+            # asked for, of something that the session waited for, is a defect.
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                if isinstance(defect, Exception):
+                    self.status.defect(defect)
+                raise asyncio.CancelledError from None
             return defect_error(defect)
-        except asyncio.CancelledError as defect:
-            self._check_cancelled(defect)
-            return defect_error(defect)
-
-    def _check_cancelled(self, defect: BaseException) -> None:
-        """Raise CancelledError if somebody has cancelled the stream.
-
-        A defect while the session is closed must not replace it, or the stream would never end. A
-        CancelledError that nobody asked for, of something that the session waited for, is a defect.
-        """
-        task = asyncio.current_task()
-        if task is not None and task.cancelling():
-            if isinstance(defect, Exception):
-                self.status.defect(defect)
-            raise asyncio.CancelledError
 
     async def _run_session(self) -> NoReturn:
         """Run one session until it ends; raise LinkError with the reason."""
+        common, callbacks = (self._source, self.settings, self.status), self._callbacks
         ingest = self._ingest = Ingest(
-            self._source,
-            self.settings,
-            self.status,
-            self._callbacks.publish,
-            self._callbacks.skip,
+            *common,
+            callbacks.publish,
+            callbacks.skip,
             lambda halvings: target.lateness_changed(halvings),  # noqa: PLW0108 - assigned below
-            self._callbacks.on_restart,
+            callbacks.on_restart,
         )
-        session = Session(
-            self._source,
-            self.settings,
-            self.status,
-            ingest.receive,
-            self._callbacks.files,
-            self._connect,
-            self._read_clocks,
-        )
-        requests = StreamRequests(
-            self._source,
-            self.settings,
-            self.status,
-            session,
-            self._callbacks.read_parameters,
-            self._planned_components,
-        )
+        session = Session(*common, ingest.receive, callbacks.files, self._connect, self._read_clocks)
+        requests = StreamRequests(*common, session, callbacks.read_parameters, self._planned_components)
         target = self._target = StreamTarget(
-            self._source,
-            self.settings,
-            self.status,
-            session,
-            requests,
-            lambda: self._callbacks.has_subscribers(self.settings.components),
+            *common, session, requests, lambda: callbacks.has_subscribers(self.settings.components)
         )
         try:
             await session.connect()

@@ -124,7 +124,7 @@ def test_splitting_an_encoded_frame_returns_its_components(
     components: list[RawComponent], order: ByteOrder
 ) -> None:
     split = split_frame(encode_frame([raw.encode(order) for raw in components], order), order)
-    assert split.unknown_types == ()
+    assert split.layout.unknown_types == ()
     for raw, component in zip(components, split.components, strict=True):
         item_bytes = sum(FIELD_BYTES[raw.kind])
         assert component.type == KINDS[raw.kind][0]
@@ -158,7 +158,7 @@ def test_unknown_components_are_skipped_at_any_position(
             wires.append((8 + len(data)).to_bytes(4, order) + kind.to_bytes(4, order) + data)
     split = split_frame(frame(wires, order), order)
     assert [bytes(component.content) for component in split.components] == known
-    assert list(split.unknown_types) == unknown
+    assert list(split.layout.unknown_types) == unknown
 
 
 # Arbitrary bytes ------------------------------------------------------------------------------
@@ -191,12 +191,12 @@ def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, orde
     split = split_or_none(body, order)
     if split is None:
         return
-    assert len(split.components) + len(split.unknown_types) == int.from_bytes(body[:4], order)
+    assert len(split.components) + len(split.layout.unknown_types) == int.from_bytes(body[:4], order)
     for component in split.components:
         assert_consistent(component, order)
     known_bytes = 4 + sum(8 + len(component.content) for component in split.components)
-    if split.unknown_types:
-        assert known_bytes + 8 * len(split.unknown_types) + split.layout.num_extra_bytes <= len(body)
+    if split.layout.unknown_types:
+        assert known_bytes + 8 * len(split.layout.unknown_types) + split.layout.num_extra_bytes <= len(body)
     else:
         assert known_bytes + split.layout.num_extra_bytes == len(body)
 

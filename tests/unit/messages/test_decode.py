@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,17 @@ from tests.support.vectors import LONG_EVENTS, MARKERS
 from tests.unit.messages.samples import component_message, tool_pose_messages
 
 MISSING = [None] * 3
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON says about a value, found independently of ``json_text``."""
+    if hasattr(value, "__slots__"):
+        return {name: plain(getattr(value, name)) for name in value.__slots__}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 EVERY_MESSAGE = [vector.data for vector in VECTORS]
 """Of each type that the gateway publishes or receives."""
 
@@ -23,8 +35,8 @@ def test_every_message_is_decoded_by_its_fingerprint_and_can_be_written_as_json(
         decoded = decode(message)
         assert type(decoded)._get_packed_fingerprint() == message[:8]
         assert decoded.encode() == message
-        value = to_json(decoded)
-        assert json.loads(json.dumps(value, allow_nan=False)) == value
+        value = plain(decoded)
+        assert to_json(decoded) == value
         assert json_text(decoded) == json.dumps(value, separators=(",", ":"), ensure_ascii=False)
     assert set(MESSAGE_TYPES_BY_NAME) == {type(decode(message)).__name__ for message in EVERY_MESSAGE}
     assert len(MESSAGE_TYPES_BY_NAME) == 16
@@ -73,7 +85,7 @@ def test_values_as_json(value: object, text: str) -> None:
 
 def test_parameters_are_objects_of_their_fields() -> None:
     parameters = Parameters(force=ParametersForce((Plate("1", corners=(Point(x=1.0),)),)))
-    assert json.loads(json_text(parameters)) == to_json(parameters)
+    assert json.loads(json_text(parameters)) == plain(parameters)
 
 
 def test_json_is_compact_and_in_utf8_and_has_only_its_own_numbers() -> None:

@@ -180,9 +180,9 @@ def test_the_offset_of_a_server_that_counts_from_any_number_fits_its_field(first
 async def test_frames_without_the_streams_components_are_a_problem_if_they_last() -> None:
     status = StreamStatus("3d")
     clock_s = running_clock().time()
-    status.frames_read(clock_s - 4)
+    status.last_frame_s = clock_s - 4
     status.components_received("6d")
-    status.frames_read(clock_s)
+    status.last_frame_s = clock_s
     status.components_received("6d")
     assert "none has a component of this stream (3d); the newest has 6d" in unusable_frames(status, 3.0)
     assert unusable_frames(status, 100.0) == ""

@@ -131,7 +131,7 @@ class FakeSource:
     async def _announce(self, answer: ServerAnswer | None, version: int) -> None:
         self.announced.append((None if answer is None else answer.xml, version))
         for status in (self.status, self.second_status):
-            status.parameters_changed(version)
+            status.parameters_version = version
 
     async def _last_c3d(self) -> Answer:
         self.num_file_reads += 1

@@ -65,7 +65,7 @@ def let_outputs_fail(monkeypatch: pytest.MonkeyPatch, method: str) -> list[str]:
 
 
 DEFECTS = [
-    *((StreamStatus, name) for name in ("disconnected", "connecting", "reconnecting", "check")),
+    *((StreamStatus, name) for name in ("disconnected", "connecting", "check")),
     *((Source, name) for name in ("publish_status", "_status_message", "_read_parameters", "_on_state")),
     *((FanOut, name) for name in ("publish", "publish_clock", "check_losses")),
     *((Session, name) for name in ("_on_event", "_report_change", "close")),

@@ -43,7 +43,7 @@ def requests(lab: Lab) -> list[str]:
 
 async def change(lab: Lab, halvings: int, lag_s: float | None = None) -> None:
     if lag_s is not None:
-        lab.status.lag_measured(lag_s)
+        lab.status.lag_s = lag_s
     lab.changes.lateness_changed(halvings)
     await settle()
 
@@ -127,7 +127,7 @@ async def test_a_reduced_rate_is_requested_again_with_other_components() -> None
 async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream")
     lab = await started()
-    lab.status.lag_measured(0.3)
+    lab.status.lag_s = 0.3
     for halvings in (1, 0):
         await change(lab, halvings)
     assert requests(lab) == []
@@ -152,7 +152,7 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
 async def test_a_request_for_the_default_rate_is_logged_as_such(caplog: pytest.LogCaptureFixture) -> None:
     lab = await started(adapt_rate=True)
     lab.server.answer = refusing("StreamFrames")
-    lab.status.rate_agreed("")
+    lab.status.rate = ""
     await change(lab, 1, 0.3)
     assert "lab (3d): frames arrive 300 ms late; asked the server for its default rate" in caplog.messages
 
