@@ -23,7 +23,7 @@ from gateway.simulator.faults.connection_faults import (
     Split,
 )
 from gateway.simulator.faults.control import KINDS
-from gateway.simulator.faults.reply_faults import LateAcknowledgements
+from gateway.simulator.faults.packet_faults import LateAcknowledgements
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SceneSettings
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until

@@ -2,66 +2,15 @@
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 import asyncio
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, ClassVar, Final, NamedTuple, Protocol, Self
+import re
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, Final, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from gateway.config.section import Section, expects, validation_error
-from gateway.rtc3d.packets import Packet, PacketType
-from gateway.simulator.synthetic import SceneSettings
-
-
-class FaultyConnection(Protocol):
-    """What a momentary fault may do to a connection."""
-
-    @property
-    def number(self) -> int:
-        """The connection's number since the server's start, from 1."""
-        ...
-
-    def send_unchanged(self, data: bytes) -> None:
-        """Send bytes that no fault changes, after all bytes that are waiting."""
-        ...
-
-    def disconnect(self, last_data: bytes, *, reset: bool) -> None:
-        """Write ``last_data`` before all bytes that are waiting, and end the connection with FIN or RST."""
-        ...
-
-
-class FaultyServer(Protocol):
-    """What a fault may do to the server."""
-
-    @property
-    def connections(self) -> Sequence[FaultyConnection]:
-        """The clients' connections."""
-        ...
-
-    def stop_measurement(self) -> None:
-        """Stop the measurement, if one is running."""
-        ...
-
-    def start_measurement(self) -> None:
-        """Start a measurement, unless another fault prevents it."""
-        ...
-
-    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
-        """Serve the scenario's scene with changes; return a function that restores the previous scene."""
-        ...
-
-    def rename_items(self, prefix: str) -> Callable[[], None]:
-        """Put ``prefix`` before the names of markers and tools; return a function that restores the scene."""
-        ...
-
-    def crash(self) -> None:
-        """End as if the process died."""
-        ...
-
-    def restart(self) -> None:
-        """Listen again after a crash, unless another fault prevents it."""
-        ...
-
+from gateway.rtc3d.packets import Packet
 
 MAX_SECONDS: Final = 86400
 
@@ -83,6 +32,48 @@ Milliseconds = Annotated[
 Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 
 
+class Fault(Section):
+    """A kind of fault with its parameters and times; it can begin any number of times.
+
+    ``str`` returns it in the form of the command line: ``delay,delay_ms=80,for_s=3``.
+    """
+
+    kind: ClassVar[str]
+    """The kind's name in scenarios and on the command line: that of the class, in lower case with _."""
+
+    at_s: Seconds | None = None
+    """Begin this many seconds after the start."""
+
+    every_s: Interval | None = None
+    """Begin repeatedly, at intervals of this many seconds, varied at random by up to half."""
+
+    times: Count | None = None
+    """Do not happen again after this many times."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+
+    @property
+    def lasts_s(self) -> float | None:
+        """How long the fault lasts: 0 means a moment, None means until it is ended."""
+        return 0.0
+
+    def __str__(self) -> str:
+        return ",".join([self.kind, *_assignments(self.model_dump(exclude_unset=True))])
+
+
+def _assignments(values: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return NAME=VALUE for each value, and MAPPING.NAME=VALUE for each value of a mapping."""
+    texts: list[str] = []
+    for name, value in values.items():
+        if isinstance(value, dict):
+            texts += _assignments(value, f"{prefix}{name}.")
+        else:
+            texts.append(f"{prefix}{name}={parameter_text(value)}")
+    return texts
+
+
 def parameter_text(value: object) -> str:
     """Return a parameter's value in the form of the command line."""
     match value:
@@ -93,6 +84,84 @@ def parameter_text(value: object) -> str:
         case tuple() | list():
             return f"[{','.join(map(parameter_text, value))}]"
     return str(value)
+
+
+class ActiveFault:
+    """A fault on one server: when it begins, what it changed, and its random numbers.
+
+    A fault with ``every_s`` begins repeatedly, others once.
+    """
+
+    def __init__(self, fault: Fault, rng: np.random.Generator) -> None:
+        self.fault = fault
+        # Two generators, so that the timing does not depend on how many packets the fault changed.
+        self.rng, self._timing_rng = rng.spawn(2)
+        self.ended = asyncio.Event()
+        self.num_happened = 0
+        """How often it happened: packets, replies or reads that it changed; for other faults, beginnings."""
+        self.variant = 0
+        """A random number, different each time the fault begins."""
+        self.timestamp_us: int | None = None
+        """The time stamp of the first frame since the fault last began, if the fault remembers it."""
+        self.undo: Callable[[], None] | None = None
+        """What undoes the fault at its end."""
+        self.end_timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether the fault has happened as often as its ``times`` allows."""
+        return self.fault.times is not None and self.num_happened >= self.fault.times
+
+    def first_delay_s(self) -> float:
+        """Return the time from the start of the simulator until the fault first begins."""
+        if self.fault.at_s is not None or self.fault.every_s is None:
+            return self.fault.at_s or 0.0
+        return self.random_interval_s(self.fault.every_s)
+
+    def random_interval_s(self, every_s: float) -> float:
+        """Return a random time from one beginning to the next: 50 to 150 % of ``every_s``."""
+        return every_s * float(self._timing_rng.uniform(0.5, 1.5))
+
+    def begin(self) -> None:
+        """Forget what belongs to an earlier time that the fault was active."""
+        self.ended.clear()
+        self.variant = int(self._timing_rng.integers(2**31))
+        self.timestamp_us = None
+
+    def cancel_end(self) -> None:
+        """Cancel the automatic end."""
+        if self.end_timer is not None:
+            self.end_timer.cancel()
+            self.end_timer = None
+
+
+class LastingFault(Fault):
+    """A fault that lasts until it ends."""
+
+    for_s: Interval | None = None
+    """Last this many seconds; by default, until the simulator ends."""
+
+    @model_validator(mode="after")
+    def _ends_before_it_begins_again(self) -> Self:
+        if self.every_s is not None and self.for_s is None:
+            raise validation_error("found every_s without for_s; expected both", "every_s")
+        return self
+
+    @property
+    def lasts_s(self) -> float | None:
+        """See Fault."""
+        return self.for_s
+
+
+class ConnectionFault(Fault):
+    """A fault that affects connections."""
+
+    connection: Count | None = None
+    """Affect only the n-th connection since the server's start; by default, all."""
+
+    def applies_to(self, number: int) -> bool:
+        """Return whether the fault affects the connection with this number."""
+        return self.connection in {None, number}
 
 
 class PendingWrite(NamedTuple):
@@ -118,159 +187,6 @@ class Reply(NamedTuple):
     after_frames: int = 0
     """The number of data frames to send before it; a No Data packet ends the wait."""
 
-    @property
-    def is_held(self) -> bool:
-        """Whether the reply is delayed."""
-        return bool(self.delay_s or self.after_frames)
-
-
-def packet_type_of(packet: bytes) -> int:
-    """Return a packet's type (§4.2); -1 for bytes that are not a packet."""
-    return int.from_bytes(packet[4:8], "big") if len(packet) >= 8 else -1
-
-
-def is_acknowledgement(packet: bytes) -> bool:
-    """Return whether a reply reports success: type 1, whatever its text (field note 1)."""
-    return packet_type_of(packet) == PacketType.COMMAND
-
-
-class ActiveFault:
-    """A fault on one server: begins and ends it, counts what it changed, and has its random numbers.
-
-    A fault with ``every_s`` begins repeatedly, others once.
-    """
-
-    def __init__(self, fault: "Fault", server: FaultyServer, rng: np.random.Generator) -> None:
-        self.fault = fault
-        self.server = server
-        # Two generators, so that the timing does not depend on how many packets the fault changed.
-        self.rng, self._timing_rng = rng.spawn(2)
-        self.ended = asyncio.Event()
-        self.num_happened = 0
-        """How often it happened: packets, replies or reads that it changed; for other faults, beginnings."""
-        self.variant = 0
-        """A random number, different each time the fault begins."""
-        self.timestamp_us: int | None = None
-        """The time stamp of the first frame since the fault last began, if the fault remembers it."""
-        self._undo: Callable[[], None] | None = None
-        self._end_timer: asyncio.TimerHandle | None = None
-
-    @property
-    def is_exhausted(self) -> bool:
-        """Whether the fault has happened as often as its ``times`` allows."""
-        return self.fault.times is not None and self.num_happened >= self.fault.times
-
-    def first_delay_s(self) -> float:
-        """Return the time from the start of the simulator until the fault first begins."""
-        if self.fault.at_s is not None or self.fault.every_s is None:
-            return self.fault.at_s or 0.0
-        return self.random_interval_s(self.fault.every_s)
-
-    def random_interval_s(self, every_s: float) -> float:
-        """Return a random time from one beginning to the next: 50 to 150 % of ``every_s``."""
-        return every_s * float(self._timing_rng.uniform(0.5, 1.5))
-
-    def begin(self) -> None:
-        """Begin the fault."""
-        self.ended.clear()
-        self.variant = int(self._timing_rng.integers(2**31))
-        self.timestamp_us = None
-        self._undo = self.fault.begin(self)
-
-    def end_after(self, seconds: float, end: Callable[["ActiveFault"], None]) -> None:
-        """Call ``end`` with this fault after ``seconds``; at once if they are 0."""
-        if seconds:
-            self._end_timer = asyncio.get_running_loop().call_later(seconds, end, self)
-        else:
-            end(self)
-
-    def end(self) -> None:
-        """End the fault."""
-        self.cancel_end()
-        if self._undo is not None:
-            self._undo()
-        self.ended.set()
-
-    def cancel_end(self) -> None:
-        """Cancel the automatic end."""
-        if self._end_timer is not None:
-            self._end_timer.cancel()
-            self._end_timer = None
-
-
-class Fault(Section):
-    """A kind of fault with its parameters and times; it can begin any number of times.
-
-    ``str`` returns it in the form of the command line: ``delay,delay_ms=80,for_s=3``.
-    """
-
-    kind: ClassVar[str]
-    """The kind's name in scenarios and on the command line."""
-
-    at_s: Seconds | None = None
-    """Begin this many seconds after the start."""
-
-    every_s: Interval | None = None
-    """Begin repeatedly, at intervals of this many seconds, varied at random by up to half."""
-
-    times: Count | None = None
-    """Do not happen again after this many times."""
-
-    @property
-    def lasts_s(self) -> float | None:
-        """How long the fault lasts: 0 means a moment, None means until ``end`` is called."""
-        return 0.0
-
-    def begin(self, active: ActiveFault) -> Callable[[], None] | None:
-        """Begin; return a function that undoes it, or None if there is nothing to undo."""
-        return None
-
-    def __str__(self) -> str:
-        return ",".join([self.kind, *_assignments(self.model_dump(exclude_unset=True))])
-
-
-class ConnectionFault(Fault):
-    """A fault that affects connections."""
-
-    connection: Count | None = None
-    """Affect only the n-th connection since the server's start; by default, all."""
-
-    def applies_to(self, number: int) -> bool:
-        """Return whether the fault affects the connection with this number."""
-        return self.connection in {None, number}
-
-
-class MomentaryFault(ConnectionFault):
-    """A fault that happens to connections at one moment."""
-
-    def begin(self, active: ActiveFault) -> None:
-        """Act on every affected connection."""
-        for connection in active.server.connections:
-            if self.applies_to(connection.number):
-                self.act_on(connection, active)
-
-    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
-        """Act on one connection."""
-        raise NotImplementedError
-
-
-class LastingFault(Fault):
-    """A fault that lasts until it ends."""
-
-    for_s: Interval | None = None
-    """Last this many seconds; by default, until the simulator ends."""
-
-    @model_validator(mode="after")
-    def _ends_before_it_begins_again(self) -> Self:
-        if self.every_s is not None and self.for_s is None:
-            raise validation_error("found every_s without for_s; expected both", "every_s")
-        return self
-
-    @property
-    def lasts_s(self) -> float | None:
-        """See Fault."""
-        return self.for_s
-
 
 class LastingConnectionFault(ConnectionFault, LastingFault):
     """A fault that changes the bytes of connections, including later ones, until it ends.
@@ -295,12 +211,14 @@ class LastingConnectionFault(ConnectionFault, LastingFault):
         return 0.0
 
 
-def _assignments(values: dict[str, Any], prefix: str = "") -> list[str]:
-    """Return NAME=VALUE for each value, and MAPPING.NAME=VALUE for each value of a mapping."""
-    texts: list[str] = []
-    for name, value in values.items():
-        if isinstance(value, dict):
-            texts += _assignments(value, f"{prefix}{name}.")
-        else:
-            texts.append(f"{prefix}{name}={parameter_text(value)}")
-    return texts
+class MomentaryFault(ConnectionFault):
+    """A fault that happens to connections at one moment: bytes that no server sends."""
+
+    def data(self, rng: np.random.Generator) -> bytes:
+        """Return the bytes to send on a connection."""
+        raise NotImplementedError
+
+
+def packet_type_of(packet: bytes) -> int:
+    """Return a packet's type (§4.2); -1 for bytes that are not a packet."""
+    return int.from_bytes(packet[4:8], "big") if len(packet) >= 8 else -1

@@ -2,9 +2,9 @@
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 import math
-from collections.abc import Callable
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
+import numpy as np
 from pydantic import Field
 
 from gateway.config.section import expects
@@ -12,7 +12,6 @@ from gateway.rtc3d.packets import PACKET_HEADER, PacketType
 from gateway.simulator.faults.base import (
     ActiveFault,
     Fault,
-    FaultyConnection,
     LastingConnectionFault,
     LastingFault,
     Milliseconds,
@@ -33,8 +32,6 @@ Speed = Annotated[
 class Split(LastingConnectionFault):
     """The server sends each packet in several pieces of random size."""
 
-    kind: ClassVar[str] = "split"
-
     pieces: Pieces = 3
     """The number of pieces; a packet of fewer bytes is sent byte by byte."""
 
@@ -43,23 +40,20 @@ class Split(LastingConnectionFault):
 
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
         """See LastingConnectionFault."""
-        return [piece for write in writes for piece in self._split(write, active)]
-
-    def _split(self, write: PendingWrite, active: ActiveFault) -> list[PendingWrite]:
-        size = len(write.data)
-        num_cuts = min(self.pieces, size) - 1
-        cuts = sorted(active.rng.choice(size - 1, num_cuts, replace=False) + 1) if num_cuts > 0 else []
+        pieces = []
         pause_s = self.pause_ms / 1000
-        return [
-            write._replace(due_s=write.due_s + index * pause_s, data=write.data[start:stop])
-            for index, (start, stop) in enumerate(zip([0, *cuts], [*cuts, size], strict=True))
-        ]
+        for write in writes:
+            size = len(write.data)
+            num_cuts = min(self.pieces, size) - 1
+            cuts = sorted(active.rng.choice(size - 1, num_cuts, replace=False) + 1) if num_cuts > 0 else []
+            for index, (start, stop) in enumerate(zip([0, *cuts], [*cuts, size], strict=True)):
+                due_s = write.due_s + index * pause_s
+                pieces.append(write._replace(due_s=due_s, data=write.data[start:stop]))
+        return pieces
 
 
 class Merge(LastingConnectionFault):
     """The server collects packets and sends several at once."""
-
-    kind: ClassVar[str] = "merge"
 
     window_ms: Milliseconds = 20.0
     """How long the server collects packets, in milliseconds."""
@@ -76,8 +70,6 @@ class Merge(LastingConnectionFault):
 class Delay(LastingConnectionFault):
     """The server sends everything late."""
 
-    kind: ClassVar[str] = "delay"
-
     delay_ms: Milliseconds = 100.0
     """The delay in milliseconds."""
 
@@ -88,8 +80,6 @@ class Delay(LastingConnectionFault):
 
 class Jitter(LastingConnectionFault):
     """The server sends each packet late by a random time (exponential distribution), in order."""
-
-    kind: ClassVar[str] = "jitter"
 
     mean_ms: Milliseconds = 5.0
     """The mean delay in milliseconds."""
@@ -103,8 +93,6 @@ class Jitter(LastingConnectionFault):
 class HalfOpen(LastingConnectionFault):
     """The server neither reads nor writes nor closes connections; what it would have sent is lost."""
 
-    kind: ClassVar[str] = "half_open"
-
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
         """See LastingConnectionFault."""
         return []
@@ -117,24 +105,12 @@ class HalfOpen(LastingConnectionFault):
 class SlowReader(LastingConnectionFault):
     """The server reads commands slowly."""
 
-    kind: ClassVar[str] = "slow_reader"
-
     bytes_per_s: Speed = 100.0
     """The speed in bytes per second."""
 
     def read_delay_s(self, num_bytes: int) -> float:
         """See LastingConnectionFault."""
         return num_bytes / self.bytes_per_s
-
-
-STREAM_FAULTS: Final[tuple[type[LastingConnectionFault], ...]] = (
-    Split,
-    Merge,
-    Delay,
-    Jitter,
-    HalfOpen,
-    SlowReader,
-)
 
 
 NumBytes = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
@@ -144,105 +120,71 @@ TooLarge = Annotated[
 TooSmall = Annotated[int, Field(strict=True, ge=0, le=7), expects("a whole number of bytes from 0 to 7")]
 Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 
-_PART_OF_A_PACKET: Final = PACKET_HEADER.pack(1000, PacketType.DATA) + bytes(100)
-
 
 class Garbage(MomentaryFault):
     """The server sends random bytes between two packets."""
 
-    kind: ClassVar[str] = "garbage"
-
     num_bytes: NumBytes = 64
     """The number of bytes."""
 
-    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
+    def data(self, rng: np.random.Generator) -> bytes:
         """See MomentaryFault."""
-        connection.send_unchanged(active.rng.bytes(self.num_bytes))
+        return rng.bytes(self.num_bytes)
 
 
-class Oversize(MomentaryFault):
+class _WrongSize(MomentaryFault):
+    size_bytes: int
+
+    def data(self, rng: np.random.Generator) -> bytes:
+        """See MomentaryFault."""
+        return PACKET_HEADER.pack(self.size_bytes, PacketType.DATA)
+
+
+class Oversize(_WrongSize):
     """The server sends a packet header that announces more bytes than follow."""
-
-    kind: ClassVar[str] = "oversize"
 
     size_bytes: TooLarge = 0xFFFFFFFF
     """The value of the size field."""
 
-    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
-        """See MomentaryFault."""
-        connection.send_unchanged(PACKET_HEADER.pack(self.size_bytes, PacketType.DATA))
 
-
-class Undersize(MomentaryFault):
+class Undersize(_WrongSize):
     """The server sends a packet header that announces fewer bytes than the header itself has."""
-
-    kind: ClassVar[str] = "undersize"
 
     size_bytes: TooSmall = 0
     """The value of the size field."""
-
-    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
-        """See MomentaryFault."""
-        connection.send_unchanged(PACKET_HEADER.pack(self.size_bytes, PacketType.DATA))
 
 
 class Cut(MomentaryFault):
     """Connections end in the middle of a packet."""
 
-    kind: ClassVar[str] = "cut"
-
     reset: Switch = False
     """End connections with RST instead of FIN, as a server's computer does after a restart."""
 
-    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
+    def data(self, rng: np.random.Generator) -> bytes:
         """See MomentaryFault."""
-        connection.disconnect(_PART_OF_A_PACKET, reset=self.reset)
-
-
-MOMENTARY_FAULTS: Final[tuple[type[MomentaryFault], ...]] = (Garbage, Oversize, Undersize, Cut)
+        return PACKET_HEADER.pack(1000, PacketType.DATA) + bytes(100)
 
 
 class NoMeasurement(LastingFault):
     """The measurement stops; when the fault ends, a new one starts."""
 
-    kind: ClassVar[str] = "no_measurement"
-
-    def begin(self, active: ActiveFault) -> Callable[[], None]:
-        """See Fault."""
-        active.server.stop_measurement()
-        return active.server.start_measurement
-
 
 class ChangeScene(LastingFault):
     """Markers, tools and so on change during the measurement; when the fault ends, they change back."""
 
-    kind: ClassVar[str] = "change_scene"
-
     scene: SceneSettings = SceneSettings(markers=12)
     """The changes to the scenario's scene; by default, it gets 12 markers."""
-
-    def begin(self, active: ActiveFault) -> Callable[[], None]:
-        """See Fault."""
-        return active.server.change_scene(self.scene)
 
 
 class Rename(LastingFault):
     """Somebody renames all markers and tools; when the fault ends, they have their former names."""
 
-    kind: ClassVar[str] = "rename"
-
     prefix: Label = "New "
     """The text before each former name."""
-
-    def begin(self, active: ActiveFault) -> Callable[[], None]:
-        """See Fault."""
-        return active.server.rename_items(self.prefix)
 
 
 class Restart(Fault):
     """The server crashes and comes back on the same port with a new measurement."""
-
-    kind: ClassVar[str] = "restart"
 
     away_s: Seconds = 1.0
     """Seconds until the server comes back."""
@@ -255,12 +197,8 @@ class Restart(Fault):
         """See Fault."""
         return self.away_s
 
-    def begin(self, active: ActiveFault) -> Callable[[], None]:
-        """See Fault."""
-        active.server.crash()
-        if self.scene.model_fields_set:
-            active.server.change_scene(self.scene)
-        return active.server.restart
 
-
-SERVER_FAULTS: Final[tuple[type[Fault], ...]] = (NoMeasurement, ChangeScene, Rename, Restart)
+SERVER_FAULTS: Final = (NoMeasurement, ChangeScene, Rename, Restart)
+"""What these do is in ``control.Faults``, which has the server."""
+STREAM_FAULTS: Final = (Split, Merge, Delay, Jitter, HalfOpen, SlowReader)
+MOMENTARY_FAULTS: Final = (Garbage, Oversize, Undersize, Cut)

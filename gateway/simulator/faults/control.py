@@ -1,6 +1,7 @@
 """All kinds of faults by name, and their begin and end: at once, or at the times in a scenario."""
 
 import asyncio
+import contextlib
 import logging
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -27,17 +28,18 @@ from gateway.simulator.faults.connection_faults import (
     MOMENTARY_FAULTS,
     SERVER_FAULTS,
     STREAM_FAULTS,
+    ChangeScene,
+    Cut,
     NoMeasurement,
+    Rename,
     Restart,
 )
-from gateway.simulator.faults.frame_faults import FRAME_FAULTS
+from gateway.simulator.faults.packet_faults import PACKET_FAULTS
 from gateway.simulator.faults.pipeline import ActiveConnectionFaults, FaultPipeline
-from gateway.simulator.faults.reply_faults import REPLY_FAULTS
 from gateway.simulator.synthetic import RenamedScene, SceneSettings
 
 KINDS: Final[dict[str, type[Fault]]] = {
-    fault.kind: fault
-    for fault in (*SERVER_FAULTS, *REPLY_FAULTS, *FRAME_FAULTS, *STREAM_FAULTS, *MOMENTARY_FAULTS)
+    fault.kind: fault for fault in (*SERVER_FAULTS, *PACKET_FAULTS, *STREAM_FAULTS, *MOMENTARY_FAULTS)
 }
 """All kinds by name, in the order in which they act on the bytes of a connection."""
 
@@ -73,7 +75,9 @@ def parse_fault(text: str) -> Fault:
                 )
         if not equals or name in target:
             raise ConfigError(f"fault {text!r}: found {assignment!r}; expected NAME=VALUE, each name once")
-        target[name] = _value(value)
+        target[name] = value
+        with contextlib.suppress(yaml.YAMLError):
+            target[name] = yaml.safe_load(value)
     try:
         return validate_fault(values)
     except ValidationError as error:
@@ -101,11 +105,6 @@ def validate_fault(value: object) -> Fault:
     raise validation_error(f"found {describe(value)}; expected a mapping with the key fault, one of {_NAMES}")
 
 
-def summary_of(kind: type[Fault]) -> str:
-    """Return one sentence that describes what happens."""
-    return (kind.__doc__ or "").partition("\n")[0]
-
-
 def parameters_of(kind: type[Fault]) -> Iterator[tuple[str, str, str]]:
     """Yield name, default ("" for none) and description of each parameter except the common ones."""
     for name, field in kind.model_fields.items():
@@ -121,7 +120,7 @@ def describe_kinds() -> str:
     for name, kind in KINDS.items():
         common = [key for key in ("for_s", "connection") if key in kind.model_fields]
         lines.append(f"{name}{''.join(f' [{key}]' for key in common)}")
-        lines.append(f"    {summary_of(kind)}")
+        lines.append(f"    {(kind.__doc__ or '').splitlines()[0]}")
         for key, default, text in parameters_of(kind):
             lines.append(f"    {key}{'=' if default else ''}{default}  {text}")
     lines += [
@@ -130,13 +129,6 @@ def describe_kinds() -> str:
     ]
     lines += [f"    {key}  {text}" for key, text in COMMON_PARAMETERS.items()]
     return "\n".join(lines)
-
-
-def _value(text: str) -> object:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
 
 
 _RETRY_S: Final = 1.0  # between attempts to listen on a port that another program has taken
@@ -192,7 +184,10 @@ class Faults:
         if active not in self._active:
             return
         self._active.remove(active)
-        active.end()
+        active.cancel_end()
+        if active.undo is not None:
+            active.undo()
+        active.ended.set()
         for pipeline in self.connections:
             pipeline.fault_ended()
         if not isinstance(active.fault, MomentaryFault):
@@ -233,35 +228,56 @@ class Faults:
             if isinstance(active.fault, LastingConnectionFault) and active.fault.applies_to(number)
         ]
 
-    # For faults (FaultyServer) --------------------------------------------------------------
+    # What faults do to the server and to connections ----------------------------------------
 
-    def stop_measurement(self) -> None:
-        """See FaultyServer."""
-        self._server.stop_measurement()
+    def _begin(self, active: ActiveFault) -> None:
+        fault = active.fault
+        _log.info("Fault: %s" if isinstance(fault, MomentaryFault) else "Fault begins: %s", fault)
+        self._active.append(active)
+        self._active.sort(key=lambda active: _ORDER[type(active.fault)])
+        active.begin()
+        active.undo = self._apply(fault, active.rng)
+        if not isinstance(fault, LastingConnectionFault):
+            active.num_happened += 1
+        if fault.lasts_s:
+            active.end_timer = asyncio.get_running_loop().call_later(fault.lasts_s, self.end, active)
+        elif fault.lasts_s is not None:
+            self.end(active)
 
-    def start_measurement(self) -> None:
-        """See FaultyServer."""
+    def _apply(self, fault: Fault, rng: np.random.Generator) -> Callable[[], None] | None:
+        """Do what a fault does when it begins; return what undoes it. Others act while data is sent."""
+        match fault:
+            case NoMeasurement():
+                self._server.stop_measurement()
+                return self._start_measurement
+            case ChangeScene():
+                return self._serve(self.scene.with_changes(fault.scene).build())
+            case Rename():
+                return self._serve(RenamedScene(self._server.scene, fault.prefix))
+            case Restart():
+                self._server.crash()
+                if fault.scene.model_fields_set:
+                    self._serve(self.scene.with_changes(fault.scene).build())
+                return self._begin_restart
+            case MomentaryFault():
+                for pipeline in self.connections:
+                    if not fault.applies_to(pipeline.connection.number):
+                        continue
+                    if isinstance(fault, Cut):
+                        pipeline.disconnect(fault.data(rng), reset=fault.reset)
+                    else:
+                        pipeline.send_unchanged(fault.data(rng))
+        return None
+
+    def _start_measurement(self) -> None:
+        """Start a measurement, unless another fault prevents it."""
         if self._server.is_listening and not self._is_active(NoMeasurement):
             self._server.start_measurement()
 
-    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
-        """See FaultyServer."""
-        return self._serve(self.scene.with_changes(changes).build())
-
-    def rename_items(self, prefix: str) -> Callable[[], None]:
-        """See FaultyServer."""
-        return self._serve(RenamedScene(self._server.scene, prefix))
-
-    def crash(self) -> None:
-        """See FaultyServer."""
-        self._server.crash()
-
-    def restart(self) -> None:
-        """See FaultyServer."""
+    def _begin_restart(self) -> None:
+        """Listen again after a crash, unless another fault prevents it."""
         if self._restarting is None or self._restarting.done():
             self._restarting = asyncio.get_running_loop().create_task(self._restart())
-
-    # Internals ------------------------------------------------------------------------------
 
     def _serve(self, scene: Scene) -> Callable[[], None]:
         before = self._server.scene
@@ -270,7 +286,7 @@ class Faults:
 
     def _new_active_fault(self, fault: Fault) -> ActiveFault:
         self._num_added += 1
-        return ActiveFault(fault, self, np.random.default_rng((self._seed, self._num_added)))
+        return ActiveFault(fault, np.random.default_rng((self._seed, self._num_added)))
 
     async def _play(self, active: ActiveFault) -> None:
         loop = asyncio.get_running_loop()
@@ -284,17 +300,6 @@ class Faults:
             if active.fault.every_s is None or active.is_exhausted:
                 return
             delay_s = active.random_interval_s(active.fault.every_s)
-
-    def _begin(self, active: ActiveFault) -> None:
-        fault = active.fault
-        _log.info("Fault: %s" if isinstance(fault, MomentaryFault) else "Fault begins: %s", fault)
-        self._active.append(active)
-        self._active.sort(key=lambda active: _ORDER[type(active.fault)])
-        active.begin()
-        if not isinstance(fault, LastingConnectionFault):
-            active.num_happened += 1
-        if fault.lasts_s is not None:
-            active.end_after(fault.lasts_s, self.end)
 
     def _count(self, changed_by: Iterable[ActiveFault]) -> None:
         """Count that these faults changed something, and end those that are exhausted."""
