@@ -132,6 +132,8 @@ class IncomingFile:
         thread: WorkerThread,
         on_end: Callable[["IncomingFile", StoredFile | SpoolError], None],
     ) -> None:
+        self.directory = spool.directory
+        """Where the file will be."""
         self._source = source
         self._name = f"a C3D file of {file_bytes} bytes from {source}"
         self._spool = spool
@@ -150,11 +152,9 @@ class IncomingFile:
             return
         if not self._spool.memory.reserve(self._source, piece):
             held_mib = self._spool.memory.held_bytes // _MIB
-            self._end(
-                SpoolError(
-                    f"{self._name} is dropped: {held_mib} MiB of C3D files are waiting to be written; "
-                    "is the disk slow, or the server faulty?"
-                )
+            self.lose(
+                f"is dropped: {held_mib} MiB of C3D files are waiting to be written; "
+                "is the disk slow, or the server faulty?"
             )
             return
         self._num_bytes += len(piece)
@@ -167,16 +167,11 @@ class IncomingFile:
 
     def interrupt(self, reason: str) -> None:
         """Give up the file, because no further piece of it will come."""
-        self._end(SpoolError(f"{self._name} broke off after {self._num_bytes} bytes: {reason}"))
+        self.lose(f"broke off after {self._num_bytes} bytes: {reason}")
 
-    def give_up_disk(self) -> None:
-        """Give up the file, because the disk does not respond."""
-        self._end(
-            SpoolError(
-                f"{self._name} is dropped: the disk of {self._spool.directory} does not respond; "
-                "check it, and whether it is mounted"
-            )
-        )
+    def lose(self, how: str) -> None:
+        """Give up the file. ``how`` continues a sentence that begins with its size and source."""
+        self._end(SpoolError(f"{self._name} {how}"))
 
     def _end(self, result: StoredFile | SpoolError) -> None:
         """Report the end of the file, once. If it is lost, free its memory and have it deleted."""
@@ -197,22 +192,19 @@ class IncomingFile:
         except IndexError:  # the file is lost
             return
         try:
-            if self._has_failed:
-                return
-            if self._unfinished is None:
-                self._unfinished = self._spool.begin()
-            self._unfinished.write(piece)
+            if not self._has_failed:
+                self._unfinished = self._unfinished or self._spool.begin()
+                self._unfinished.write(piece)
         except OSError as error:
             self._fail(error)
         finally:
             self._spool.memory.release(self._source, piece)
 
     def _keep(self) -> None:
-        unfinished = self._unfinished
-        if unfinished is None or self._is_ended:
+        if self._unfinished is None or self._is_ended:
             return
         try:
-            stored = self._spool.keep(self._source, unfinished)
+            stored = self._spool.keep(self._source, self._unfinished)
         except OSError as error:
             self._fail(error)
         else:
@@ -228,12 +220,8 @@ class IncomingFile:
     def _fail(self, error: OSError) -> None:
         self._has_failed = True
         self._discard()
-        self._report(
-            SpoolError(
-                f"{self._name} cannot be stored in {self._spool.directory}: {error.strerror}; "
-                "check spool.directory and the space on it"
-            )
-        )
+        text = f"{self._name} cannot be stored in {self.directory}: {error.strerror}"
+        self._report(SpoolError(f"{text}; check spool.directory and the space on it"))
 
     def _report(self, result: StoredFile | SpoolError) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: the gateway has stopped
@@ -273,10 +261,6 @@ class SourceFiles:
         self._is_disk_silent = False
         self._allowed = TokenBucket(1 / _FILE_PERIOD_S, _MAX_FILES_AT_ONCE)
 
-    def receiver(self, on_lost: Callable[[SpoolError], None]) -> "FileReceiver":
-        """Return what takes the files of one stream; ``on_lost`` is called with each one that is lost."""
-        return FileReceiver(self, on_lost)
-
     def begin(self, head: bytes, file_bytes: int, on_lost: Callable[[SpoolError], None]) -> IncomingFile:
         """Return a new file that begins with ``head``. Raises SpoolError if it is refused."""
         name = f"a C3D file of {file_bytes} bytes"
@@ -307,19 +291,19 @@ class SourceFiles:
 
     def check(self) -> None:
         """Give up the files that wait for a disk that does not respond. Call it once a second."""
-        if self._thread.call_age_s > _MAX_DISK_S:
-            self._is_disk_silent = True
+        self._is_disk_silent = self._thread.call_age_s > _MAX_DISK_S
+        if self._is_disk_silent:
             for file in [*self._unstored]:
-                file.give_up_disk()
-        else:
-            self._is_disk_silent = False
+                file.lose(
+                    f"is dropped: the disk of {file.directory} does not respond; "
+                    "check it, and whether it is mounted"
+                )
 
     async def finish(self) -> None:
         """Wait until the files that have arrived are stored, but not long: the disk may not respond."""
-        if not self._unstored:
-            return
-        written = asyncio.wrap_future(self._thread.submit(lambda: None))
-        await asyncio.wait([written], timeout=_FINISH_S)
+        if self._unstored:
+            written = asyncio.wrap_future(self._thread.submit(lambda: None))
+            await asyncio.wait([written], timeout=_FINISH_S)
 
     def _end(self, file: IncomingFile, result: StoredFile | SpoolError) -> None:
         on_lost = self._unstored.pop(file)

@@ -1,13 +1,13 @@
 """Export to C3D: markers, analog channels, force plates and events, one file per measurement."""
 
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from gateway import version_text
+from gateway.descriptions.force_plates import ADDED_LABELS
 from gateway.descriptions.labels import MAX_EVENT_AGE_US, EventText, event_text, fitting_labels, printable
 from gateway.errors import TakeError
 from gateway.takes.export.c3d_content import C3dContent, content_of, encode_points, plate_group, residual_step
@@ -17,195 +17,17 @@ from gateway.takes.export.c3d_format import (
     MAX_LIST,
     MAX_TEXT_BYTES,
     MAX_WORD,
+    Group,
     Groups,
-    Parameter,
     Shape,
     encode_head,
     encode_text,
+    lists,
     rate_in_float32,
     standard_groups,
-    text_lists,
 )
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, named_measurements, utc_text
-from gateway.takes.files.component_rows import Array
-from gateway.takes.files.description import TakeDetails
-from gateway.takes.files.series import Series
-
-_MINUTE_S: Final = 60.0
-_SIDES: Final = {"Left", "Right"}
-_MARGIN_S: Final = 1.0
-"""An event within this time before the first frame or after the last one belongs to the measurement."""
-
-
-def event_times_us(events: Series) -> Array:
-    """Return the server's time of each event: its own, or that of its frame if it is far from that."""
-    own = events.items["timestamp"]
-    is_near = abs(own.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
-    return np.where(is_near, own, events.timestamp_us)
-
-
-def _context_of(text: EventText) -> str:
-    """Return Left, Right or General, by a parameter of the event, or else by a word of its label.
-
-    A parameter called Context, as the simulator has it for events of C3D files, can say something else.
-    """
-    named = _value_of(text, "context")
-    if named:
-        return named
-    for words in ([value.strip() for _, value in text.values], text.label.split()):
-        sides = _SIDES & {word.capitalize() for word in words}
-        if len(sides) == 1:
-            return sides.pop()
-    return "General"
-
-
-def _value_of(text: EventText, name: str) -> str:
-    """Return the value of a parameter of the event; "" if it has none of this name."""
-    return next((value for each, value in text.values if each.strip().casefold() == name), "")
-
-
-def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> list[Parameter]:
-    """Return the group EVENT with the events of these rows; [] if there are none."""
-    events = measurement.source.events
-    if events is None:
-        return []
-    rate_hz = measurement.grid.rate_hz
-    seconds = measurement.seconds_of(event_times_us(events), events.capture_utime) - first_row / rate_hz
-    (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
-    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
-    if len(chosen) > MAX_LIST:
-        job.note(
-            f"{len(chosen) - MAX_LIST} of {len(chosen)} events were left out: a C3D file has at most 255"
-        )
-        chosen = chosen[:MAX_LIST]
-    if not len(chosen):
-        return []
-    count = len(chosen)
-    subject = measurement.source.details.subject
-    texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
-    minutes, rest = np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)
-    return [
-        Parameter("USED", np.array(count, np.int16)),
-        Parameter("CONTEXTS", [printable(_context_of(text)) for text in texts]),
-        Parameter("LABELS", [printable(text.label) for text in texts]),
-        Parameter("DESCRIPTIONS", [printable(text.description) for text in texts]),
-        Parameter("SUBJECTS", [printable(_value_of(text, "subject") or subject) for text in texts]),
-        Parameter("TIMES", np.stack([minutes, rest]).astype(np.float32)),
-        Parameter("ICON_IDS", np.zeros(count, np.int16)),
-        Parameter("GENERIC_FLAGS", np.zeros(count, np.int16)),
-    ]
-
-
-_TEXT_SIZES: Final = (MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
-"""How long labels may be, in bytes; the parameters of a file have 130 kB at most."""
-
-
-def encode_head_that_fits(job: ExportJob, content: C3dContent, shape: Shape) -> bytes:
-    """Return everything before the frames, with texts as long as there is room for. Raises TakeError."""
-    error: TakeError | None = None
-    for max_bytes in _TEXT_SIZES:
-        try:
-            head = encode_head(shape, _groups(job, content, shape, max_bytes))
-        except TakeError as too_large:
-            error = too_large
-            continue
-        if error is not None:
-            job.note(
-                "a C3D file has no room for so many texts: descriptions were left out, "
-                f"and labels have at most {max_bytes} bytes"
-            )
-        return head
-    raise error or TakeError("there is no room for labels")
-
-
-def _groups(job: ExportJob, content: C3dContent, shape: Shape, max_bytes: int) -> Groups:
-    """Return all groups; with descriptions only if texts can have their full size."""
-    groups = standard_groups(shape, [content.unit])
-    labels, descriptions = _point_texts(content)
-    groups["POINT"] += _texts(job, labels, descriptions, max_bytes, "marker")
-    labels, descriptions, units = _channel_texts(content)
-    groups["ANALOG"] += _texts(job, labels, descriptions, max_bytes, "channel")
-    groups["ANALOG"] += text_lists("UNITS", [printable(unit) for unit in units])
-    groups["TRIAL"] += [
-        Parameter("DATE_TIME", [utc_text(content.measurement, content.start_s)]),
-        Parameter("TIME_OFFSET", np.array(content.start_s, np.float32)),
-        *_details(job, content.measurement.source.details),
-    ]
-    subject = content.measurement.source.details.subject
-    if subject:
-        groups["SUBJECTS"] = [
-            Parameter("USED", np.array(1, np.int16)),
-            Parameter("USES_PREFIXES", np.array(0, np.int16)),
-            Parameter("NAMES", [printable(subject)]),
-        ]
-    groups["FORCE_PLATFORM"] = plate_group(content.plates)
-    events = event_group(job, content.measurement, content.first_row, content.num_frames)
-    if events:
-        groups["EVENT"] = events
-    groups["MANUFACTURER"] = [
-        Parameter("SOFTWARE", ["rtc3d-gateway"]),
-        Parameter("VERSION_LABEL", [version_text()]),
-    ]
-    return groups
-
-
-def _details(job: ExportJob, details: TakeDetails) -> list[Parameter]:
-    """Return the session and the note, in lines as long as a parameter can have in any script."""
-    for text in (details.subject, details.session):
-        if encode_text(text) != text.encode():
-            job.note(f"{text!r} was cut: a C3D file has texts of at most {MAX_TEXT_BYTES} bytes")
-    texts = {"SESSION": [details.session], "NOTE": textwrap.wrap(details.note, MAX_TEXT_BYTES // 4)}
-    return [Parameter(name, lines) for name, lines in texts.items() if any(lines)]
-
-
-def _texts(
-    job: ExportJob, labels: list[str], descriptions: list[str], max_bytes: int, noun: str
-) -> list[Parameter]:
-    fitted = fitting_labels(labels, printable, max_bytes, noun)
-    changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
-    if changed and max_bytes == MAX_TEXT_BYTES:
-        job.note(f"{changed} labels of {noun}s were changed, because a C3D file cannot hold them")
-    if max_bytes < MAX_TEXT_BYTES or not any(descriptions):
-        descriptions = [""] * len(fitted)
-    return [
-        *text_lists("LABELS", fitted),
-        *text_lists("DESCRIPTIONS", [printable(text) for text in descriptions]),
-    ]
-
-
-def _point_texts(content: C3dContent) -> tuple[list[str], list[str]]:
-    """Return the labels and descriptions of the markers."""
-    if content.markers is None:
-        return [], []
-    labels = list(content.markers.series.labels)
-    described = content.parameters.markers.markers if content.parameters.markers else ()
-    return labels, _padded([marker.description for marker in described], len(labels))
-
-
-def _channel_texts(content: C3dContent) -> tuple[list[str], list[str], list[str]]:
-    """Return the labels, descriptions and units of the analog channels, the added ones at the end."""
-    labels: list[str] = []
-    descriptions: list[str] = []
-    units: list[str] = []
-    if content.analog is not None:
-        series = content.analog.series
-        analog = series.parameters_of(0).analog
-        labels += series.labels
-        units += series.units
-        descriptions += _padded(
-            [channel.description for channel in analog.channels] if analog else [], len(labels)
-        )
-    for plan in content.added_plates:
-        labels += plan.added_labels()
-        units += plan.added_units(content.unit)
-        descriptions += [plan.plate.label] * 6
-    return labels, descriptions, units
-
-
-def _padded(texts: list[str], count: int) -> list[str]:
-    return texts[:count] + [""] * (count - len(texts))
-
+from gateway.takes.export.measurements import Measurement, named_measurements, note_missing, utc_text
 
 _KEYS: Final = ("3d", "analog", "force")
 """The components that can be in a file; the first one that a source has gives the rate of the frames."""
@@ -224,14 +46,18 @@ def export_c3d(job: ExportJob) -> None:
 def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
     """Write one file."""
     shape = _shape(content, path)
+    size = max(
+        1, _BLOCK_VALUES // max(4 * shape.num_points + shape.num_channels * shape.samples_per_frame, 1)
+    )
+    blocks = [(start, min(start + size, shape.num_frames)) for start in range(0, shape.num_frames, size)]
     if content.markers is not None:
         job.progress(f"reading the residuals of {path.name}", 0, 0)
-        step = residual_step(content.points(start, stop) for start, stop in _blocks(shape))
+        step = residual_step(content.points(start, stop) for start, stop in blocks)
         shape = shape._replace(scale=step)
     file = job.files.create(path)
-    file.write(encode_head_that_fits(job, content, shape))
+    file.write(_head(job, content, shape))
     incomplete_samples = 0
-    for start, stop in _blocks(shape):
+    for start, stop in blocks:
         points = encode_points(content.points(start, stop), shape.scale).reshape(stop - start, -1)
         channels = content.channels(start, stop)
         incomplete_samples += int(np.isnan(channels).any(axis=1).sum())
@@ -240,19 +66,11 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
         job.progress(f"writing {path.name}", stop, content.num_frames)
     if content.num_frames <= MAX_WORD:  # ezc3d reads longer files to their end
         file.write(bytes(-file.tell() % BLOCK_BYTES))
-    missing = content.measurement.frames.num_missing(
-        content.first_row, content.first_row + content.num_frames
-    )
-    if missing:
-        job.note(
-            f"{path.name}: {missing} of {content.num_frames} frames are missing in the take; they are empty"
-        )
-    start_s = content.start_s
-    if start_s * shape.rate_hz >= 1:
-        begin = utc_text(content.measurement, start_s)
-        job.note(
-            f"{path.name}: time 0 is its first frame, {start_s:.3f} s after the take's beginning ({begin})"
-        )
+    note_missing(job, path, content.measurement, content.first_row, content.num_frames)
+    if content.start_s * shape.rate_hz >= 1:
+        begin = f"{content.start_s:.3f} s after the take's beginning"
+        utc = utc_text(content.measurement, content.start_s)
+        job.note(f"{path.name}: time 0 is its first frame, {begin} ({utc})")
     if incomplete_samples:
         job.note(f"{path.name}: {incomplete_samples} analog samples are missing in the take; they are NaN")
 
@@ -274,9 +92,150 @@ def _shape(content: C3dContent, path: Path) -> Shape:
     return Shape(content.num_points, content.num_channels, samples, content.num_frames, rate_hz, 1.0)
 
 
-def _blocks(shape: Shape) -> Iterator[tuple[int, int]]:
-    """Yield the first frame of each block, and the one after its last."""
-    values = 4 * shape.num_points + shape.num_channels * shape.samples_per_frame
-    size = max(1, _BLOCK_VALUES // max(values, 1))
-    for start in range(0, shape.num_frames, size):
-        yield start, min(start + size, shape.num_frames)
+_TEXT_SIZES: Final = (MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
+"""How long labels may be, in bytes; the parameters of a file have 130 kB at most."""
+
+
+def _head(job: ExportJob, content: C3dContent, shape: Shape) -> bytes:
+    """Return everything before the frames, with texts as long as there is room for. Raises TakeError."""
+    for max_bytes in _TEXT_SIZES:
+        head = encode_head(shape, _groups(job, content, shape, max_bytes))
+        if head is not None:
+            if max_bytes < MAX_TEXT_BYTES:
+                job.note(
+                    "a C3D file has no room for so many texts: descriptions were left out, "
+                    f"and labels have at most {max_bytes} bytes"
+                )
+            return head
+    raise TakeError("the labels do not fit into a C3D file; export to .csv instead")
+
+
+def _groups(job: ExportJob, content: C3dContent, shape: Shape, max_bytes: int) -> Groups:
+    """Return all groups; with descriptions only if texts can have their full size."""
+    details = content.measurement.source.details
+    groups = standard_groups(shape, content.unit)
+    labels: list[str] = []
+    descriptions: list[str] = []
+    if content.markers is not None:
+        labels += content.markers.series.labels
+        described = content.parameters.markers.markers if content.parameters.markers else ()
+        descriptions += _padded([marker.description for marker in described], len(labels))
+    groups["POINT"] |= _texts(job, labels, descriptions, max_bytes, "marker")
+    labels, descriptions, units = _channel_texts(content)
+    groups["ANALOG"] |= _texts(job, labels, descriptions, max_bytes, "channel")
+    groups["ANALOG"] |= lists("UNITS", [printable(unit) for unit in units])
+    groups["TRIAL"] |= {
+        "DATE_TIME": [utc_text(content.measurement, content.start_s)],
+        "TIME_OFFSET": content.start_s,
+    }
+    for text in (details.subject, details.session):
+        if encode_text(text) != text.encode():
+            job.note(f"{text!r} was cut: a C3D file has texts of at most {MAX_TEXT_BYTES} bytes")
+    if details.session:
+        groups["TRIAL"]["SESSION"] = [details.session]
+    if details.note.strip():  # in lines as long as a parameter can have in any script
+        groups["TRIAL"]["NOTE"] = textwrap.wrap(details.note, MAX_TEXT_BYTES // 4)
+    if details.subject:
+        groups["SUBJECTS"] = {"USED": 1, "USES_PREFIXES": 0, "NAMES": [printable(details.subject)]}
+    groups["FORCE_PLATFORM"] = plate_group(content.plates)
+    events = _event_group(job, content.measurement, content.first_row, content.num_frames)
+    if events:
+        groups["EVENT"] = events
+    groups["MANUFACTURER"] = {"SOFTWARE": ["rtc3d-gateway"], "VERSION_LABEL": [version_text()]}
+    return groups
+
+
+def _texts(job: ExportJob, labels: list[str], descriptions: list[str], max_bytes: int, noun: str) -> Group:
+    fitted = fitting_labels(labels, printable, max_bytes, noun)
+    changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
+    if changed and max_bytes == MAX_TEXT_BYTES:
+        job.note(f"{changed} labels of {noun}s were changed, because a C3D file cannot hold them")
+    if max_bytes < MAX_TEXT_BYTES or not any(descriptions):
+        descriptions = [""] * len(fitted)
+    return lists("LABELS", fitted) | lists("DESCRIPTIONS", [printable(text) for text in descriptions])
+
+
+def _channel_texts(content: C3dContent) -> tuple[list[str], list[str], list[str]]:
+    """Return the labels, descriptions and units of the analog channels, the added ones at the end."""
+    labels: list[str] = []
+    descriptions: list[str] = []
+    units: list[str] = []
+    if content.analog is not None:
+        series = content.analog.series
+        analog = series.parameters_of(0).analog
+        labels += series.labels
+        units += series.units
+        descriptions += _padded(
+            [channel.description for channel in analog.channels] if analog else [], len(labels)
+        )
+    for plan in content.added_plates:
+        labels += [f"{label}{plan.position + 1}" for label in ADDED_LABELS]
+        force = (plan.plate.channels[0].unit if plan.plate.channels else "") or "N"
+        units += [force] * 3 + [force + content.unit] * 3
+        descriptions += [plan.plate.label] * 6
+    return labels, descriptions, units
+
+
+def _padded(texts: list[str], count: int) -> list[str]:
+    return texts[:count] + [""] * (count - len(texts))
+
+
+_MINUTE_S: Final = 60.0
+_SIDES: Final = {"Left", "Right"}
+_MARGIN_S: Final = 1.0
+"""An event within this time before the first frame or after the last one belongs to the measurement."""
+
+
+def _event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> Group:
+    """Return the group EVENT with the events of these rows; {} if there are none.
+
+    The time of an event is its own, or that of its frame if it is far from that.
+    """
+    events = measurement.source.events
+    if events is None:
+        return {}
+    rate_hz = measurement.grid.rate_hz
+    own_us = events.items["timestamp"]
+    is_near = abs(own_us.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
+    times_us = np.where(is_near, own_us, events.timestamp_us)
+    seconds = measurement.seconds_of(times_us, events.capture_utime) - first_row / rate_hz
+    (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
+    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
+    if len(chosen) > MAX_LIST:
+        left_out = len(chosen) - MAX_LIST
+        job.note(f"{left_out} of {len(chosen)} events were left out: a C3D file has at most 255")
+        chosen = chosen[:MAX_LIST]
+    if not len(chosen):
+        return {}
+    subject = measurement.source.details.subject
+    texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
+    return {
+        "USED": len(chosen),
+        "CONTEXTS": [printable(_context_of(text)) for text in texts],
+        "LABELS": [printable(text.label) for text in texts],
+        "DESCRIPTIONS": [printable(text.description) for text in texts],
+        "SUBJECTS": [printable(_value_of(text, "subject") or subject) for text in texts],
+        "TIMES": np.stack(np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)),
+        "ICON_IDS": np.zeros(len(chosen), int),
+        "GENERIC_FLAGS": np.zeros(len(chosen), int),
+    }
+
+
+def _context_of(text: EventText) -> str:
+    """Return Left, Right or General, by a parameter of the event, or else by a word of its label.
+
+    A parameter called Context, as the simulator has it for events of C3D files, can say something else.
+    """
+    named = _value_of(text, "context")
+    if named:
+        return named
+    for words in ([value.strip() for _, value in text.values], text.label.split()):
+        sides = _SIDES & {word.capitalize() for word in words}
+        if len(sides) == 1:
+            return sides.pop()
+    return "General"
+
+
+def _value_of(text: EventText, name: str) -> str:
+    """Return the value of a parameter of the event; "" if it has none of this name."""
+    return next((value for each, value in text.values if each.strip().casefold() == name), "")

@@ -15,8 +15,6 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gateway.errors import TakeError
-
 BLOCK_BYTES: Final = 512
 MAX_LIST: Final = 255
 """The highest number of values in one dimension of a parameter; a longer list continues in others."""
@@ -33,20 +31,14 @@ _FOUR_CHARACTER_EVENTS: Final = 0x3039
 _FOUR_CHARACTER_EVENTS_OFFSET: Final = 149 * 2
 
 Texts: TypeAlias = Sequence[str]
-Numbers: TypeAlias = npt.NDArray[Any]
+Values: TypeAlias = Texts | npt.NDArray[Any] | int | float
+"""The values of a parameter: texts, or numbers: 16 bits if they are integers, and 32 bits if they are floats.
 
+An array has the dimensions in the order of the C3D user guide, the first one changing fastest.
+"""
 
-class Parameter(NamedTuple):
-    """One parameter of a group: a list of texts, or an array of integers (16 bits) or of floats (32 bits).
-
-    An array has the dimensions in the order of the C3D user guide, the first one changing fastest.
-    """
-
-    name: str
-    values: Texts | Numbers
-
-
-Groups: TypeAlias = dict[str, list[Parameter]]
+Group: TypeAlias = dict[str, Values]
+Groups: TypeAlias = dict[str, Group]
 
 
 class Shape(NamedTuple):
@@ -74,66 +66,49 @@ def rate_in_float32(rate_hz: float, samples_per_frame: int) -> float:
     return float(np.ldexp(np.round(mantissa * digits) / digits, exponent))
 
 
-def text_lists(name: str, texts: Texts) -> list[Parameter]:
-    """Return a list of texts as NAME, and NAME2, NAME3, … if they are more than 255."""
-    return [
-        Parameter(_numbered(name, part), texts[start : start + MAX_LIST]) for part, start in _parts(texts)
-    ]
+def lists(name: str, values: Texts | npt.NDArray[Any]) -> Group:
+    """Return a list of texts or numbers as NAME, and NAME2, NAME3, … if they are more than 255."""
+    parts = enumerate(range(0, max(len(values), 1), MAX_LIST), start=1)
+    return {name if part == 1 else f"{name}{part}": values[at : at + MAX_LIST] for part, at in parts}
 
 
-def number_lists(name: str, numbers: Numbers) -> list[Parameter]:
-    """Return a list of numbers as NAME, and NAME2, NAME3, … if they are more than 255."""
-    return [
-        Parameter(_numbered(name, part), numbers[start : start + MAX_LIST]) for part, start in _parts(numbers)
-    ]
-
-
-def standard_groups(shape: Shape, point_units: Texts) -> Groups:
+def standard_groups(shape: Shape, point_unit: str) -> Groups:
     """Return POINT, ANALOG and TRIAL with what the shape says; labels and the like are still missing."""
-    analog_rate_hz = shape.rate_hz * shape.samples_per_frame if shape.num_channels else 0.0
-    groups: Groups = {
-        "POINT": [
-            Parameter("USED", _integer(shape.num_points)),
-            Parameter("SCALE", _float(-shape.scale)),
-            Parameter("RATE", _float(shape.rate_hz)),
-            Parameter("DATA_START", _integer(0)),
-            Parameter("FRAMES", _integer(min(shape.num_frames, MAX_WORD))),
-            Parameter("UNITS", point_units),
-        ],
-        "ANALOG": [
-            Parameter("USED", _integer(shape.num_channels)),
-            Parameter("GEN_SCALE", _float(1.0)),
-            Parameter("RATE", _float(analog_rate_hz)),
-            Parameter("FORMAT", ["SIGNED"]),
-            Parameter("BITS", _integer(16)),
-            *number_lists("SCALE", np.ones(shape.num_channels, np.float32)),
-            *number_lists("OFFSET", np.zeros(shape.num_channels, np.int16)),
-        ],
-        "TRIAL": [
-            Parameter("ACTUAL_START_FIELD", _two_words(1)),
-            Parameter("ACTUAL_END_FIELD", _two_words(shape.num_frames)),
-            Parameter("CAMERA_RATE", _float(shape.rate_hz)),
-        ],
+    return {
+        "POINT": {
+            "USED": shape.num_points,
+            "SCALE": -shape.scale,
+            "RATE": shape.rate_hz,
+            "DATA_START": 0,
+            "FRAMES": min(shape.num_frames, MAX_WORD),
+            "UNITS": [point_unit],
+            **({"LONG_FRAMES": float(shape.num_frames)} if shape.num_frames > MAX_WORD else {}),
+        },
+        "ANALOG": {
+            "USED": shape.num_channels,
+            "GEN_SCALE": 1.0,
+            "RATE": shape.rate_hz * shape.samples_per_frame if shape.num_channels else 0.0,
+            "FORMAT": ["SIGNED"],
+            "BITS": 16,
+            **lists("SCALE", np.ones(shape.num_channels)),
+            **lists("OFFSET", np.zeros(shape.num_channels, int)),
+        },
+        "TRIAL": {
+            "ACTUAL_START_FIELD": np.array([1, 0]),
+            "ACTUAL_END_FIELD": np.array([shape.num_frames & MAX_WORD, shape.num_frames >> 16]),
+            "CAMERA_RATE": shape.rate_hz,
+        },
     }
-    if shape.num_frames > MAX_WORD:
-        groups["POINT"].append(Parameter("LONG_FRAMES", _float(shape.num_frames)))
-    return groups
 
 
-def encode_head(shape: Shape, groups: Groups) -> bytes:
-    """Return everything before the frames. Raises TakeError if the parameters are too large for the
-    format."""
-    num_blocks = -(-len(_encode_groups(groups, 0)) // BLOCK_BYTES)
+def encode_head(shape: Shape, groups: Groups) -> bytes | None:
+    """Return everything before the frames, with POINT:DATA_START; None if the parameters are too large."""
+    num_blocks = -(-len(_encode_groups(groups)) // BLOCK_BYTES)
     if num_blocks > _MAX_PARAMETER_BLOCKS:
-        raise TakeError("the labels do not fit into a C3D file; export to .csv instead")
-    data_block = 2 + num_blocks
-    parameters = _encode_groups(groups, data_block).ljust(num_blocks * BLOCK_BYTES, b"\0")
-    return _encode_header(shape, data_block) + parameters
-
-
-def _encode_header(shape: Shape, data_block: int) -> bytes:
-    header = bytearray(BLOCK_BYTES)
+        return None
+    data_block = groups["POINT"]["DATA_START"] = 2 + num_blocks
     samples_per_frame = shape.samples_per_frame if shape.num_channels else 0
+    header = bytearray(BLOCK_BYTES)
     _HEADER.pack_into(
         header,
         0,
@@ -150,16 +125,14 @@ def _encode_header(shape: Shape, data_block: int) -> bytes:
         shape.rate_hz,
     )
     struct.pack_into("<H", header, _FOUR_CHARACTER_EVENTS_OFFSET, _FOUR_CHARACTER_EVENTS)
-    return bytes(header)
+    return bytes(header) + _encode_groups(groups).ljust(num_blocks * BLOCK_BYTES, b"\0")
 
 
-def _encode_groups(groups: Groups, data_block: int) -> bytes:
+def _encode_groups(groups: Groups) -> bytes:
     records = []
     for number, (name, parameters) in enumerate(groups.items(), start=1):
         records.append(_record(name, -number, b""))
-        for parameter in parameters:
-            values = _integer(data_block) if parameter.name == "DATA_START" else parameter.values
-            records.append(_record(parameter.name, number, _encode_values(values)))
+        records += [_record(each, number, _encode_values(values)) for each, values in parameters.items()]
     body = b"".join(records) + b"\0\0"
     num_blocks = -(-(4 + len(body)) // BLOCK_BYTES)
     return struct.pack("<BBBB", 1, 0x50, min(num_blocks, 255), _INTEL) + body
@@ -167,51 +140,22 @@ def _encode_groups(groups: Groups, data_block: int) -> bytes:
 
 def _record(name: str, number: int, content: bytes) -> bytes:
     """Return a group or a parameter, with an empty description; the offset counts from itself."""
-    encoded = name.encode("ascii")
-    return (
-        struct.pack("<bb", len(encoded), number)
-        + encoded
-        + struct.pack("<H", 3 + len(content))
-        + content
-        + b"\0"
-    )
+    head = struct.pack("<bb", len(name), number) + name.encode("ascii")
+    return head + struct.pack("<H", 3 + len(content)) + content + b"\0"
 
 
-def _encode_values(values: Texts | Numbers) -> bytes:
-    if isinstance(values, np.ndarray):
-        is_float = values.dtype.kind == "f"
-        data = values.astype("<f4" if is_float else "<i2").tobytes(order="F")
-        sizes = values.shape
-        kind = 4 if is_float else 2
-    else:
+def _encode_values(values: Values) -> bytes:
+    if isinstance(values, Sequence):
         encoded = [encode_text(text) for text in values]
         width = max(map(len, encoded), default=0)
         data = b"".join(text.ljust(width) for text in encoded)
-        sizes = (width, len(encoded))
-        kind = -1
-    return struct.pack("<bB", kind, len(sizes)) + bytes(sizes) + data
+        return struct.pack("<bBBB", -1, 2, width, len(encoded)) + data
+    numbers = np.asarray(values)
+    kind, dtype = (4, "<f4") if numbers.dtype.kind == "f" else (2, "<i2")
+    sizes = struct.pack("<bB", kind, numbers.ndim) + bytes(numbers.shape)
+    return sizes + numbers.astype(dtype).tobytes(order="F")
 
 
-def encode_text(text: str, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
-    """Return a text as UTF-8 of at most ``max_bytes``, cut between two characters."""
-    return text.encode(errors="replace")[:max_bytes].decode(errors="ignore").encode()
-
-
-def _parts(values: Texts | Numbers) -> list[tuple[int, int]]:
-    return list(enumerate(range(0, max(len(values), 1), MAX_LIST), start=1))
-
-
-def _numbered(name: str, part: int) -> str:
-    return name if part == 1 else f"{name}{part}"
-
-
-def _integer(value: int) -> Numbers:
-    return np.array(value, np.uint16)
-
-
-def _float(value: float) -> Numbers:
-    return np.array(value, np.float32)
-
-
-def _two_words(value: int) -> Numbers:
-    return np.array([value & MAX_WORD, value >> 16], np.uint16)
+def encode_text(text: str) -> bytes:
+    """Return a text as UTF-8 of at most MAX_TEXT_BYTES, cut between two characters."""
+    return text.encode(errors="replace")[:MAX_TEXT_BYTES].decode(errors="ignore").encode()

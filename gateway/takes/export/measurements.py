@@ -54,7 +54,7 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     order = order[np.concatenate([[True], np.diff(run.sequence[order]) > 0])]
     sequence = run.sequence[order]
     stamps = run.timestamp_us[order]
-    has_time_stamps = by_time_stamps and _progresses(stamps)
+    has_time_stamps = by_time_stamps and (len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5))
     times = stamps if has_time_stamps else run.capture_utime[order]
     period_us = regular_step(np.diff(times)[np.diff(sequence) == 1])
     rate_hz = _rate_hz(period_us, run.rate_hz)
@@ -69,10 +69,6 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
         Grid(rate_hz, rows[start:stop] - rows[start], order[start:stop], times[start:stop], has_time_stamps)
         for start, stop in zip([0, *cuts.tolist()], [*cuts.tolist(), len(order)], strict=True)
     ]
-
-
-def _progresses(stamps: Array) -> bool:
-    return len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5)
 
 
 def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
@@ -233,8 +229,11 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     called. A measurement begins where the server's time stamps start again or pause for more than 10 s, with
     each session, and where the labels change.
     """
-    by_source = {source.name: _measurements(source, keys) for source in job.open_take().sources.values()}
-    by_source = {name: found for name, found in by_source.items() if found}
+    by_source = {
+        source.name: found
+        for source in job.open_take().sources.values()
+        if (found := _measurements(source, keys))
+    }
     total = sum(map(len, by_source.values()))
     if not total:
         raise nothing_to_export(job, what)
@@ -247,19 +246,23 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     named = []
     for name, found in by_source.items():
         for number, measurement in enumerate(found, start=1):
-            source_part = name if len(by_source) > 1 else ""
-            number_part = str(number) if len(found) > 1 else ""
-            path = job.file_name(source_part, number_part) if total > 1 else job.out
-            named.append((measurement, path))
+            parts = (name if len(by_source) > 1 else "", str(number) if len(found) > 1 else "")
+            named.append((measurement, job.file_name(*parts)))
     return named
 
 
 def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement]:
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
     runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
-    base_key = next((key for key in keys if key in runs), None)
-    base_runs = [] if base_key is None else runs[base_key]
+    base_runs = next((runs[key] for key in keys if key in runs), [])
     return [Measurement(source, runs, run, grid) for run in base_runs for grid in place(run)]
+
+
+def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
+    """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
+    missing = measurement.frames.num_missing(first, first + count)
+    if missing:
+        job.note(f"{path.name}: {missing} of {count} frames are missing in the take; they are empty")
 
 
 def _nearest(times: Array, wanted: Array) -> Array:
