@@ -6,7 +6,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gateway.descriptions.force_plates import (
-    CALIBRATED,
     FORCES_AND_MOMENTS,
     PlateGeometry,
     calibration_of,
@@ -19,10 +18,12 @@ from gateway.descriptions.force_plates import (
     possible_types,
 )
 from gateway.rtc3d.parameters import Parameters, Plate
-from gateway.takes.export.c3d_format import MAX_LIST, Group
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import Measurement, Part, Placed, place, seconds_of_row
 from gateway.takes.files.component_rows import Array
+
+MAX_LIST: Final = 255
+"""The highest number of values in one dimension of a parameter; a longer list continues in others."""
 
 _MAX_STEPS: Final = 127
 _BOTH_BYTES: Final = 257
@@ -167,29 +168,6 @@ def _with_own_channels(
     return next((own for own in plans if not known.any() or own.explains(values, loads[known])), None)
 
 
-def plate_group(plans: list[PlatePlan]) -> Group:
-    """Return the group FORCE_PLATFORM."""
-    num_rows = max((len(plan.channels) for plan in plans), default=0)
-    channels = [np.array(plan.channels + (-1,) * (num_rows - len(plan.channels))) + 1 for plan in plans]
-    units = {plan.plate.channels[0].unit for plan in plans if plan.plate.channels} - {"", "N"}
-    matrices = [calibration_of(plan.plate) if plan.type == CALIBRATED else np.zeros((6, 6)) for plan in plans]
-    return {
-        "USED": len(plans),
-        "TYPE": np.array([plan.type for plan in plans], int),
-        "ZERO": np.zeros(2, int),
-        "CORNERS": _stack([plan.geometry.corners.T for plan in plans]),
-        "ORIGIN": _stack([plan.geometry.origin for plan in plans]),
-        "CHANNEL": _stack(channels, int),
-        "CAL_MATRIX": _stack(matrices),
-        **({"UNITS": [units.pop()]} if len(units) == 1 else {}),
-    }
-
-
-def _stack(arrays: list[Array], dtype: type = float) -> Array:
-    """Return arrays along a new last dimension; an empty list if there are none."""
-    return np.stack(arrays, axis=-1) if arrays else np.zeros(0, dtype)
-
-
 _MAX_TRIMMED_S: Final = 1.0
 """Frames at either end that lack analog samples are left out, up to this duration."""
 
@@ -214,6 +192,17 @@ class C3dContent(NamedTuple):
     def start_s(self) -> float:
         """When the first frame was captured, in seconds since the beginning of the take."""
         return seconds_of_row(self.measurement, self.first_row)
+
+    @property
+    def rate_hz(self) -> float:
+        """The nearest rate of frames whose product with ``samples_per_frame`` is exact in 32 bits.
+
+        Readers divide ANALOG:RATE by POINT:RATE and need exactly ``samples_per_frame``.
+        """
+        bits = max(self.samples_per_frame - 1, 0).bit_length()
+        mantissa, exponent = np.frexp(np.float32(self.measurement.grid.rate_hz))
+        digits = 2.0 ** (24 - bits)
+        return float(np.ldexp(np.round(mantissa * digits) / digits, exponent))
 
     @property
     def num_points(self) -> int:

@@ -132,14 +132,6 @@ class Placed:
             block[part.rows[first:last] - start] = part.series.values[part.frames[first:last]]
         return block
 
-    def num_missing(self, start: int, stop: int) -> int:
-        """Return how many of these rows have no frame."""
-        found = np.zeros(stop - start, bool)
-        for part in self.parts:
-            first, last = np.searchsorted(part.rows, [start, stop])
-            found[part.rows[first:last] - start] = True
-        return int((~found).sum())
-
 
 class Measurement(NamedTuple):
     """One measurement of a source. ``grid`` has the places of the frames of ``base``.
@@ -260,7 +252,8 @@ def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement
 
 def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
     """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
-    missing = measurement.frames.num_missing(first, first + count)
+    found = int(np.diff(np.searchsorted(measurement.grid.rows, [first, first + count])).sum())
+    missing = count - found
     if missing:
         job.note(f"{path.name}: {missing} of {count} frames are missing in the take; they are empty")
 

@@ -11,19 +11,23 @@ from hypothesis import strategies as st
 from gateway.errors import ConfigError, FrameError
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
-from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault, PendingWrite, Reply
-from gateway.simulator.faults.connection_faults import (
+from gateway.simulator.fault_pipeline import HeldReplies
+from gateway.simulator.faults import (
+    ActiveFault,
     Cut,
     Delay,
+    Fault,
     Jitter,
+    LastingConnectionFault,
     Merge,
     Oversize,
+    PendingWrite,
+    Reply,
     Restart,
     Split,
     Undersize,
 )
-from gateway.simulator.faults.control import KINDS, describe_kinds, parse_fault
-from gateway.simulator.faults.packet_faults import (
+from gateway.simulator.packet_faults import (
     FrameFault,
     FrozenTimestamps,
     JumpingTimestamps,
@@ -35,7 +39,7 @@ from gateway.simulator.faults.packet_faults import (
     WrongByteOrder,
     WrongCounts,
 )
-from gateway.simulator.faults.pipeline import HeldReplies
+from gateway.simulator.simulator import KINDS, describe_kinds, parse_fault
 from gateway.simulator.synthetic import SceneSettings
 from tests.unit.rtc3d_server.wire import (
     COMMAND,

@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.connection_faults import (
+from gateway.simulator.fault_pipeline import MAX_WAITING_BYTES
+from gateway.simulator.faults import (
     Delay,
+    Fault,
     Garbage,
     HalfOpen,
     Jitter,
@@ -19,7 +20,7 @@ from gateway.simulator.faults.connection_faults import (
     Split,
     Undersize,
 )
-from gateway.simulator.faults.packet_faults import (
+from gateway.simulator.packet_faults import (
     ConstantFrameNumbers,
     DoubledAcknowledgements,
     FramesFirst,
@@ -30,7 +31,6 @@ from gateway.simulator.faults.packet_faults import (
     ReplyText,
     ShortEvents,
 )
-from gateway.simulator.faults.pipeline import MAX_WAITING_BYTES
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, NO_DATA, XML, components_in, packet
 from tests.unit.simulator.faults.faulty_client import VERSION, FaultyClient
 

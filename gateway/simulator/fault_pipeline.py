@@ -15,7 +15,7 @@ from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d_server.client_session import error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.server import call_after_us
-from gateway.simulator.faults.base import (
+from gateway.simulator.faults import (
     ActiveFault,
     LastingConnectionFault,
     PendingWrite,

@@ -24,7 +24,7 @@ from gateway.rtc3d.components import (
 )
 from gateway.rtc3d.frames import detect_byte_order, encode_frame, split_frame
 from gateway.rtc3d.packets import PACKET_HEADER, Packet, PacketType, decode_text, encode_packet
-from gateway.simulator.faults.base import (
+from gateway.simulator.faults import (
     ActiveFault,
     Count,
     LastingConnectionFault,
