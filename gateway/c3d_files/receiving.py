@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 from gateway.c3d_files.spool import Spool, StoredFile, UnfinishedFile
 from gateway.errors import SpoolError
@@ -31,16 +31,6 @@ _DATA_BLOCK_OFFSET: Final = 16
 """Where the header has the number of the block where the frames begin."""
 _DEC, _BIG_ENDIAN = 85, 86  # of the types of processors; the usual one is 84, little-endian
 _FORMATS: Final = {1: "B", 2: "H", 4: "f"}
-
-
-class _Record(NamedTuple):
-    """A parameter: the number of its group, its name, and where its values are."""
-
-    group: int
-    name: str
-    element_bytes: int
-    values_offset: int
-    num_bytes: int
 
 
 def problem_of_c3d(head: bytes, file_bytes: int) -> str:
@@ -70,15 +60,12 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     data_start = max(data_block - 1, 0) * _BLOCK_BYTES
     stated_end = max(data_start, start + head[start + 2] * _BLOCK_BYTES)
     end = stated_end if start < stated_end <= file_bytes else file_bytes
-    groups, records = _records(head[:end], start + 4, order)
     numbers: dict[str, float] = {}
-    for record in records:
-        name = f"{groups.get(record.group, record.group)}:{record.name}"
-        if record.values_offset + record.num_bytes > end:
-            return f"its parameter {safe_text(name)} would have {record.num_bytes} bytes, more than it has"
-        if record.num_bytes == record.element_bytes in _FORMATS and record.values_offset + 4 <= len(head):
-            value_format = order + _FORMATS[record.element_bytes]
-            (numbers[name],) = struct.unpack_from(value_format, head, record.values_offset)
+    for name, element_bytes, offset, num_bytes in _parameters(head[:end], start + 4, order):
+        if offset + num_bytes > end:
+            return f"its parameter {safe_text(name)} would have {num_bytes} bytes, more than it has"
+        if num_bytes == element_bytes in _FORMATS and offset + 4 <= len(head):
+            (numbers[name],) = struct.unpack_from(order + _FORMATS[element_bytes], head, offset)
     rates_hz = numbers.get("ANALOG:RATE", 0.0), numbers.get("POINT:RATE", 0.0)
     ratio = rates_hz[0] / rates_hz[1] if processor != _DEC and rates_hz[1] > 0 else 1.0
     samples = ratio if math.isfinite(ratio) else 1.0
@@ -89,10 +76,13 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     return ""
 
 
-def _records(head: bytes, position: int, order: str) -> tuple[dict[int, str], list[_Record]]:
-    """Return the names of the groups by their numbers, and all parameters, as far as they can be read."""
+def _parameters(head: bytes, position: int, order: str) -> list[tuple[str, int, int, int]]:
+    """Return the name of each parameter, the size of an element, and where its values are and their size.
+
+    The name is GROUP:NAME. What cannot be read ends the list.
+    """
     groups: dict[int, str] = {}
-    records = []
+    found = []
     while position + 2 <= len(head):
         length, group = struct.unpack_from("bb", head, position)
         name = head[position + 2 : position + 2 + abs(length)].decode("latin-1").strip().upper()
@@ -105,13 +95,13 @@ def _records(head: bytes, position: int, order: str) -> tuple[dict[int, str], li
         else:
             element_bytes = abs(struct.unpack_from("b", head, at + 2)[0])
             sizes = head[at + 4 : at + 4 + head[at + 3]]
-            values_offset = at + 4 + len(sizes)
             num_bytes = element_bytes * math.prod(sizes)
-            records.append(_Record(group, name, element_bytes, values_offset, num_bytes))
+            found.append((group, name, element_bytes, at + 4 + len(sizes), num_bytes))
         if offset == 0:
             break
         position = at + offset
-    return groups, records
+    # A group may be defined after its parameters.
+    return [(f"{groups.get(group, group)}:{name}", *rest) for group, name, *rest in found]
 
 
 _MIB: Final = 1024 * 1024

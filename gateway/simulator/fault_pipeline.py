@@ -15,13 +15,7 @@ from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d_server.client_session import error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.server import call_after_us
-from gateway.simulator.faults import (
-    ActiveFault,
-    LastingConnectionFault,
-    PendingWrite,
-    Reply,
-    packet_type_of,
-)
+from gateway.simulator.faults import ActiveFault, LastingConnectionFault, PendingWrite, Reply, packet_type_of
 
 MAX_WAITING_BYTES: Final = 4 * 1024 * 1024
 """How many bytes may wait to be sent on one connection; beyond this, packets are dropped."""
@@ -54,11 +48,7 @@ class WriteQueue:
             return
         self._waiting.extend(writes)
         self.waiting_bytes += size
-        self._write_due(time.monotonic())
-
-    def flush(self) -> None:
-        """Write everything at once."""
-        self._write_due(math.inf)
+        self.write_due(time.monotonic())
 
     def clear(self) -> None:
         """Discard everything."""
@@ -66,7 +56,8 @@ class WriteQueue:
         self._waiting.clear()
         self.waiting_bytes = 0
 
-    def _write_due(self, now_s: float) -> None:
+    def write_due(self, now_s: float) -> None:
+        """Write what is due at this time; at math.inf, that is everything."""
         while self._waiting and self._waiting[0].due_s <= now_s:
             data = self._waiting.popleft().data
             while self._waiting and self._waiting[0].joins_previous and self._waiting[0].due_s <= now_s:
@@ -76,7 +67,7 @@ class WriteQueue:
         self._cancel_timer()
         if self._waiting:
             self._timer = call_after_us(
-                1_000_000 * (self._waiting[0].due_s - now_s), lambda: self._write_due(time.monotonic())
+                1_000_000 * (self._waiting[0].due_s - now_s), lambda: self.write_due(time.monotonic())
             )
 
     def _cancel_timer(self) -> None:
@@ -232,7 +223,7 @@ class FaultPipeline(ConnectionFilter):
     def flush(self) -> None:
         """Send at once all bytes that faults hold back, in order."""
         self._held_replies.flush()
-        self._writes.flush()
+        self._writes.write_due(math.inf)
 
     def connection_lost(self) -> None:
         """Discard all bytes that faults hold back, in both directions."""

@@ -136,26 +136,16 @@ def _events_before(time_us: int) -> int:
     return 2 * period + (rest_us > _PRESSED_US) + (rest_us > _RELEASED_US)
 
 
+_STATES: Final = (
+    ExpectedValue("1", "1", "ON", "Button was pressed"),
+    ExpectedValue("2", "0", "OFF", "Button was released"),
+)
+_BUTTON_PARAMETERS: Final = (
+    EventParameter("1", "int", "Button id number"),
+    EventParameter("2", "int", "ON/OFF state", _STATES),
+)
 _EVENTS: Final = ParametersEvents(
-    (
-        EventDefinition(
-            id=f"0x{BUTTON_EVENT:x}",
-            label="Button",
-            description="Button action",
-            parameters=(
-                EventParameter("1", "int", "Button id number"),
-                EventParameter(
-                    "2",
-                    "int",
-                    "ON/OFF state",
-                    (
-                        ExpectedValue("1", "1", "ON", "Button was pressed"),
-                        ExpectedValue("2", "0", "OFF", "Button was released"),
-                    ),
-                ),
-            ),
-        ),
-    )
+    (EventDefinition(f"0x{BUTTON_EVENT:x}", "Button", "Button action", _BUTTON_PARAMETERS),)
 )
 
 

@@ -146,10 +146,7 @@ class RecordedFrames:
     """
 
     def __init__(
-        self,
-        requested: Sequence[ComponentType],
-        event_bytes: int,
-        rates_hz: Mapping[ComponentType, float],
+        self, requested: Sequence[ComponentType], event_bytes: int, rates_hz: Mapping[ComponentType, float]
     ) -> None:
         chosen = [component for component in WIRE_ORDER if not requested or component in requested]
         self.has_events = ComponentType.EVENT in chosen

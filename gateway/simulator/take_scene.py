@@ -67,12 +67,7 @@ class TakeScene:
     """
 
     def __init__(
-        self,
-        path: Path,
-        source: str | None = None,
-        *,
-        from_s: float | None = None,
-        to_s: float | None = None,
+        self, path: Path, source: str | None = None, *, from_s: float | None = None, to_s: float | None = None
     ) -> None:
         """Read the beginning of the take. Raises TakeError if it cannot be played."""
         self._reader = TakeReader(path)

@@ -167,10 +167,7 @@ def _trc_head(job: ExportJob, measurement: Measurement, name: str) -> str:
     """Return the five lines before the frames, and an empty one."""
     markers, grid = measurement.base, measurement.grid
     labels = fitting_labels(
-        markers.labels,
-        lambda label: _NOT_IN_LABELS.sub("_", label.strip()),
-        _MAX_LABEL_BYTES,
-        "marker",
+        markers.labels, lambda label: _NOT_IN_LABELS.sub("_", label.strip()), _MAX_LABEL_BYTES, "marker"
     )
     changed = sum(old != new for old, new in zip(markers.labels, labels, strict=True))
     if changed:
