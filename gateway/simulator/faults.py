@@ -59,11 +59,6 @@ class Fault(Section):
         super().__init_subclass__(**kwargs)
         cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
-    @property
-    def lasts_s(self) -> float | None:
-        """How long the fault lasts: 0 means a moment, None means until it is ended."""
-        return 0.0
-
     def __str__(self) -> str:
         return ",".join([self.kind, *_assignments(self.model_dump(exclude_unset=True))])
 
@@ -151,11 +146,6 @@ class LastingFault(Fault):
         if self.every_s is not None and self.for_s is None:
             raise validation_error("found every_s without for_s; expected both", "every_s")
         return self
-
-    @property
-    def lasts_s(self) -> float | None:
-        """See Fault."""
-        return self.for_s
 
 
 class ConnectionFault(Fault):
@@ -399,11 +389,6 @@ class Restart(Fault):
 
     scene: SceneSettings = SceneSettings()
     """The changes to the scenario's scene; by default, none."""
-
-    @property
-    def lasts_s(self) -> float | None:
-        """See Fault."""
-        return self.away_s
 
 
 SERVER_FAULTS: Final = (NoMeasurement, ChangeScene, Rename, Restart)

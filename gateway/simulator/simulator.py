@@ -29,6 +29,7 @@ from gateway.simulator.faults import (
     Cut,
     Fault,
     LastingConnectionFault,
+    LastingFault,
     MomentaryFault,
     NoMeasurement,
     Rename,
@@ -180,9 +181,16 @@ class Faults:
         active.undo = self._apply(fault, active.rng)
         if not isinstance(fault, LastingConnectionFault):
             active.num_happened += 1
-        if fault.lasts_s:
-            active.end_timer = asyncio.get_running_loop().call_later(fault.lasts_s, self.end, active)
-        elif fault.lasts_s is not None:
+        match fault:
+            case LastingFault():
+                lasts_s = fault.for_s
+            case Restart():
+                lasts_s = fault.away_s
+            case _:
+                lasts_s = 0.0
+        if lasts_s:
+            active.end_timer = asyncio.get_running_loop().call_later(lasts_s, self.end, active)
+        elif lasts_s is not None:
             self.end(active)
 
     def _apply(self, fault: Fault, rng: np.random.Generator) -> Callable[[], None] | None:

@@ -149,10 +149,14 @@ class Measurement(NamedTuple):
         """The frames of ``base`` in their rows."""
         return Placed([Part(self.base, self.grid.rows, self.grid.frames)])
 
+    @property
+    def captures(self) -> Array:
+        """The times of capture of the frames of ``base``."""
+        return self.base.capture_utime[self.grid.frames]
+
     def runs_of(self, key: str) -> list[Series]:
         """Return the runs of a component that were captured at the time of this measurement."""
-        captures = self.base.capture_utime[self.grid.frames]
-        first, last = captures.min() - _MARGIN_US, captures.max() + _MARGIN_US
+        first, last = self.captures.min() - _MARGIN_US, self.captures.max() + _MARGIN_US
         found = self.runs.get(key, [])
         return [run for run in found if run.capture_utime.max() >= first and run.capture_utime.min() <= last]
 
@@ -175,7 +179,7 @@ class Measurement(NamedTuple):
     def seconds_of(self, times_us: Array, capture_utime: Array) -> Array:
         """Return times of the server in seconds from the first row; NaN if they are of another
         measurement."""
-        base_times, base_captures = self._times()
+        base_times, base_captures = self.grid.times_us, self.captures
         times = times_us if self.grid.has_time_stamps else capture_utime
         nearest = _nearest(base_times, times)
         offset_us = (capture_utime - times) - (base_captures - base_times)[nearest]
@@ -185,7 +189,7 @@ class Measurement(NamedTuple):
 
     def _row_of(self, run: Series, grid: Grid, rows_per_row: int) -> int | None:
         """Return the row of a run's first frame; None if it is not of this measurement."""
-        base_times, base_captures = self._times()
+        base_times, base_captures = self.grid.times_us, self.captures
         captures = run.capture_utime[grid.frames]
         if grid.has_time_stamps and self.grid.has_time_stamps:
             times = grid.times_us
@@ -208,10 +212,6 @@ class Measurement(NamedTuple):
         period_us = _SECOND_US / (self.grid.rate_hz * rows_per_row)
         distance = round(float(times[anchor] - base_times[near]) / period_us)
         return int(self.grid.rows[near]) * rows_per_row + distance - int(grid.rows[anchor])
-
-    def _times(self) -> tuple[Array, Array]:
-        """Return the times of the base's frames on the server's clock, and on the gateway's."""
-        return self.grid.times_us, self.base.capture_utime[self.grid.frames]
 
 
 def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list[tuple[Measurement, Path]]:
