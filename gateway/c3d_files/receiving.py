@@ -124,8 +124,9 @@ class IncomingFile:
     ) -> None:
         self.directory = spool.directory
         """Where the file will be."""
+        self.name = f"a C3D file of {file_bytes} bytes from {source}"
+        """What the file is called in messages."""
         self._source = source
-        self._name = f"a C3D file of {file_bytes} bytes from {source}"
         self._spool = spool
         self._thread = thread
         self._on_end = on_end
@@ -142,9 +143,11 @@ class IncomingFile:
             return
         if not self._spool.memory.reserve(self._source, piece):
             held_mib = self._spool.memory.held_bytes // _MIB
-            self.lose(
-                f"is dropped: {held_mib} MiB of C3D files are waiting to be written; "
-                "is the disk slow, or the server faulty?"
+            self.end(
+                SpoolError(
+                    f"{self.name} is dropped: {held_mib} MiB of C3D files are waiting to be written; "
+                    "is the disk slow, or the server faulty?"
+                )
             )
             return
         self._num_bytes += len(piece)
@@ -157,13 +160,9 @@ class IncomingFile:
 
     def interrupt(self, reason: str) -> None:
         """Give up the file, because no further piece of it will come."""
-        self.lose(f"broke off after {self._num_bytes} bytes: {reason}")
+        self.end(SpoolError(f"{self.name} broke off after {self._num_bytes} bytes: {reason}"))
 
-    def lose(self, how: str) -> None:
-        """Give up the file. ``how`` continues a sentence that begins with its size and source."""
-        self._end(SpoolError(f"{self._name} {how}"))
-
-    def _end(self, result: StoredFile | SpoolError) -> None:
+    def end(self, result: StoredFile | SpoolError) -> None:
         """Report the end of the file, once. If it is lost, free its memory and have it deleted."""
         if self._is_ended:
             return
@@ -210,12 +209,16 @@ class IncomingFile:
     def _fail(self, error: OSError) -> None:
         self._has_failed = True
         self._discard()
-        text = f"{self._name} cannot be stored in {self.directory}: {error.strerror}"
-        self._report(SpoolError(f"{text}; check spool.directory and the space on it"))
+        self._report(
+            SpoolError(
+                f"{self.name} cannot be stored in {self.directory}: {error.strerror}; "
+                "check spool.directory and the space on it"
+            )
+        )
 
     def _report(self, result: StoredFile | SpoolError) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: the gateway has stopped
-            self._loop.call_soon_threadsafe(partial(self._end, result))
+            self._loop.call_soon_threadsafe(partial(self.end, result))
 
 
 _MAX_UNSTORED_FILES: Final = 4
@@ -284,9 +287,11 @@ class SourceFiles:
         self._is_disk_silent = self._thread.call_age_s > _MAX_DISK_S
         if self._is_disk_silent:
             for file in [*self._unstored]:
-                file.lose(
-                    f"is dropped: the disk of {file.directory} does not respond; "
-                    "check it, and whether it is mounted"
+                file.end(
+                    SpoolError(
+                        f"{file.name} is dropped: the disk of {file.directory} does not respond; "
+                        "check it, and whether it is mounted"
+                    )
                 )
 
     async def finish(self) -> None:

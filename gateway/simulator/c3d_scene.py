@@ -124,8 +124,12 @@ def _read_in_process(path: Path, file_bytes: int) -> tuple[C3dRecording, list[st
     memory_bytes = _MEMORY_BYTES + _MEMORY_PER_BYTE * file_bytes
     cpu_s = _CPU_S + round(_CPU_S_PER_MB * megabytes)
     wall_s = _WALL_FACTOR * cpu_s
-    text = "%s (%.1f MB) takes long to read; this ends after %d s at most"
-    notice = threading.Timer(_NOTICE_S, _log.warning, (text, path, megabytes, wall_s))
+    notice = threading.Timer(
+        _NOTICE_S,
+        lambda: _log.warning(
+            "%s (%.1f MB) takes long to read; this ends after %d s at most", path, megabytes, wall_s
+        ),
+    )
     notice.start()
     try:
         done = subprocess.run(  # noqa: S603 - our own module
