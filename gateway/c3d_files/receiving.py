@@ -11,7 +11,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 from gateway.c3d_files.spool import Spool, StoredFile, UnfinishedFile
 from gateway.errors import SpoolError
@@ -31,16 +31,6 @@ _DATA_BLOCK_OFFSET: Final = 16
 """Where the header has the number of the block where the frames begin."""
 _DEC, _BIG_ENDIAN = 85, 86  # of the types of processors; the usual one is 84, little-endian
 _FORMATS: Final = {1: "B", 2: "H", 4: "f"}
-
-
-class _Record(NamedTuple):
-    """A parameter: the number of its group, its name, and where its values are."""
-
-    group: int
-    name: str
-    element_bytes: int
-    values_offset: int
-    num_bytes: int
 
 
 def problem_of_c3d(head: bytes, file_bytes: int) -> str:
@@ -70,15 +60,12 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     data_start = max(data_block - 1, 0) * _BLOCK_BYTES
     stated_end = max(data_start, start + head[start + 2] * _BLOCK_BYTES)
     end = stated_end if start < stated_end <= file_bytes else file_bytes
-    groups, records = _records(head[:end], start + 4, order)
     numbers: dict[str, float] = {}
-    for record in records:
-        name = f"{groups.get(record.group, record.group)}:{record.name}"
-        if record.values_offset + record.num_bytes > end:
-            return f"its parameter {safe_text(name)} would have {record.num_bytes} bytes, more than it has"
-        if record.num_bytes == record.element_bytes in _FORMATS and record.values_offset + 4 <= len(head):
-            value_format = order + _FORMATS[record.element_bytes]
-            (numbers[name],) = struct.unpack_from(value_format, head, record.values_offset)
+    for name, element_bytes, offset, num_bytes in _parameters(head[:end], start + 4, order):
+        if offset + num_bytes > end:
+            return f"its parameter {safe_text(name)} would have {num_bytes} bytes, more than it has"
+        if num_bytes == element_bytes in _FORMATS and offset + 4 <= len(head):
+            (numbers[name],) = struct.unpack_from(order + _FORMATS[element_bytes], head, offset)
     rates_hz = numbers.get("ANALOG:RATE", 0.0), numbers.get("POINT:RATE", 0.0)
     ratio = rates_hz[0] / rates_hz[1] if processor != _DEC and rates_hz[1] > 0 else 1.0
     samples = ratio if math.isfinite(ratio) else 1.0
@@ -89,10 +76,13 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     return ""
 
 
-def _records(head: bytes, position: int, order: str) -> tuple[dict[int, str], list[_Record]]:
-    """Return the names of the groups by their numbers, and all parameters, as far as they can be read."""
+def _parameters(head: bytes, position: int, order: str) -> list[tuple[str, int, int, int]]:
+    """Return the name of each parameter, the size of an element, and where its values are and their size.
+
+    The name is GROUP:NAME. What cannot be read ends the list.
+    """
     groups: dict[int, str] = {}
-    records = []
+    found = []
     while position + 2 <= len(head):
         length, group = struct.unpack_from("bb", head, position)
         name = head[position + 2 : position + 2 + abs(length)].decode("latin-1").strip().upper()
@@ -105,13 +95,13 @@ def _records(head: bytes, position: int, order: str) -> tuple[dict[int, str], li
         else:
             element_bytes = abs(struct.unpack_from("b", head, at + 2)[0])
             sizes = head[at + 4 : at + 4 + head[at + 3]]
-            values_offset = at + 4 + len(sizes)
             num_bytes = element_bytes * math.prod(sizes)
-            records.append(_Record(group, name, element_bytes, values_offset, num_bytes))
+            found.append((group, name, element_bytes, at + 4 + len(sizes), num_bytes))
         if offset == 0:
             break
         position = at + offset
-    return groups, records
+    # A group may be defined after its parameters.
+    return [(f"{groups.get(group, group)}:{name}", *rest) for group, name, *rest in found]
 
 
 _MIB: Final = 1024 * 1024
@@ -132,8 +122,11 @@ class IncomingFile:
         thread: WorkerThread,
         on_end: Callable[["IncomingFile", StoredFile | SpoolError], None],
     ) -> None:
+        self.directory = spool.directory
+        """Where the file will be."""
+        self.name = f"a C3D file of {file_bytes} bytes from {source}"
+        """What the file is called in messages."""
         self._source = source
-        self._name = f"a C3D file of {file_bytes} bytes from {source}"
         self._spool = spool
         self._thread = thread
         self._on_end = on_end
@@ -150,9 +143,9 @@ class IncomingFile:
             return
         if not self._spool.memory.reserve(self._source, piece):
             held_mib = self._spool.memory.held_bytes // _MIB
-            self._end(
+            self.end(
                 SpoolError(
-                    f"{self._name} is dropped: {held_mib} MiB of C3D files are waiting to be written; "
+                    f"{self.name} is dropped: {held_mib} MiB of C3D files are waiting to be written; "
                     "is the disk slow, or the server faulty?"
                 )
             )
@@ -167,18 +160,9 @@ class IncomingFile:
 
     def interrupt(self, reason: str) -> None:
         """Give up the file, because no further piece of it will come."""
-        self._end(SpoolError(f"{self._name} broke off after {self._num_bytes} bytes: {reason}"))
+        self.end(SpoolError(f"{self.name} broke off after {self._num_bytes} bytes: {reason}"))
 
-    def give_up_disk(self) -> None:
-        """Give up the file, because the disk does not respond."""
-        self._end(
-            SpoolError(
-                f"{self._name} is dropped: the disk of {self._spool.directory} does not respond; "
-                "check it, and whether it is mounted"
-            )
-        )
-
-    def _end(self, result: StoredFile | SpoolError) -> None:
+    def end(self, result: StoredFile | SpoolError) -> None:
         """Report the end of the file, once. If it is lost, free its memory and have it deleted."""
         if self._is_ended:
             return
@@ -197,22 +181,19 @@ class IncomingFile:
         except IndexError:  # the file is lost
             return
         try:
-            if self._has_failed:
-                return
-            if self._unfinished is None:
-                self._unfinished = self._spool.begin()
-            self._unfinished.write(piece)
+            if not self._has_failed:
+                self._unfinished = self._unfinished or self._spool.begin()
+                self._unfinished.write(piece)
         except OSError as error:
             self._fail(error)
         finally:
             self._spool.memory.release(self._source, piece)
 
     def _keep(self) -> None:
-        unfinished = self._unfinished
-        if unfinished is None or self._is_ended:
+        if self._unfinished is None or self._is_ended:
             return
         try:
-            stored = self._spool.keep(self._source, unfinished)
+            stored = self._spool.keep(self._source, self._unfinished)
         except OSError as error:
             self._fail(error)
         else:
@@ -230,14 +211,14 @@ class IncomingFile:
         self._discard()
         self._report(
             SpoolError(
-                f"{self._name} cannot be stored in {self._spool.directory}: {error.strerror}; "
+                f"{self.name} cannot be stored in {self.directory}: {error.strerror}; "
                 "check spool.directory and the space on it"
             )
         )
 
     def _report(self, result: StoredFile | SpoolError) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: the gateway has stopped
-            self._loop.call_soon_threadsafe(partial(self._end, result))
+            self._loop.call_soon_threadsafe(partial(self.end, result))
 
 
 _MAX_UNSTORED_FILES: Final = 4
@@ -273,10 +254,6 @@ class SourceFiles:
         self._is_disk_silent = False
         self._allowed = TokenBucket(1 / _FILE_PERIOD_S, _MAX_FILES_AT_ONCE)
 
-    def receiver(self, on_lost: Callable[[SpoolError], None]) -> "FileReceiver":
-        """Return what takes the files of one stream; ``on_lost`` is called with each one that is lost."""
-        return FileReceiver(self, on_lost)
-
     def begin(self, head: bytes, file_bytes: int, on_lost: Callable[[SpoolError], None]) -> IncomingFile:
         """Return a new file that begins with ``head``. Raises SpoolError if it is refused."""
         name = f"a C3D file of {file_bytes} bytes"
@@ -307,19 +284,21 @@ class SourceFiles:
 
     def check(self) -> None:
         """Give up the files that wait for a disk that does not respond. Call it once a second."""
-        if self._thread.call_age_s > _MAX_DISK_S:
-            self._is_disk_silent = True
+        self._is_disk_silent = self._thread.call_age_s > _MAX_DISK_S
+        if self._is_disk_silent:
             for file in [*self._unstored]:
-                file.give_up_disk()
-        else:
-            self._is_disk_silent = False
+                file.end(
+                    SpoolError(
+                        f"{file.name} is dropped: the disk of {file.directory} does not respond; "
+                        "check it, and whether it is mounted"
+                    )
+                )
 
     async def finish(self) -> None:
         """Wait until the files that have arrived are stored, but not long: the disk may not respond."""
-        if not self._unstored:
-            return
-        written = asyncio.wrap_future(self._thread.submit(lambda: None))
-        await asyncio.wait([written], timeout=_FINISH_S)
+        if self._unstored:
+            written = asyncio.wrap_future(self._thread.submit(lambda: None))
+            await asyncio.wait([written], timeout=_FINISH_S)
 
     def _end(self, file: IncomingFile, result: StoredFile | SpoolError) -> None:
         on_lost = self._unstored.pop(file)

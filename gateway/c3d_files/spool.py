@@ -155,9 +155,18 @@ class Spool:
         if earlier and earlier[0].time >= time:  # the clock was set back
             time = earlier[0].time + timedelta(microseconds=1)
         path = self.directory / f"{source}-{time:{_TIME}}.c3d"
-        num_bytes = unfinished.finish(path)
-        deleted, not_deleted = self._delete_beyond_limits(earlier, num_bytes)
-        return StoredFile(path, num_bytes, tuple(deleted), problem or not_deleted)
+        num_bytes = kept_bytes = unfinished.finish(path)
+        deleted = []
+        for number, file in enumerate(earlier, start=2):
+            kept_bytes += file.num_bytes
+            if number <= self._max_files and kept_bytes <= self.max_bytes:
+                continue
+            try:
+                file.path.unlink(missing_ok=True)
+                deleted.append(file.path)
+            except OSError as error:
+                problem = f"{file.path} cannot be deleted: {error.strerror}"
+        return StoredFile(path, num_bytes, tuple(deleted), problem)
 
     def newest(self, source: str) -> Path | None:
         """Return the newest file of ``source``, None if there is none. Raises OSError."""
@@ -168,8 +177,15 @@ class Spool:
         """Delete unfinished files that nobody writes, because a gateway was killed."""
         with self._creating, contextlib.suppress(OSError):
             for entry in [*os.scandir(self.directory)]:
-                if entry.name.endswith(_UNFINISHED) and entry.is_file(follow_symlinks=False):
-                    _delete_if_abandoned(Path(entry.path))
+                if not (entry.name.endswith(_UNFINISHED) and entry.is_file(follow_symlinks=False)):
+                    continue
+                with contextlib.suppress(OSError):  # the lock: somebody writes the file
+                    descriptor = os.open(entry.path, os.O_RDONLY | os.O_NONBLOCK)
+                    try:
+                        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        Path(entry.path).unlink()
+                    finally:
+                        os.close(descriptor)
 
     def _files(self, source: str) -> Iterator[_File]:
         for entry in [*os.scandir(self.directory)]:
@@ -180,28 +196,3 @@ class Spool:
             with contextlib.suppress(FileNotFoundError, ValueError):
                 time = datetime.strptime(name["time"], _TIME).replace(tzinfo=UTC)
                 yield _File(time, Path(entry.path), entry.stat(follow_symlinks=False).st_size)
-
-    def _delete_beyond_limits(self, earlier: list[_File], kept_bytes: int) -> tuple[list[Path], str]:
-        """Delete the oldest of ``earlier``, which has the newest first; return them, and a problem or ""."""
-        deleted = []
-        problem = ""
-        for number, file in enumerate(earlier, start=2):
-            kept_bytes += file.num_bytes
-            if number <= self._max_files and kept_bytes <= self.max_bytes:
-                continue
-            try:
-                file.path.unlink(missing_ok=True)
-                deleted.append(file.path)
-            except OSError as error:
-                problem = f"{file.path} cannot be deleted: {error.strerror}"
-        return deleted, problem
-
-
-def _delete_if_abandoned(path: Path) -> None:
-    with contextlib.suppress(OSError):  # the lock: somebody writes the file
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()
-        finally:
-            os.close(descriptor)

@@ -118,7 +118,7 @@ class SceneOptions:
 
 def _list_faults(context: typer.Context, wanted: bool) -> None:
     if wanted and not context.resilient_parsing:
-        from gateway.simulator.faults.control import describe_kinds
+        from gateway.simulator.simulator import describe_kinds
 
         print(describe_kinds())
         raise typer.Exit
@@ -196,8 +196,7 @@ def simulate(
     import uvloop
 
     from gateway.simulator.c3d_scene import C3dScene
-    from gateway.simulator.faults.control import parse_fault
-    from gateway.simulator.simulator import Scenario, Simulator, load_scenario
+    from gateway.simulator.simulator import Scenario, Simulator, load_scenario, parse_fault
     from gateway.simulator.take_scene import TakeScene
 
     set_up_log(level, log.log_format)

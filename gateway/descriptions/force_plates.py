@@ -81,9 +81,8 @@ def possible_types(plate: Plate, num_channels: int) -> tuple[int, ...]:
 def calibration_of(plate: Plate) -> Array:
     """Return a plate's calibration matrix, shape (6, 6); zeros if it has none of this size."""
     rows = plate.calibration_matrix
-    if len(rows) != 6 or any(len(row) != 6 for row in rows):
-        return np.zeros((6, 6))
-    matrix = np.array(rows)
+    is_square = len(rows) == 6 and all(len(row) == 6 for row in rows)
+    matrix = np.array(rows) if is_square else np.zeros((6, 6))
     return matrix if np.isfinite(matrix).all() else np.zeros((6, 6))
 
 
@@ -192,29 +191,21 @@ def placed_plates(parameters: Parameters) -> list[PlacedPlate | None]:
         geometry = geometry_of(plate, "m")
         if geometry is None:
             found.append(None)
-            continue
-        x, y, z = geometry.corners.mean(axis=0).tolist()
-        nx, ny, nz = geometry.rotation[:, 2].tolist()
-        found.append(PlacedPlate(label, geometry.corners.tolist(), (x, y, z), (nx, ny, nz), *units_of(plate)))
+        else:
+            centre, normal = geometry.corners.mean(axis=0).tolist(), geometry.rotation[:, 2].tolist()
+            corners = geometry.corners.tolist()
+            found.append(PlacedPlate(label, corners, tuple(centre), tuple(normal), *units_of(plate)))
     return found
 
 
 def units_of(plate: Plate) -> tuple[float, float]:
     """Return the units of a plate's forces and moments, in N and in Nm; unknown ones count as N and Nm."""
     units = [channel.unit for channel in plate.channels]
-    return _in_newtons(units[0] if units else ""), _in_newton_metres(units[3] if len(units) > 3 else "")
-
-
-def _in_newtons(unit: str) -> float:
-    match = _UNIT_OF_FORCE.fullmatch(unit)
-    return 1000.0 if match and match[1] else 1.0
-
-
-def _in_newton_metres(unit: str) -> float:
-    match = _UNIT_OF_MOMENT.fullmatch(unit)
-    if match is None:
-        return 1.0
-    return (1000.0 if match[1] else 1.0) * (metres_per_unit(match[2]) or 1.0)
+    force = _UNIT_OF_FORCE.fullmatch(units[0] if units else "")
+    moment = _UNIT_OF_MOMENT.fullmatch(units[3] if len(units) > 3 else "")
+    newtons = 1000.0 if force and force[1] else 1.0
+    newton_metres = (1000.0 if moment[1] else 1.0) * (metres_per_unit(moment[2]) or 1.0) if moment else 1.0
+    return newtons, newton_metres
 
 
 def force_on(plate: PlacedPlate, load: tuple[float, ...]) -> PlateForce | None:

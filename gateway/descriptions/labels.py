@@ -2,11 +2,12 @@
 
 import struct
 from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH
-from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import EventDefinition, EventParameter, Parameters
+from gateway.rtc3d.components import ComponentType, described_labels
+from gateway.rtc3d.parameters import EventParameter, Parameters
 
 _Value = TypeVar("_Value")
 
@@ -47,36 +48,36 @@ def describe(component: ComponentType, parameters: Parameters | None, num_items:
     rates: tuple[float | None, ...] = ()
     moment_unit, default_unit = "", ""
     match component:
-        case ComponentType.MARKERS:
+        case ComponentType.MARKERS | ComponentType.TOOLS:
             default_unit = parameters.length_unit
-            if parameters.markers is not None:
-                labels = (marker.label for marker in parameters.markers.markers)
-                rates = (parameters.markers.frequency_hz,)
-        case ComponentType.TOOLS:
-            default_unit = parameters.length_unit
-            if parameters.tools is not None:
-                labels = (tool.label for tool in parameters.tools.tools)
-                rates = (parameters.tools.frequency_hz,)
+            labels = described_labels(parameters, component)
+            section = parameters.markers if component is ComponentType.MARKERS else parameters.tools
+            rates = (section.frequency_hz,) if section else ()
         case ComponentType.ANALOG:
             default_unit = "mV"
-            if parameters.analog is not None:
-                channels = parameters.analog.channels[:num_items]
-                labels = (channel.label for channel in channels)
-                units = tuple(channel.unit for channel in channels)
-                rates = tuple(channel.frequency_hz for channel in channels)
+            channels = parameters.analog.channels[:num_items] if parameters.analog else ()
+            labels = (channel.label for channel in channels)
+            units = tuple(channel.unit for channel in channels)
+            rates = tuple(channel.frequency_hz for channel in channels)
         case ComponentType.FORCE:
-            if parameters.force is not None:
-                plates = parameters.force.plates[:num_items]
-                labels = (plate.label for plate in plates)
-                units = tuple(plate.channels[0].unit if plate.channels else "" for plate in plates)
-                rates = tuple(plate.frequency_hz for plate in plates)
-                moments = [plate.channels[_MOMENT_CHANNEL:][:1] for plate in plates]
-                moment_unit = common(found[0].unit if found else "" for found in moments) or ""
+            plates = parameters.force.plates[:num_items] if parameters.force else ()
+            labels = (plate.label for plate in plates)
+            units = tuple(plate.channels[0].unit if plate.channels else "" for plate in plates)
+            rates = tuple(plate.frequency_hz for plate in plates)
+            moments = [plate.channels[_MOMENT_CHANNEL:][:1] for plate in plates]
+            moment_unit = common(found[0].unit if found else "" for found in moments) or ""
         case ComponentType.EVENT:
             return Description((), (), "", None)
     noun = component.item_noun.removesuffix("s")
+    given = [label.strip() for label in islice(labels, num_items)]
+    given += [""] * (num_items - len(given))
+    found = _different(
+        [(label or f"{noun} {index}")[:MAX_LABEL_LENGTH] for index, label in enumerate(given, start=1)],
+        lambda text, length: text[: MAX_LABEL_LENGTH - length],
+        [JSON_NAME] if component is ComponentType.TOOLS else [],  # no key of a tool is that of JSON
+    )
     units += (default_unit,) * (num_items - len(units))
-    return Description(_unique_labels(labels, noun, num_items), units, moment_unit, common(rates))
+    return Description(tuple(found), units, moment_unit, common(rates))
 
 
 def event_labels(parameters: Parameters | None) -> dict[int, str]:
@@ -106,24 +107,6 @@ def common(values: Iterable[_Value]) -> _Value | None:
     return different.pop() if len(different) == 1 else None
 
 
-def _unique_labels(labels: Iterable[str], noun: str, num_items: int) -> tuple[str, ...]:
-    """Return ``num_items`` different labels, as ``topics.unique_name`` makes them for the keys of tools."""
-    given = [label.strip() for label, _ in zip(labels, range(num_items), strict=False)]
-    given += [""] * (num_items - len(given))
-    names: dict[str, None] = {JSON_NAME: None} if noun == "tool" else {}  # no key of a tool is that of JSON
-    numbers: dict[str, int] = {}  # tried last, by label; many items may have the same label
-    for position, label in enumerate(given, start=1):
-        base = (label or f"{noun} {position}")[:MAX_LABEL_LENGTH]
-        name, number = base, numbers.get(base, 1)
-        while name in names:
-            number += 1
-            suffix = f"_{number}"
-            name = base[: MAX_LABEL_LENGTH - len(suffix)] + suffix
-        numbers[base] = number
-        names[name] = None
-    return tuple(names)[-num_items:] if num_items else ()
-
-
 def fitting_labels(
     labels: Sequence[str], fit: Callable[[str], str], max_bytes: int, noun: str
 ) -> tuple[str, ...]:
@@ -132,18 +115,31 @@ def fitting_labels(
     An empty one is called by its position, such as "marker 3". One that another item has already gets _2,
     _3, ….
     """
-    fitted: dict[str, None] = {}
-    numbers: dict[str, int] = {}
-    for position, label in enumerate(labels, start=1):
-        base = cut(fit(label), max_bytes) or fit(f"{noun} {position}")
+    bases = (
+        cut(fit(label), max_bytes) or fit(f"{noun} {position}")
+        for position, label in enumerate(labels, start=1)
+    )
+    return tuple(_different(bases, lambda text, num_bytes: cut(text, max_bytes - num_bytes)))
+
+
+def _different(
+    bases: Iterable[str], shorten: Callable[[str, int], str], taken: Sequence[str] = ()
+) -> list[str]:
+    """Return labels that differ from each other and from ``taken``.
+
+    ``shorten`` makes room in a label for a suffix of this length.
+    """
+    names = dict.fromkeys(taken)
+    numbers: dict[str, int] = {}  # tried last, by label; many items may have the same label
+    for base in bases:
         name, number = base, numbers.get(base, 1)
-        while name in fitted:
+        while name in names:
             number += 1
             suffix = f"_{number}"
-            name = cut(base, max_bytes - len(suffix)) + suffix
+            name = shorten(base, len(suffix)) + suffix
         numbers[base] = number
-        fitted[name] = None
-    return tuple(fitted)
+        names[name] = None
+    return list(names)[len(taken) :]
 
 
 def printable(text: str) -> str:
@@ -177,24 +173,19 @@ class EventText(NamedTuple):
 
 def event_text(parameters: Parameters, item: Any) -> EventText:
     """Return the texts of one event, an item with the fields of LONG_EVENT."""
-    definition = _definition(parameters, int(item["id"]))
-    values = [int(item[name]) for name in ("param1", "param2", "param3")]
+    number = int(item["id"])
+    definitions = parameters.events.events if parameters.events else ()
+    definition = next((found for found in definitions if event_number(found.id) == number), None)
     described = definition.parameters if definition else ()
     found = []
-    for index, value in enumerate(values):
-        if index < len(described):
-            name = described[index].description or f"param{index + 1}"
-            if value != UNUSED:
-                found.append((name, _value(described[index], value)))
+    for index, name in enumerate(("param1", "param2", "param3")):
+        value = int(item[name])
+        if value != UNUSED and index < len(described):
+            found.append((described[index].description or name, _value(described[index], value)))
         elif value != UNUSED:
-            found.append((f"param{index + 1}", str(value)))
+            found.append((name, str(value)))
     label = definition.label.strip() if definition else ""
-    return EventText(label or f"event {int(item['id'])}", tuple(found))
-
-
-def _definition(parameters: Parameters, number: int) -> EventDefinition | None:
-    definitions = parameters.events.events if parameters.events else ()
-    return next((found for found in definitions if event_number(found.id) == number), None)
+    return EventText(label or f"event {number}", tuple(found))
 
 
 def _value(parameter: EventParameter, value: int) -> str:

@@ -46,10 +46,9 @@ def _quaternion(angles: RollPitchYaw) -> Quaternion:
     about_x = (math.sin(roll), 0.0, 0.0, math.cos(roll))
     about_y = (0.0, math.sin(pitch), 0.0, math.cos(pitch))
     about_z = (0.0, 0.0, math.sin(yaw), math.cos(yaw))
-    x, y, z, w = product(about_z, product(about_y, about_x))
-    return (_tidy(x), _tidy(y), _tidy(z), _tidy(w))
-
-
-def _tidy(value: float) -> float:
-    """Return 0 for a rounding error such as the cosine of 90°, so that poses have 0 there, too."""
-    return 0.0 if abs(value) < _ROUNDING_ERROR else value
+    x, y, z, w = (
+        # Without rounding errors such as that of the cosine of 90°, so that poses have 0 there, too.
+        0.0 if abs(value) < _ROUNDING_ERROR else value
+        for value in product(about_z, product(about_y, about_x))
+    )
+    return x, y, z, w

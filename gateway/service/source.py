@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import rtc3d
 
-from gateway.c3d_files.receiving import SourceFiles
+from gateway.c3d_files.receiving import FileReceiver, SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError
@@ -236,7 +236,7 @@ class Source:
             skip=self.fan_out.skip,
             read_parameters=self._read_parameters,
             on_restart=self._refresh.request,
-            files=self._files.receiver(lambda error: status.file_lost(str(error))),
+            files=FileReceiver(self._files, lambda error: status.file_lost(str(error))),
             has_subscribers=self.fan_out.has_subscribers,
         )
         return Supervisor(self.settings, stream, status, callbacks, listener)

@@ -9,6 +9,8 @@ The server itself is ``gateway.rtc3d_server``. A scene tells it which frames the
   components belong to the same frame and when it is due, ``take_frames`` makes the frames that a client has
   requested.
 
-``simulator`` joins a scene, the server and the faults, and reads scenario files. ``faults`` changes what the
-server sends, between the server and the socket: see its docstring.
+``simulator`` joins a scene, the server and the faults: it begins and ends faults at once, or at the times in
+a scenario file. Their kinds are in ``faults`` and ``packet_faults``. ``fault_pipeline`` stands between the
+server and the socket of a connection: it passes what is sent through the active faults, and holds what is to
+be late.
 """

@@ -68,22 +68,19 @@ class RigidBodies:
 
         self._centre_mm = rng.uniform((-1000.0, -1000.0, 500.0), (1000.0, 1000.0, 1500.0), (bodies, 3))
         self._axis = _normalised(rng.standard_normal((bodies, 3)))
-        self._markers = self._rotation_terms(
-            _BODY_RADIUS_MM * _spread(num_markers, rng), self._body_of_marker
-        )
+        # No four consecutive directions are close to one line or plane.
+        corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
+        directions = corners[np.arange(num_markers) % 4] + rng.uniform(-0.3, 0.3, (num_markers, 3))
+        self._markers = self._rotation_terms(_BODY_RADIUS_MM * directions, self._body_of_marker)
         origin_mm = rng.uniform(-20.0, 20.0, (num_tools, 3))
         self._origins = self._rotation_terms(origin_mm, self._body_of_tool)
         # A tool's quaternion is the body's, (cos a/2, axis · sin a/2), times its own on the body.
         own = _normalised(rng.standard_normal((num_tools, 4)))
         axis = self._axis[self._body_of_tool]
         self._quaternion_cos = own
-        self._quaternion_sin = np.concatenate(
-            [
-                -np.sum(axis * own[:, 1:], axis=1, keepdims=True),
-                own[:, :1] * axis + np.cross(axis, own[:, 1:]),
-            ],
-            axis=1,
-        )
+        scalar = -np.sum(axis * own[:, 1:], axis=1, keepdims=True)
+        vector = own[:, :1] * axis + np.cross(axis, own[:, 1:])
+        self._quaternion_sin = np.concatenate([scalar, vector], axis=1)
 
     def markers(self, samples: SampleNumbers) -> Items:
         """Return the 3D items, shape (len(samples), markers), in mm."""
@@ -181,14 +178,6 @@ class _Waves:
         return values
 
 
-def _spread(count: int, rng: np.random.Generator) -> Floats:
-    """Return directions, shape (count, 3); no four consecutive ones are close to one line or plane."""
-    corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
-    jitter = rng.uniform(-0.3, 0.3, (count, 3))
-    directions: npt.NDArray[Any] = corners[np.arange(count) % 4] + jitter
-    return directions
-
-
 def _square_sum(vectors: Floats) -> Floats:
     """Return the squared lengths of ``vectors``, which have the shape (…, 3)."""
     squares: npt.NDArray[Any] = np.einsum("...i,...i->...", vectors, vectors)
@@ -244,16 +233,12 @@ class ForcePlates:
 
 def _plate(index: int, rate_hz: float) -> Plate:
     near, far = _PITCH_MM * index, _PITCH_MM * index + _LENGTH_MM
+    corners = ((0.0, near), (_WIDTH_MM, near), (_WIDTH_MM, far), (0.0, far))
     return Plate(
         id=str(index + 1),
         label=f"Force plate {index + 1}",
         frequency_hz=rate_hz,
-        corners=(
-            Point(0.0, near, 0.0),
-            Point(_WIDTH_MM, near, 0.0),
-            Point(_WIDTH_MM, far, 0.0),
-            Point(0.0, far, 0.0),
-        ),
+        corners=tuple(Point(x, y, 0.0) for x, y in corners),
         origin=Point(0.0, 0.0, 0.0),
         channels=force_channels("N", "Nm"),
         excitation_voltage_v=5.0,

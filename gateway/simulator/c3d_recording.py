@@ -1,6 +1,8 @@
 """What a C3D file has, read with ezc3d: points, analog channels, force plates and events."""
 
 import logging
+from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -9,13 +11,7 @@ import numpy.typing as npt
 
 from gateway.descriptions.labels import UNUSED, common
 from gateway.errors import TakeError
-from gateway.rtc3d.components import (
-    ITEM_DTYPES,
-    LONG_EVENT,
-    MISSING_MARKER,
-    ComponentType,
-    Items,
-)
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, MISSING_MARKER, ComponentType, Items
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -34,142 +30,9 @@ from gateway.rtc3d.parameters import (
 from gateway.rtc3d_server.scene import NO_EVENTS
 from gateway.simulator.bodies import force_channels
 
-_WORD_BYTES: Final = 2
-_COUNT_OFFSET: Final = 150 * _WORD_BYTES
-"""Where the header has the number of its events. It has room for 18."""
-_MAX_HEADER_EVENTS: Final = 18
-_SECOND_US: Final = 1_000_000
-_NO_LABEL: Final = "Event"
 _log = logging.getLogger(__name__)
-
-
-class _Texts(NamedTuple):
-    """The times of events in s, and their texts, one for each event or none."""
-
-    seconds: npt.NDArray[np.float64]
-    labels: list[str]
-    contexts: list[str]
-    subjects: list[str]
-    descriptions: list[str]
-
-
-def read_events(
-    path: Path, content: Any, head: bytes, frame_rate_hz: float, length_s: float
-) -> tuple[ParametersEvents, Items]:
-    """Return the events of the group EVENT, or else those of the header, in µs since the first frame.
-
-    ``content`` is what ezc3d reads, ``head`` the first block of the file. Times count from frame 1 of the
-    trial (Vicon, Qualisys), also if the file begins with a later frame, or else from the first frame of the
-    file: what places more events in it.
-    """
-    texts = _from_group(content["parameters"].get("EVENT", {})) or _from_header(content["header"], head)
-    if texts is None:
-        return ParametersEvents(), NO_EVENTS
-    period_s = 1.0 / frame_rate_hz
-    starts_s = [(number - 1) * period_s for number in _first_frames(content)]
-    choices_s = [texts.seconds - start_s for start_s in (*starts_s, 0.0)]
-    within = [(seconds > -period_s) & (seconds < length_s + period_s) for seconds in choices_s]
-    best = int(np.argmax([each.sum() for each in within]))
-    (chosen,) = np.nonzero(within[best])
-    # A frame has the events up to its own time, so those after the last frame would come in the next pass.
-    seconds = np.clip(choices_s[best], 0.0, max(length_s - period_s, 0.0))
-    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
-    count, left_out = len(texts.seconds), len(texts.seconds) - len(chosen)
-    if left_out:
-        _log.warning("%s: %d of %d events are outside of its frames and are left out", path, left_out, count)
-    definitions, numbers = _define(texts)
-    items = np.full(len(chosen), UNUSED, LONG_EVENT)
-    items["timestamp"] = np.round(seconds[chosen] * _SECOND_US)
-    for name, values in numbers.items():
-        items[name] = values[chosen]
-    return definitions, items
-
-
-def texts_of(group: Any, name: str) -> list[str]:
-    """Return a parameter's texts, including its continuations: LABELS, LABELS2, … (255 texts each)."""
-    return [text.strip() for values in _parts(group, name) for text in values]
-
-
-def _parts(group: Any, name: str) -> list[Any]:
-    """Return the values of a parameter and of its continuations."""
-    parts = []
-    for part in (name, *(f"{name}{number}" for number in range(2, 100))):
-        if part not in group:
-            break
-        parts.append(group[part]["value"])
-    return parts
-
-
-def _from_group(group: Any) -> _Texts | None:
-    """Return the events of the group EVENT, whose times are minutes and seconds; None if it has none."""
-    labels = texts_of(group, "LABELS")
-    times = [np.asarray(part, np.float64) for part in _parts(group, "TIMES")]
-    if len(times) == 1 and times[0].ndim == 1 and len(labels) == times[0].size:
-        seconds = times[0]  # as some programs write them
-    else:
-        minutes_and_seconds = [part[: part.size // 2 * 2].reshape(2, -1) for part in times if part.size]
-        seconds = np.concatenate([[60.0, 1.0] @ part for part in minutes_and_seconds] or [np.zeros(0)])
-    if "USED" in group and len(group["USED"]["value"]):
-        seconds = seconds[: int(group["USED"]["value"][0]) & 0xFFFF]
-    if not len(seconds):
-        return None
-    others = (texts_of(group, name) for name in ("CONTEXTS", "SUBJECTS", "DESCRIPTIONS"))
-    return _Texts(seconds, labels, *others)
-
-
-def _from_header(header: Any, head: bytes) -> _Texts | None:
-    """Return the events of the header; None if it has none."""
-    count = max(head[_COUNT_OFFSET : _COUNT_OFFSET + _WORD_BYTES])  # one of both bytes is 0
-    if not 0 < count <= _MAX_HEADER_EVENTS:
-        return None
-    events = header["events"]
-    seconds = np.array(events["events_time"][:count], np.float64)
-    labels = [text.strip("\0 ") for text in events["events_label"][:count]]
-    return _Texts(seconds, labels, [], [], [])
-
-
-def _first_frames(content: Any) -> list[int]:
-    """Return the number of the first frame in TRIAL:ACTUAL_START_FIELD, if it is there, and in the header."""
-    numbers = [int(content["header"]["points"]["first_frame"]) + 1]
-    field = content["parameters"].get("TRIAL", {}).get("ACTUAL_START_FIELD", {"value": []})["value"]
-    if len(field):
-        words = [int(word) & 0xFFFF for word in np.ravel(field)[:2]]
-        numbers.insert(0, words[0] + (words[1] << 16 if len(words) > 1 else 0))
-    return numbers
-
-
-def _define(texts: _Texts) -> tuple[ParametersEvents, dict[str, npt.NDArray[np.int64]]]:
-    """Return a definition for each label, and the fields of the events: their ids, context and subject."""
-    count = len(texts.seconds)
-    labels = [label or _NO_LABEL for label in _padded(texts.labels, count)]
-    # A description of a single event, such as the number of a plate, is not that of all.
-    descriptions: dict[str, set[str]] = {}
-    for label, description in zip(labels, _padded(texts.descriptions, count), strict=True):
-        descriptions.setdefault(label, set()).add(description)
-    parameters: list[EventParameter] = []
-    numbers: dict[str, npt.NDArray[np.int64]] = {}
-    for name, values in (("Context", texts.contexts), ("Subject", texts.subjects)):
-        different = [text for text in dict.fromkeys(_padded(values, count)) if text]
-        if different:
-            number = len(parameters) + 1
-            codes = {text: code for code, text in enumerate(different, start=1)}
-            expected = tuple(ExpectedValue(str(code), str(code), text) for text, code in codes.items())
-            parameters.append(EventParameter(str(number), "int", name, expected))
-            numbers[f"param{number}"] = np.array([codes.get(text, UNUSED) for text in _padded(values, count)])
-    ids = {label: number for number, label in enumerate(dict.fromkeys(labels), start=1)}
-    numbers["id"] = np.array([ids[label] for label in labels])
-    definitions = tuple(
-        EventDefinition(str(number), label, common(descriptions[label]) or "", tuple(parameters))
-        for label, number in ids.items()
-    )
-    return ParametersEvents(definitions), numbers
-
-
-def _padded(texts: list[str], count: int) -> list[str]:
-    return texts[:count] + [""] * (count - len(texts))
-
-
 _HEADER_BYTES: Final = 512
+_ITEM_TEXTS: Final = ("LABELS", "DESCRIPTIONS")
 _WHOLE_UNITS: Final = {"mill": "mm", "cent": "cm", "mete": "m"}
 """Units that programs cut to four characters (field note 28)."""
 
@@ -234,7 +97,6 @@ def _raise_memory_error(error: Exception) -> None:
 def _convert(path: Path, content: Any, head: bytes) -> C3dRecording:
     parameters, data = content["parameters"], content["data"]
     point, analog = parameters["POINT"], parameters["ANALOG"]
-    plates = data.get("platform", [])
     point_rate_hz, analog_rate_hz = _number(point, "RATE"), _number(analog, "RATE")
     all_rates_hz = {
         ComponentType.MARKERS: point_rate_hz,
@@ -244,7 +106,7 @@ def _convert(path: Path, content: Any, head: bytes) -> C3dRecording:
     all_items = {
         ComponentType.MARKERS: _markers(data["points"], data["meta_points"]["residuals"]),
         ComponentType.ANALOG: data["analogs"][0].T.astype(ITEM_DTYPES[ComponentType.ANALOG]),
-        ComponentType.FORCE: _forces(plates),
+        ComponentType.FORCE: _forces(data.get("platform", [])),
     }
     items: dict[ComponentType, Items] = {c: array for c, array in all_items.items() if array.size}
     rates_hz = {component: all_rates_hz[component] for component in items}
@@ -252,21 +114,8 @@ def _convert(path: Path, content: Any, head: bytes) -> C3dRecording:
     rate_hz, num_frames = all_rates_hz[slowest], len(all_items[slowest])
     length_s = num_frames / rate_hz if rate_hz > 0 else 0.0
     frame_rate_hz = point_rate_hz if point_rate_hz > 0 else rate_hz or 1.0
-    definitions, events = read_events(path, content, head, frame_rate_hz, length_s)
-    num_points, num_channels = data["points"].shape[1], data["analogs"].shape[1]
-    unit = _length_unit(path, point, num_points)
-    described = Parameters(
-        markers=_describe_markers(point, num_points, point_rate_hz, unit),
-        tools=Parameters6D(),
-        analog=_describe_analog(path, analog, num_channels, analog_rate_hz),
-        force=ParametersForce(
-            tuple(
-                _describe_plate(plate, index, parameters["FORCE_PLATFORM"], analog_rate_hz, unit)
-                for index, plate in enumerate(plates)
-            )
-        ),
-        events=definitions,
-    )
+    definitions, events = _read_events(path, content, head, frame_rate_hz, length_s)
+    described = replace(_describe(path, parameters, data, point_rate_hz, analog_rate_hz), events=definitions)
     return C3dRecording(described, items, rates_hz, rate_hz, num_frames, events)
 
 
@@ -290,65 +139,58 @@ def _forces(plates: list[Any]) -> Items:
     return ordered.view(dtype)[..., 0]
 
 
-def _length_unit(path: Path, point: Any, num_points: int) -> str:
-    """Return the unit of positions; that of nearly all C3D files if this one does not say it."""
-    unit = _text(texts_of(point, "UNITS"), 0, "")
+def _describe(
+    path: Path, parameters: Any, data: Any, point_rate_hz: float, analog_rate_hz: float
+) -> Parameters:
+    """Return the parameters of markers, channels and plates; C3D has no label or excitation of plates."""
+    point, analog = parameters["POINT"], parameters["ANALOG"]
+    num_points, num_channels = data["points"].shape[1], data["analogs"].shape[1]
+    [unit] = _texts_of(point, "UNITS", 1)
     if not unit and num_points:
         _log.warning("%s does not say the unit of its points (POINT:UNITS); mm is assumed", path)
-    return _WHOLE_UNITS.get(unit, unit or "mm")
-
-
-def _describe_markers(point: Any, count: int, rate_hz: float, unit: str) -> Parameters3D:
-    labels, descriptions = (texts_of(point, name) for name in ("LABELS", "DESCRIPTIONS"))
-    return Parameters3D(
-        frequency_hz=rate_hz,
-        unit=unit,
-        markers=tuple(
-            Marker(
-                str(index + 1), _text(labels, index, f"Marker {index + 1}"), _text(descriptions, index, "")
-            )
-            for index in range(count)
-        ),
+    unit = _WHOLE_UNITS.get(unit, unit or "mm")
+    point_texts = zip(*(_texts_of(point, name, num_points) for name in _ITEM_TEXTS), strict=True)
+    markers = tuple(
+        Marker(str(number), label or f"Marker {number}", description)
+        for number, (label, description) in enumerate(point_texts, start=1)
     )
-
-
-def _describe_analog(path: Path, analog: Any, count: int, rate_hz: float) -> ParametersAnalog:
-    labels, descriptions, units = (texts_of(analog, name) for name in ("LABELS", "DESCRIPTIONS", "UNITS"))
-    unknown = sum(not _text(units, index, "") for index in range(count))
-    if unknown:
+    analog_units = _texts_of(analog, "UNITS", num_channels)
+    if "" in analog_units:
         text = "%s does not say the unit of %d of its %d analog channels (ANALOG:UNITS)"
-        _log.warning(text, path, unknown, count)
-    return ParametersAnalog(
-        tuple(
-            AnalogChannel(
-                id=str(index + 1),
-                label=_text(labels, index, f"Analog {index + 1}"),
-                description=_text(descriptions, index, ""),
-                unit=_text(units, index, ""),
-                frequency_hz=rate_hz,
-            )
-            for index in range(count)
-        )
+        _log.warning(text, path, analog_units.count(""), num_channels)
+    analog_texts = zip(
+        *(_texts_of(analog, name, num_channels) for name in _ITEM_TEXTS), analog_units, strict=True
     )
-
-
-def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float, unit: str) -> Plate:
-    """Return a plate's parameters; C3D has no label, excitation or gain for plates."""
-    force_unit, moment_unit = plate["unit_force"], plate["unit_moment"]
-    if plate["unit_position"] != unit:  # ezc3d says metres if the file says nothing
-        moment_unit = f"{force_unit}{unit}"
-    channels = np.reshape(force_platform["CHANNEL"]["value"], (-1, len(force_platform["TYPE"]["value"])))
-    calibration = plate["cal_matrix"]
-    return Plate(
-        id=str(index + 1),
-        label=f"Force plate {index + 1}",
-        frequency_hz=rate_hz,
-        corners=tuple(_point(corner, unit) for corner in plate["corners"].T),
-        origin=_point(plate["origin"], unit),
-        channels=force_channels(force_unit, moment_unit),
-        analog_channel_ids=tuple(str(channel) for channel in channels[:, index] if channel > 0),
-        # for plate types without a calibration matrix, ezc3d returns zeros
-        calibration_matrix=tuple(tuple(map(float, row)) for row in calibration) if calibration.any() else (),
+    channels = tuple(
+        AnalogChannel(str(number), label or f"Analog {number}", description, channel_unit, analog_rate_hz)
+        for number, (label, description, channel_unit) in enumerate(analog_texts, start=1)
+    )
+    plates = []
+    for index, plate in enumerate(data.get("platform", [])):
+        force_unit, moment_unit = plate["unit_force"], plate["unit_moment"]
+        if plate["unit_position"] != unit:  # ezc3d says metres if the file says nothing
+            moment_unit = f"{force_unit}{unit}"
+        group = parameters["FORCE_PLATFORM"]
+        ids = np.reshape(group["CHANNEL"]["value"], (-1, len(group["TYPE"]["value"])))
+        # For plate types without a calibration matrix, ezc3d returns zeros.
+        rows = plate["cal_matrix"] if plate["cal_matrix"].any() else ()
+        plates.append(
+            Plate(
+                id=str(index + 1),
+                label=f"Force plate {index + 1}",
+                frequency_hz=analog_rate_hz,
+                corners=tuple(_point(corner, unit) for corner in plate["corners"].T),
+                origin=_point(plate["origin"], unit),
+                channels=force_channels(force_unit, moment_unit),
+                analog_channel_ids=tuple(str(channel) for channel in ids[:, index] if channel > 0),
+                calibration_matrix=tuple(tuple(map(float, row)) for row in rows),
+            )
+        )
+    return Parameters(
+        markers=Parameters3D(frequency_hz=point_rate_hz, unit=unit, markers=markers),
+        tools=Parameters6D(),
+        analog=ParametersAnalog(channels),
+        force=ParametersForce(tuple(plates)),
     )
 
 
@@ -363,5 +205,124 @@ def _number(group: Any, name: str) -> float:
     return float(values[0]) if len(values) else 0.0
 
 
-def _text(texts: list[str], index: int, default: str) -> str:
-    return (texts[index] if index < len(texts) else "") or default
+_COUNT_OFFSET: Final = 300
+"""Where the header has the number of its events. It has room for 18."""
+_MAX_HEADER_EVENTS: Final = 18
+_SECOND_US: Final = 1_000_000
+_NO_LABEL: Final = "Event"
+
+
+class _Texts(NamedTuple):
+    """The times of events in s, and their texts, "" where an event has none."""
+
+    seconds: npt.NDArray[np.float64]
+    labels: list[str]
+    contexts: list[str]
+    subjects: list[str]
+    descriptions: list[str]
+
+
+def _read_events(
+    path: Path, content: Any, head: bytes, frame_rate_hz: float, length_s: float
+) -> tuple[ParametersEvents, Items]:
+    """Return the events of the group EVENT, or else those of the header, in µs since the first frame.
+
+    ``content`` is what ezc3d reads, ``head`` the first block of the file. Times count from frame 1 of the
+    trial (Vicon, Qualisys), also if the file begins with a later frame, or else from the first frame of the
+    file: what places more events in it.
+    """
+    texts = _from_group(content["parameters"].get("EVENT", {})) or _from_header(content["header"], head)
+    if texts is None:
+        return ParametersEvents(), NO_EVENTS
+    period_s = 1.0 / frame_rate_hz
+    starts_s = [(number - 1) * period_s for number in _first_frames(content)]
+    choices_s = [texts.seconds - start_s for start_s in (*starts_s, 0.0)]
+    within = [(seconds > -period_s) & (seconds < length_s + period_s) for seconds in choices_s]
+    best = int(np.argmax([each.sum() for each in within]))
+    (chosen,) = np.nonzero(within[best])
+    # A frame has the events up to its own time, so those after the last frame would come in the next pass.
+    seconds = np.clip(choices_s[best], 0.0, max(length_s - period_s, 0.0))
+    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
+    count, left_out = len(texts.seconds), len(texts.seconds) - len(chosen)
+    if left_out:
+        _log.warning("%s: %d of %d events are outside of its frames and are left out", path, left_out, count)
+    definitions, numbers = _define(texts)
+    items = np.full(len(chosen), UNUSED, LONG_EVENT)
+    items["timestamp"] = np.round(seconds[chosen] * _SECOND_US)
+    for name, values in numbers.items():
+        items[name] = values[chosen]
+    return definitions, items
+
+
+def _parts(group: Any, name: str) -> list[Any]:
+    """Return the values of a parameter and of its continuations: LABELS, LABELS2, … (255 texts each)."""
+    names = (name, *(f"{name}{number}" for number in range(2, 100)))
+    return [group[part]["value"] for part in takewhile(lambda part: part in group, names)]
+
+
+def _texts_of(group: Any, name: str, count: int) -> list[str]:
+    """Return ``count`` texts of a parameter, "" for those that are missing."""
+    texts = [text.strip() for values in _parts(group, name) for text in values]
+    return texts[:count] + [""] * (count - len(texts))
+
+
+def _from_group(group: Any) -> _Texts | None:
+    """Return the events of the group EVENT, whose times are minutes and seconds; None if it has none."""
+    num_labels = sum(map(len, _parts(group, "LABELS")))
+    times = [np.asarray(part, np.float64) for part in _parts(group, "TIMES")]
+    if len(times) == 1 and times[0].ndim == 1 and num_labels == times[0].size:
+        seconds = times[0]  # as some programs write them
+    else:
+        minutes_and_seconds = [part[: part.size // 2 * 2].reshape(2, -1) for part in times if part.size]
+        seconds = np.concatenate([[60.0, 1.0] @ part for part in minutes_and_seconds] or [np.zeros(0)])
+    if "USED" in group and len(group["USED"]["value"]):
+        seconds = seconds[: int(group["USED"]["value"][0]) & 0xFFFF]
+    names = ("LABELS", "CONTEXTS", "SUBJECTS", "DESCRIPTIONS")
+    texts = (_texts_of(group, name, len(seconds)) for name in names)
+    return _Texts(seconds, *texts) if len(seconds) else None
+
+
+def _from_header(header: Any, head: bytes) -> _Texts | None:
+    """Return the events of the header; None if it has none."""
+    count = max(head[_COUNT_OFFSET : _COUNT_OFFSET + 2])  # one of both bytes is 0
+    if not 0 < count <= _MAX_HEADER_EVENTS:
+        return None
+    events, none = header["events"], [""] * count
+    labels = [text.strip("\0 ") for text in events["events_label"][:count]] + none
+    return _Texts(np.array(events["events_time"][:count], np.float64), labels[:count], none, none, none)
+
+
+def _first_frames(content: Any) -> list[int]:
+    """Return the number of the first frame in TRIAL:ACTUAL_START_FIELD, if it is there, and in the header."""
+    numbers = [int(content["header"]["points"]["first_frame"]) + 1]
+    field = content["parameters"].get("TRIAL", {}).get("ACTUAL_START_FIELD", {"value": []})["value"]
+    if len(field):
+        words = [int(word) & 0xFFFF for word in np.ravel(field)[:2]]
+        numbers.insert(0, words[0] + (words[1] << 16 if len(words) > 1 else 0))
+    return numbers
+
+
+def _define(texts: _Texts) -> tuple[ParametersEvents, dict[str, npt.NDArray[np.int64]]]:
+    """Return a definition for each label, and the fields of the events: their ids, context and subject."""
+    labels = [label or _NO_LABEL for label in texts.labels]
+    # A description of a single event, such as the number of a plate, is not that of all.
+    descriptions: dict[str, set[str]] = {}
+    for label, description in zip(labels, texts.descriptions, strict=True):
+        descriptions.setdefault(label, set()).add(description)
+    parameters: list[EventParameter] = []
+    numbers: dict[str, npt.NDArray[np.int64]] = {}
+    for name, values in (("Context", texts.contexts), ("Subject", texts.subjects)):
+        different = [text for text in dict.fromkeys(values) if text]
+        if different:
+            number = len(parameters) + 1
+            codes = {text: code for code, text in enumerate(different, start=1)}
+            expected = tuple(ExpectedValue(str(code), str(code), text) for text, code in codes.items())
+            parameters.append(EventParameter(str(number), "int", name, expected))
+            numbers[f"param{number}"] = np.array([codes.get(text, UNUSED) for text in values])
+    ids = {label: number for number, label in enumerate(dict.fromkeys(labels), start=1)}
+    numbers["id"] = np.array([ids[label] for label in labels])
+    definitions = tuple(
+        EventDefinition(str(number), label, common(descriptions[label]) or "", tuple(parameters))
+        for label, number in ids.items()
+    )
+    return ParametersEvents(definitions), numbers

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
+from logging.handlers import BufferingHandler
 from pathlib import Path
 from typing import Final
 
@@ -90,6 +91,7 @@ _WALL_FACTOR: Final = 3
 """The process may take this many times its CPU time, if the computer is busy or the disk slow."""
 _NOTICE_S: Final = 3.0
 _NO_MEMORY: Final = 3  # the status of the process
+_MAX_WARNINGS: Final = 1000
 _REMEDY: Final = "export it again in the software that recorded it, or choose another file"
 _INSTALL: Final = "pip install 'rtc3d-gateway[c3d]'"
 
@@ -98,14 +100,6 @@ def read_c3d(path: Path) -> C3dRecording:
     """Return what a C3D file has; log what it lacks. Raises TakeError if it cannot be played."""
     if importlib.util.find_spec("ezc3d") is None:
         raise TakeError(f"{path} cannot be played without ezc3d; install it: {_INSTALL}")
-    result, warnings = _read_in_process(path, _check(path))
-    for warning in warnings:
-        _log.warning(warning)
-    return result
-
-
-def _check(path: Path) -> int:
-    """Return the size of a file that may be a C3D file. Raises TakeError."""
     try:
         check_is_file(path)
         with path.open("rb") as file:
@@ -118,7 +112,10 @@ def _check(path: Path) -> int:
     problem = problem_of_sizes(head, file_bytes)
     if problem:
         raise TakeError(f"{path} cannot be read as a C3D file: {problem}; {_REMEDY}")
-    return file_bytes
+    result, warnings = _read_in_process(path, file_bytes)
+    for warning in warnings:
+        _log.warning(warning)
+    return result
 
 
 def _read_in_process(path: Path, file_bytes: int) -> tuple[C3dRecording, list[str]]:
@@ -127,7 +124,12 @@ def _read_in_process(path: Path, file_bytes: int) -> tuple[C3dRecording, list[st
     memory_bytes = _MEMORY_BYTES + _MEMORY_PER_BYTE * file_bytes
     cpu_s = _CPU_S + round(_CPU_S_PER_MB * megabytes)
     wall_s = _WALL_FACTOR * cpu_s
-    notice = threading.Timer(_NOTICE_S, _log_slow, (path, megabytes, wall_s))
+    notice = threading.Timer(
+        _NOTICE_S,
+        lambda: _log.warning(
+            "%s (%.1f MB) takes long to read; this ends after %d s at most", path, megabytes, wall_s
+        ),
+    )
     notice.start()
     try:
         done = subprocess.run(  # noqa: S603 - our own module
@@ -157,49 +159,29 @@ def _read_in_process(path: Path, file_bytes: int) -> tuple[C3dRecording, list[st
     return result, warnings
 
 
-def _log_slow(path: Path, megabytes: float, wall_s: int) -> None:
-    _log.warning("%s (%.1f MB) takes long to read; this ends after %d s at most", path, megabytes, wall_s)
-
-
 def _malformed(path: Path, what: str) -> TakeError:
     return TakeError(f"{path} cannot be read as a C3D file: reading it {what}; {_REMEDY}")
-
-
-class _Warnings(logging.Handler):
-    """Collects the texts of log records."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """See logging.Handler."""
-        self.texts.append(record.getMessage())
 
 
 def _main() -> None:
     """Read a file; write a pickled C3dRecording or TakeError, and the warnings, to stdout."""
     path, memory_bytes, cpu_s = sys.argv[1:]
-    warnings = _Warnings()
+    warnings = BufferingHandler(_MAX_WARNINGS)
     logging.getLogger().addHandler(warnings)
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as out:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # ezc3d prints what it finds unusual
-        _limit(resource.RLIMIT_AS, int(memory_bytes))
-        _limit(resource.RLIMIT_CPU, int(cpu_s))
-        _limit(resource.RLIMIT_CORE, 0)
+        limits = {"AS": int(memory_bytes), "CPU": int(cpu_s), "CORE": 0}
+        for name, value in limits.items():
+            kind = getattr(resource, f"RLIMIT_{name}")
+            _, hard = resource.getrlimit(kind)
+            resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
         try:
             result: C3dRecording | TakeError = load_recording(Path(path))
         except TakeError as error:
             result = error
         except MemoryError:
             sys.exit(_NO_MEMORY)
-        pickle.dump((result, warnings.texts), out)
-
-
-def _limit(kind: int, value: int) -> None:
-    """Lower a limit of this process."""
-    _, hard = resource.getrlimit(kind)
-    resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+        pickle.dump((result, [record.getMessage() for record in warnings.buffer]), out)
 
 
 if __name__ == "__main__":

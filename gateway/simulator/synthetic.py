@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, Final, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from pydantic import Field
@@ -27,7 +27,7 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.rtc3d_server.measurement import ComputedScene
-from gateway.rtc3d_server.scene import NO_EVENTS, FrameSource, SampleNumbers, Scene
+from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers, Scene
 from gateway.simulator.bodies import ForcePlates, Noise, RigidBodies
 
 BUTTON_EVENT: Final = 0x123456
@@ -74,14 +74,16 @@ class SyntheticScene(ComputedScene):
         self._items = {component: items for component, count, _, items in components if count}
         self.rates_hz = {component: rate for component, count, rate, _ in components if count}
         self.measurement_rate_hz = rate_hz
+        described_markers = (
+            Marker(str(number), f"{marker_label} {number}") for number in range(1, markers + 1)
+        )
+        described_tools = (
+            Tool(str(number), f"Tool {number}", marker_ids=tuple(map(str, np.flatnonzero(on_tool) + 1)))
+            for number, on_tool in enumerate(bodies.tool_markers.T, start=1)
+        )
         self.parameters = Parameters(
-            markers=Parameters3D(
-                frequency_hz=rate_hz,
-                markers=tuple(
-                    Marker(str(number), f"{marker_label} {number}") for number in range(1, markers + 1)
-                ),
-            ),
-            tools=Parameters6D(frequency_hz=rate_hz, tools=_describe_tools(bodies)),
+            markers=Parameters3D(rate_hz, markers=tuple(described_markers)),
+            tools=Parameters6D(rate_hz, tuple(described_tools)),
             analog=channels.parameters,
             force=force_plates.parameters,
             events=_EVENTS,
@@ -128,43 +130,22 @@ class _AnalogSines:
         return voltage_mv.astype(ITEM_DTYPES[ComponentType.ANALOG])
 
 
-def _describe_tools(bodies: RigidBodies) -> tuple[Tool, ...]:
-    return tuple(
-        Tool(
-            str(number),
-            f"Tool {number}",
-            marker_ids=tuple(str(marker + 1) for marker in np.flatnonzero(on_tool)),
-        )
-        for number, on_tool in enumerate(bodies.tool_markers.T, start=1)
-    )
-
-
 def _events_before(time_us: int) -> int:
     """Return the number of button events with time stamps below ``time_us``."""
     period, rest_us = divmod(max(time_us, 0), _PERIOD_US)
     return 2 * period + (rest_us > _PRESSED_US) + (rest_us > _RELEASED_US)
 
 
+_STATES: Final = (
+    ExpectedValue("1", "1", "ON", "Button was pressed"),
+    ExpectedValue("2", "0", "OFF", "Button was released"),
+)
+_BUTTON_PARAMETERS: Final = (
+    EventParameter("1", "int", "Button id number"),
+    EventParameter("2", "int", "ON/OFF state", _STATES),
+)
 _EVENTS: Final = ParametersEvents(
-    (
-        EventDefinition(
-            id=f"0x{BUTTON_EVENT:x}",
-            label="Button",
-            description="Button action",
-            parameters=(
-                EventParameter("1", "int", "Button id number"),
-                EventParameter(
-                    "2",
-                    "int",
-                    "ON/OFF state",
-                    (
-                        ExpectedValue("1", "1", "ON", "Button was pressed"),
-                        ExpectedValue("2", "0", "OFF", "Button was released"),
-                    ),
-                ),
-            ),
-        ),
-    )
+    (EventDefinition(f"0x{BUTTON_EVENT:x}", "Button", "Button action", _BUTTON_PARAMETERS),)
 )
 
 
@@ -226,11 +207,6 @@ class RenamedScene:
         """See Scene."""
         return relabelled(self._scene.parameters, lambda each: self._prefix + each.label)
 
-    @property
-    def length_us(self) -> int | None:
-        """See Scene."""
-        return self._scene.length_us
-
     def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
         """See Scene."""
         parameters = self.parameters
@@ -238,18 +214,5 @@ class RenamedScene:
             only_sections(replace(parameters, general=parameters.general or general), sections)
         )
 
-    def start(self) -> None:
-        """See Scene."""
-        self._scene.start()
-
-    def advance(self, elapsed_us: int) -> int | None:
-        """See Scene."""
-        return self._scene.advance(elapsed_us)
-
-    def stop(self) -> None:
-        """See Scene."""
-        self._scene.stop()
-
-    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameSource:
-        """See Scene."""
-        return self._scene.frames(components, event_bytes)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scene, name)

@@ -1,6 +1,7 @@
 """The frames of a take: read from its files in moments, and sent for each choice of components."""
 
 import itertools
+import math
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,7 +9,7 @@ from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
 from statistics import median_low
-from typing import Final, NamedTuple
+from typing import Final
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, prefix_of
@@ -22,7 +23,6 @@ from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket
 from gateway.simulator.take_moments import (
     Moment,
     MomentBuilder,
-    Recorded,
     RecordedParameters,
     component_bytes,
     is_whole,
@@ -52,8 +52,8 @@ class TakePass:
     ) -> None:
         self._reader = reader
         self._source = source
-        self._first_utime = first_utime
-        self._end_utime = end_utime
+        self._first_utime = -math.inf if first_utime is None else first_utime
+        self._end_utime = math.inf if end_utime is None else end_utime
         self._builder = MomentBuilder()
         self._newest: RecordedParameters | None = None
         self._versions: dict[int, RecordedParameters] = {}
@@ -69,17 +69,13 @@ class TakePass:
         for message in self._reader.messages():
             if message.source != self._source:
                 continue
-            if self._end_utime is not None and message.utime >= self._end_utime + _RANGE_SLACK_US:
+            if message.utime >= self._end_utime + _RANGE_SLACK_US:
                 break
             if message.key == "parameters":
                 self._take_parameters(message.message)
-            elif message.key in COMPONENTS_BY_KEY and self._is_in_range(message.utime):
+            elif message.key in COMPONENTS_BY_KEY and self._first_utime <= message.utime < self._end_utime:
                 yield from self._take_component(message)
         yield from self._builder.finish()
-
-    def _is_in_range(self, utime: int) -> bool:
-        is_begun = self._first_utime is None or utime >= self._first_utime
-        return is_begun and (self._end_utime is None or utime < self._end_utime)
 
     def _take_parameters(self, message: bytes) -> None:
         try:
@@ -109,14 +105,12 @@ class TakePass:
         prefix = prefix_of(message.message)
         is_plausible = abs(prefix.utime - prefix.capture_utime) < _MAX_LATE_CAPTURE_US
         return self._builder.add(
-            Recorded(
-                component,
-                prefix.capture_utime if is_plausible else prefix.utime,
-                prefix.session,
-                message.message[8:24] + message.message[32:CONTENT_OFFSET],
-                content,
-                self._versions.get(prefix.parameters_version) or self._newest or self.default,
-            )
+            component,
+            prefix.capture_utime if is_plausible else prefix.utime,
+            prefix.session,
+            message.message[8:24] + message.message[32:CONTENT_OFFSET],
+            content,
+            self._versions.get(prefix.parameters_version) or self._newest or self.default,
         )
 
 
@@ -137,15 +131,6 @@ _FORGET_FRAMES: Final = 1000  # are forgotten together
 _FORGOTTEN_US: Final = -1  # the time of a frame that has been forgotten: long ago
 _MAX_GAPS: Final = 64  # a faulty server can announce another rate all the time
 
-_Contents = Mapping[ComponentType, bytes]
-
-
-class _Waiting(NamedTuple):
-    """A moment that may become a frame; ``gap_us`` belongs to its slowest component, None if it has none."""
-
-    moment: Moment
-    gap_us: float | None
-
 
 class RecordedFrames:
     """The recorded frames of a choice of components (see FrameSource).
@@ -160,13 +145,8 @@ class RecordedFrames:
     rates of components, for those whose rate the server does not announce.
     """
 
-    has_events: bool
-
     def __init__(
-        self,
-        requested: Sequence[ComponentType],
-        event_bytes: int,
-        rates_hz: Mapping[ComponentType, float],
+        self, requested: Sequence[ComponentType], event_bytes: int, rates_hz: Mapping[ComponentType, float]
     ) -> None:
         chosen = [component for component in WIRE_ORDER if not requested or component in requested]
         self.has_events = ComponentType.EVENT in chosen
@@ -174,7 +154,8 @@ class RecordedFrames:
         self._event_bytes = event_bytes
         self._rates_hz = rates_hz
         self._seen: set[ComponentType] = set()  # measured components of the choice
-        self._waiting: deque[_Waiting] = deque()
+        # Moments that may become frames, each with the gap of its slowest component, None if it has none.
+        self._waiting: deque[tuple[Moment, float | None]] = deque()
         self._gaps_us: list[float] = []  # of all rates so far
         self._next_us: dict[float, deque[int]] = {}  # when moments with each gap come, among those that wait
         self._last_us: dict[float, int] = {}  # when the last one was, among those before
@@ -183,7 +164,7 @@ class RecordedFrames:
         # The frames from _first on: their times and contents.
         self._first = 0
         self._times_us: list[int] = []
-        self._contents: list[_Contents] = []
+        self._contents: list[dict[ComponentType, bytes]] = []
         # The newest events: their times and contents.
         self._event_times_us: list[int] = []
         self._events: list[bytes] = []
@@ -227,16 +208,11 @@ class RecordedFrames:
 
     def _build_packet(self, byte_order: ByteOrder, tick: int, events: tuple[bytes, ...] = ()) -> DataPacket:
         contents = self._contents[tick - self._first]
-        parts: list[tuple[ComponentType, Sequence[bytes]]] = [
-            (each, [content]) for each, content in contents.items()
-        ]
+        parts: dict[ComponentType, Sequence[bytes]] = {each: [content] for each, content in contents.items()}
         if events:
-            parts.append((ComponentType.EVENT, events))
-        body = encode_frame(
-            [component_bytes(component, each, byte_order, self._event_bytes) for component, each in parts],
-            byte_order,
-        )
-        return DataPacket(encode_packet(PacketType.DATA, body), tuple(component for component, _ in parts))
+            parts[ComponentType.EVENT] = events
+        components = [component_bytes(*part, byte_order, self._event_bytes) for part in parts.items()]
+        return DataPacket(encode_packet(PacketType.DATA, encode_frame(components, byte_order)), tuple(parts))
 
     # For the scene --------------------------------------------------------------------------
 
@@ -245,9 +221,20 @@ class RecordedFrames:
         for moment in moments:
             self._horizon_us = moment.due_us
             self._add(moment)
-        self._make_frames(is_end=is_end)
+        while self._waiting:
+            moment, gap_us = self._waiting[0]
+            is_frame = False if gap_us is None else self._is_frame(moment.due_us, gap_us)
+            if is_frame is None and not is_end:
+                return
+            self._waiting.popleft()
+            if gap_us is not None:
+                self._last_us[gap_us] = self._next_us[gap_us].popleft()
+            self._newest.update(moment.contents)
+            if is_frame is not False:
+                self._add_frame(moment.due_us)
         if is_end:
-            if self._event_times_us and self._event_times_us[-1] > self._last_frame_us:
+            last_frame_us = self._times_us[-1] if self._times_us else -1
+            if self._event_times_us and self._event_times_us[-1] > last_frame_us:
                 self._add_frame(self._event_times_us[-1])
             self._newest = {}
 
@@ -261,16 +248,12 @@ class RecordedFrames:
         if excess > 0:
             del self._event_times_us[:excess], self._events[:excess]
 
-    @property
-    def _last_frame_us(self) -> int:
-        return self._times_us[-1] if self._times_us else -1
-
     # Which moments become frames ------------------------------------------------------------
 
     def _add(self, moment: Moment) -> None:
         found = [component for component in self.measured if component in moment.contents]
         if found and not self._seen:  # until now, the rate of the others counted
-            self._waiting = deque(_Waiting(each, None) for each, _ in self._waiting)
+            self._waiting = deque((each, None) for each, _ in self._waiting)
             self._next_us.clear()
             self._last_us.clear()
         self._seen.update(found)
@@ -278,24 +261,21 @@ class RecordedFrames:
         if event is not None:
             self._event_times_us.append(moment.due_us)
             self._events.append(event)
-        setting = (
-            found if self._seen else [each for each in moment.contents if each is not ComponentType.EVENT]
-        )
-        gap_us: float | None = None
-        if setting:
-            gap_us = self._known_gap(max(self._gap_us(component, moment) for component in setting))
-        elif event is not None:
-            gap_us = _EVENTS_ONLY
+        others = [] if self._seen else [each for each in moment.contents if each is not ComponentType.EVENT]
+        gap_us = None if event is None else _EVENTS_ONLY
+        if found or others:
+            gap_us = self._gap_us(found or others, moment)
         if gap_us is not None:
             self._next_us.setdefault(gap_us, deque()).append(moment.due_us)
-        self._waiting.append(_Waiting(moment, gap_us))
+        self._waiting.append((moment, gap_us))
 
-    def _gap_us(self, component: ComponentType, moment: Moment) -> float:
-        rate_hz = moment.parameters.rates_hz.get(component) or self._rates_hz.get(component)
-        return 0.0 if rate_hz is None else min(_GAP_PERIODS * 1e6 / rate_hz, float(_MAX_GAP_US))
-
-    def _known_gap(self, gap_us: float) -> float:
-        """Return the gap of a rate that is the same as this one's."""
+    def _gap_us(self, components: Sequence[ComponentType], moment: Moment) -> float:
+        """Return the gap of the slowest of these components, or the one of a rate that is the same."""
+        gap_us = 0.0
+        for component in components:
+            rate_hz = moment.parameters.rates_hz.get(component) or self._rates_hz.get(component)
+            if rate_hz is not None:
+                gap_us = max(gap_us, min(_GAP_PERIODS * 1e6 / rate_hz, float(_MAX_GAP_US)))
         for known_us in self._gaps_us:
             if known_us <= gap_us * _SAME_GAP and gap_us <= known_us * _SAME_GAP:
                 return known_us
@@ -303,22 +283,6 @@ class RecordedFrames:
             return min(self._gaps_us, key=lambda known_us: abs(known_us - gap_us))
         self._gaps_us.append(gap_us)
         return gap_us
-
-    def _make_frames(self, *, is_end: bool) -> None:
-        waiting = self._waiting
-        while waiting:
-            moment, gap_us = waiting[0]
-            is_frame = False if gap_us is None else self._is_frame(moment.due_us, gap_us)
-            if is_frame is None:
-                if not is_end:
-                    return
-                is_frame = True
-            waiting.popleft()
-            if gap_us is not None:
-                self._last_us[gap_us] = self._next_us[gap_us].popleft()
-            self._newest.update(moment.contents)
-            if is_frame:
-                self._add_frame(moment.due_us)
 
     def _is_frame(self, due_us: int, gap_us: float) -> bool | None:
         """Return whether no slower component is near; None if what follows must be known first."""

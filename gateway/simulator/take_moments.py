@@ -1,10 +1,11 @@
 """The moments of a take: which recorded components belong to the same frame, and when it is due."""
 
 import struct
-from bisect import insort
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from bisect import bisect_right, insort
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -35,7 +36,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
-from gateway.rtc3d.parameters_xml import cut_sections, encode_parameters, parse_parameters
+from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
 
 _HEAD: Final = struct.Struct(">iqi")
 """The fields of a content before its items: frame number, time stamp in µs, number of items."""
@@ -117,11 +118,6 @@ class TakeTimeline:
 
     def time_us(self, component: ComponentType, session: int, timestamp_us: int, capture_utime: int) -> int:
         """Return when a message is due. ``session`` is the number of its connection to the server."""
-        time_us = self._place(component, session, timestamp_us, capture_utime)
-        self._newest_us = max(self._newest_us, time_us)
-        return time_us
-
-    def _place(self, component: ComponentType, session: int, timestamp_us: int, capture_utime: int) -> int:
         if self._server_offset_us is None:
             self._server_offset_us = -timestamp_us
             self._capture_offset_us = -capture_utime
@@ -134,27 +130,27 @@ class TakeTimeline:
         if not is_repeated and abs(server_us - captured_us) <= _TOLERANCE_US:
             if self._trusted_from_utime is not None and capture_utime >= self._trusted_from_utime:
                 self._trusted_from_utime = None
+            time_us = captured_us
             if self._trusted_from_utime is None:
-                self._follow_drift(server_us - captured_us, capture_utime)
-                return server_us
-            return captured_us
-        if self._trusted_from_utime is None and _has_clock_step(last, session, timestamp_us, capture_utime):
+                time_us = server_us
+                limit_us = int(_DRIFT * max(0, capture_utime - self._capture_utime))
+                if limit_us:  # otherwise too little time has passed
+                    self._capture_offset_us += max(-limit_us, min(server_us - captured_us, limit_us))
+                    self._capture_utime = capture_utime
+        elif self._trusted_from_utime is None and _has_clock_step(last, session, timestamp_us, capture_utime):
             self._capture_offset_us += server_us - captured_us
             self._capture_utime = capture_utime
-            return server_us
-        if not -_TOLERANCE_US <= captured_us - self._newest_us <= _MAX_PAUSE_US:
-            self._capture_offset_us += self._newest_us - captured_us
-            captured_us = self._newest_us
-        self._server_offset_us = captured_us - timestamp_us
-        self._trusted_from_utime = capture_utime + _PROOF_US
-        self._capture_utime = capture_utime
-        return captured_us
-
-    def _follow_drift(self, error_us: int, capture_utime: int) -> None:
-        limit_us = int(_DRIFT * max(0, capture_utime - self._capture_utime))
-        if limit_us:  # otherwise too little time has passed
-            self._capture_offset_us += max(-limit_us, min(error_us, limit_us))
+            time_us = server_us
+        else:
+            time_us = captured_us
+            if not -_TOLERANCE_US <= captured_us - self._newest_us <= _MAX_PAUSE_US:
+                self._capture_offset_us += self._newest_us - captured_us
+                time_us = self._newest_us
+            self._server_offset_us = time_us - timestamp_us
+            self._trusted_from_utime = capture_utime + _PROOF_US
             self._capture_utime = capture_utime
+        self._newest_us = max(self._newest_us, time_us)
+        return time_us
 
 
 def _has_clock_step(
@@ -165,9 +161,6 @@ def _has_clock_step(
         return False
     step_us = timestamp_us - last[1]
     return 0 < step_us <= _MAX_STEP_US and abs(capture_utime - last[2] - step_us) > _TOLERANCE_US
-
-
-_MAX_EVENT_KINDS: Final = 1000
 
 
 class RecordedParameters:
@@ -194,47 +187,6 @@ class RecordedParameters:
             and (rate_hz := described_rate_hz(self.parsed, component)) is not None
         }
 
-    def xml_of(self, sections: Collection[str]) -> bytes:
-        """Return the XML of some sections (keys of SECTIONS); for all, it is the server's own, unchanged."""
-        return cut_sections(self.xml, self.parsed, sections)
-
-
-def derived_parameters(
-    num_items: Mapping[ComponentType, int],
-    rates_hz: Mapping[ComponentType, float],
-    event_ids: Iterable[int],
-) -> RecordedParameters:
-    """Return minimal parameters: numbered items, and rates rounded to 0.01 Hz."""
-
-    def numbered(component: ComponentType, noun: str) -> Iterator[tuple[str, str]]:
-        """Yield the id and the label of each item."""
-        return ((str(number), f"{noun} {number}") for number in range(1, num_items.get(component, 0) + 1))
-
-    rate_hz = {component: round(rate, 2) for component, rate in rates_hz.items()}.get
-    markers = (Marker(*each) for each in numbered(ComponentType.MARKERS, "Marker"))
-    tools = (Tool(*each) for each in numbered(ComponentType.TOOLS, "Tool"))
-    channels = (
-        AnalogChannel(*each, frequency_hz=rate_hz(ComponentType.ANALOG))
-        for each in numbered(ComponentType.ANALOG, "Analog")
-    )
-    plates = (
-        Plate(*each, frequency_hz=rate_hz(ComponentType.FORCE))
-        for each in numbered(ComponentType.FORCE, "Force plate")
-    )
-    kinds = sorted(set(event_ids))[:_MAX_EVENT_KINDS]
-    events = (EventDefinition(str(event_id), f"Event {event_id}") for event_id in kinds)
-    return RecordedParameters(
-        encode_parameters(
-            Parameters(
-                markers=Parameters3D(rate_hz(ComponentType.MARKERS), markers=tuple(markers)),
-                tools=Parameters6D(rate_hz(ComponentType.TOOLS), tuple(tools)),
-                analog=ParametersAnalog(tuple(channels)),
-                force=ParametersForce(tuple(plates)),
-                events=ParametersEvents(tuple(events)),
-            )
-        )
-    )
-
 
 _REORDER_US: Final = 500_000
 """Components of one frame that were recorded on two connections are at most this far apart in a take."""
@@ -245,6 +197,7 @@ _RELEASE_US: Final = 50_000
 _MAX_WAITING: Final = 20_000
 """How many moments wait for further components at most."""
 
+_DUE_US: Final = attrgetter("due_us")
 _UNPACK: Final = FRAME_NUMBER_AND_TIMESTAMP["big"].unpack_from
 
 
@@ -269,16 +222,46 @@ class Moment:
         return sum(map(len, self.contents.values()))
 
 
-@dataclass(slots=True, frozen=True)
-class Recorded:
-    """One recorded component. ``stamp`` is equal for all components of one frame of one connection."""
+_MAX_EVENT_KINDS: Final = 1000
 
-    component: ComponentType
-    capture_utime: int
-    session: int
-    stamp: bytes
-    content: bytes
-    parameters: RecordedParameters
+
+def derived_parameters(
+    moments: Iterable[Moment], rates_hz: Mapping[ComponentType, float]
+) -> RecordedParameters:
+    """Return minimal parameters for these moments: numbered items, and rates rounded to 0.01 Hz."""
+    counts: dict[ComponentType, int] = {}
+    event_ids: set[int] = set()
+    for moment in moments:
+        for component, content in moment.contents.items():
+            counts[component] = max(counts.get(component, 0), num_items(content))
+            if component is ComponentType.EVENT:
+                event_ids.update(items(component, content)["id"].tolist())
+
+    def numbered(component: ComponentType, noun: str) -> Iterator[tuple[str, str]]:
+        """Yield the id and the label of each item."""
+        return ((str(number), f"{noun} {number}") for number in range(1, counts.get(component, 0) + 1))
+
+    rate_hz = {component: round(rate, 2) for component, rate in rates_hz.items()}.get
+    analog_hz, force_hz = rate_hz(ComponentType.ANALOG), rate_hz(ComponentType.FORCE)
+    markers = (Marker(*each) for each in numbered(ComponentType.MARKERS, "Marker"))
+    tools = (Tool(*each) for each in numbered(ComponentType.TOOLS, "Tool"))
+    channels = (
+        AnalogChannel(*each, frequency_hz=analog_hz) for each in numbered(ComponentType.ANALOG, "Analog")
+    )
+    plates = (Plate(*each, frequency_hz=force_hz) for each in numbered(ComponentType.FORCE, "Force plate"))
+    kinds = sorted(event_ids)[:_MAX_EVENT_KINDS]
+    events = (EventDefinition(str(event_id), f"Event {event_id}") for event_id in kinds)
+    return RecordedParameters(
+        encode_parameters(
+            Parameters(
+                markers=Parameters3D(rate_hz(ComponentType.MARKERS), markers=tuple(markers)),
+                tools=Parameters6D(rate_hz(ComponentType.TOOLS), tuple(tools)),
+                analog=ParametersAnalog(tuple(channels)),
+                force=ParametersForce(tuple(plates)),
+                events=ParametersEvents(tuple(events)),
+            )
+        )
+    )
 
 
 class MomentBuilder:
@@ -298,15 +281,25 @@ class MomentBuilder:
         self._last_us: dict[ComponentType, int] = {}  # the newest moment of each component
         self._released_us = -1
 
-    def add(self, recorded: Recorded) -> list[Moment]:
-        """Add a component; return the moments that are complete now."""
-        component = recorded.component
-        _, timestamp_us = _UNPACK(recorded.content)
-        due_us = self._timeline.time_us(component, recorded.session, timestamp_us, recorded.capture_utime)
+    def add(
+        self,
+        component: ComponentType,
+        capture_utime: int,
+        session: int,
+        stamp: bytes,
+        content: bytes,
+        parameters: RecordedParameters,
+    ) -> list[Moment]:
+        """Add a recorded component; return the moments that are complete now.
+
+        ``stamp`` is equal for all components of one frame of one connection.
+        """
+        _, timestamp_us = _UNPACK(content)
+        due_us = self._timeline.time_us(component, session, timestamp_us, capture_utime)
         earliest_us = self._last_us.get(component, -1) + 1
         due_us = max(due_us, earliest_us)
         moment = self._by_timestamp.get(timestamp_us)
-        if moment is None and recorded.stamp == self._newest_stamp:
+        if moment is None and stamp == self._newest_stamp:
             moment = self._newest
         if (
             moment is None
@@ -315,15 +308,15 @@ class MomentBuilder:
             or moment.is_complete
             or abs(moment.due_us - due_us) > _REORDER_US
         ):
-            moment = Moment(due_us, timestamp_us, recorded.parameters)
+            moment = Moment(due_us, timestamp_us, parameters)
             if not self._waiting or self._waiting[-1].due_us <= due_us:
                 self._waiting.append(moment)
             else:
-                insort(self._waiting, moment, key=_due_us)
-            self._newest, self._newest_stamp = moment, recorded.stamp
+                insort(self._waiting, moment, key=_DUE_US)
+            self._newest, self._newest_stamp = moment, stamp
             self._newest_us = max(self._newest_us, due_us)
         self._by_timestamp[timestamp_us] = moment
-        moment.contents[component] = recorded.content
+        moment.contents[component] = content
         self._last_us[component] = moment.due_us
         until_us = self._newest_us - _REORDER_US
         if len(self._waiting) > _MAX_WAITING:
@@ -337,11 +330,7 @@ class MomentBuilder:
         return self._release(self._newest_us)
 
     def _release(self, until_us: int) -> list[Moment]:
-        count = 0
-        for moment in self._waiting:
-            if moment.due_us > until_us:
-                break
-            count += 1
+        count = bisect_right(self._waiting, until_us, key=_DUE_US)
         if not count:
             return []
         released, self._waiting = self._waiting[:count], self._waiting[count:]
@@ -351,7 +340,3 @@ class MomentBuilder:
         if not self._waiting or len(self._by_timestamp) > 2 * len(self._waiting) + 1000:
             self._by_timestamp = {each.timestamp_us: each for each in self._waiting}
         return released
-
-
-def _due_us(moment: Moment) -> int:
-    return moment.due_us

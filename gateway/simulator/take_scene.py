@@ -3,7 +3,7 @@
 import logging
 import weakref
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from itertools import chain, islice, pairwise
 from operator import itemgetter
@@ -15,7 +15,7 @@ from gateway.errors import SelectionError, TakeError
 from gateway.logs.safe_text import quoted, safe_text
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import General, Parameters
-from gateway.simulator import take_moments
+from gateway.rtc3d.parameters_xml import cut_sections
 from gateway.simulator.take_frames import LATE_US, RecordedFrames, TakePass
 from gateway.simulator.take_moments import Moment, RecordedParameters, derived_parameters
 from gateway.takes.files.reader import TakeReader
@@ -67,12 +67,7 @@ class TakeScene:
     """
 
     def __init__(
-        self,
-        path: Path,
-        source: str | None = None,
-        *,
-        from_s: float | None = None,
-        to_s: float | None = None,
+        self, path: Path, source: str | None = None, *, from_s: float | None = None, to_s: float | None = None
     ) -> None:
         """Read the beginning of the take. Raises TakeError if it cannot be played."""
         self._reader = TakeReader(path)
@@ -84,15 +79,16 @@ class TakeScene:
         moments = first_pass.moments()
         preview = list(islice(moments, _PREVIEW_MOMENTS))
         if not preview:
-            raise SelectionError(
-                f"{safe_text(str(path))} has no frames of {safe_text(self._source)}"
-                f"{_range_text(from_s, to_s)}; rtc3d-gateway take info shows what is in it"
-            )
+            text = f"{safe_text(str(path))} has no frames of {safe_text(self._source)}"
+            if from_s is not None or to_s is not None:
+                text += " from " + ("the beginning" if from_s is None else f"{from_s:g} s")
+                text += " to " + ("its end" if to_s is None else f"{to_s:g} s")
+            raise SelectionError(f"{text}; rtc3d-gateway take info shows what is in it")
         self._rates_hz = _rates_hz(preview)
         if first_pass.first_parameters is not None:
             self._default = first_pass.first_parameters
         else:
-            self._default = _derived(preview, self._rates_hz)
+            self._default = derived_parameters(preview, self._rates_hz)
             _log.warning(
                 "%s has no parameters of %s at its beginning; the simulator serves minimal ones, with the "
                 "numbers of items and the rates of the first frames, and numbers as labels",
@@ -138,7 +134,7 @@ class TakeScene:
 
     def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:  # noqa: ARG002 - as recorded
         """See Scene. General is that of the recorded server."""
-        return self._parameters.xml_of(sections)
+        return cut_sections(self._parameters.xml, self._parameters.parsed, sections)
 
     def start(self) -> None:
         """See Scene."""
@@ -205,19 +201,19 @@ class TakeScene:
             self._ahead.extend(batch.moments)
         for frames in self._frames:
             frames.add(batch.moments, is_end=batch.is_end)
-        if batch.is_end:
-            self._end_pass(batch.error)
-
-    def _end_pass(self, error: TakeError | None) -> None:
-        length_us = self._last_us + _period_us(self._rates_hz)
+        if not batch.is_end:
+            return
+        # The next pass follows after the longest period of a component.
+        period_us = round(1e6 / min(self._rates_hz.values())) if self._rates_hz else _DEFAULT_PERIOD_US
+        length_us = self._last_us + period_us
         if self._length_us is None:
             self._length_us = length_us
-        if error is not None:
-            _log.error("The take cannot be read any further, and ends here: %s", error)
+        if batch.error is not None:
+            _log.error("The take cannot be read any further, and ends here: %s", batch.error)
         elif not self._is_reported:
             self._is_reported = True
             self._report()
-        self._is_at_end = error is not None or not self._is_pass_begun
+        self._is_at_end = batch.error is not None or not self._is_pass_begun
         self._pass = self._new_pass()
         self._moments = self._pass.moments()
         self._pass_start_us = length_us
@@ -228,17 +224,13 @@ class TakeScene:
         logs = self._reader.logs
         num_damaged, num_bytes = sum(log.num_damaged for log in logs), sum(log.damaged_bytes for log in logs)
         num_unknown = self._reader.unknown.total()
-        if num_damaged or num_unknown or self._pass.num_malformed:
+        num_malformed = self._pass.num_malformed
+        if num_damaged or num_unknown or num_malformed:
             _log.warning(
                 "%s is not complete: %d damaged places (%d bytes), %d messages of an unknown type, and %d "
                 "malformed messages are left out",
-                *(
-                    safe_text(str(self._reader.path)),
-                    num_damaged,
-                    num_bytes,
-                    num_unknown,
-                    self._pass.num_malformed,
-                ),
+                safe_text(str(self._reader.path)),
+                *(num_damaged, num_bytes, num_unknown, num_malformed),
             )
 
 
@@ -300,27 +292,3 @@ def _rates_hz(moments: Sequence[Moment]) -> dict[ComponentType, float]:
             slower_hz = rate_hz
         rates_hz[component] = slower_hz
     return rates_hz
-
-
-def _period_us(rates_hz: Mapping[ComponentType, float]) -> int:
-    """Return the time from the last moment of a pass to the first one of the next."""
-    return round(1e6 / min(rates_hz.values())) if rates_hz else _DEFAULT_PERIOD_US
-
-
-def _derived(moments: Sequence[Moment], rates_hz: Mapping[ComponentType, float]) -> RecordedParameters:
-    """Return minimal parameters for these moments."""
-    counts: dict[ComponentType, int] = {}
-    event_ids: set[int] = set()
-    for moment in moments:
-        for component, content in moment.contents.items():
-            counts[component] = max(counts.get(component, 0), take_moments.num_items(content))
-            if component is ComponentType.EVENT:
-                event_ids.update(take_moments.items(component, content)["id"].tolist())
-    return derived_parameters(counts, rates_hz, event_ids)
-
-
-def _range_text(from_s: float | None, to_s: float | None) -> str:
-    if from_s is None and to_s is None:
-        return ""
-    begin = "the beginning" if from_s is None else f"{from_s:g} s"
-    return f" from {begin} to {'its end' if to_s is None else f'{to_s:g} s'}"

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.simulator.faults.control import KINDS
-from gateway.simulator.simulator import Simulator
+from gateway.simulator.simulator import KINDS, Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.gateways import MemoryGateway, run_gateway
 from tests.support.networks import free_port

@@ -17,7 +17,7 @@ from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.service.gateway import Gateway
-from gateway.simulator.faults.connection_faults import Rename
+from gateway.simulator.faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.networks import free_port, lcm_url, open_zenoh

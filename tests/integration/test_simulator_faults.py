@@ -11,20 +11,19 @@ import pytest
 
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import ClientConnection
-from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.connection_faults import (
+from gateway.simulator.faults import (
     ChangeScene,
     Cut,
     Delay,
+    Fault,
     HalfOpen,
     Merge,
     NoMeasurement,
     Restart,
     Split,
 )
-from gateway.simulator.faults.control import KINDS
-from gateway.simulator.faults.reply_faults import LateAcknowledgements
-from gateway.simulator.simulator import Simulator
+from gateway.simulator.packet_faults import LateAcknowledgements
+from gateway.simulator.simulator import KINDS, Simulator
 from gateway.simulator.synthetic import SceneSettings
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
@@ -106,7 +105,7 @@ async def test_a_server_whose_port_was_taken_comes_back_when_it_is_free(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another program may have taken the port meanwhile; the simulator says so and tries again."""
-    monkeypatch.setattr("gateway.simulator.faults.control._RETRY_S", 0.01)
+    monkeypatch.setattr("gateway.simulator.simulator._RETRY_S", 0.01)
     async with playing() as (simulator, client):
         restart = simulator.faults.begin(Restart(away_s=600))
         await client.rest()

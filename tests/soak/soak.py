@@ -29,8 +29,7 @@ from gateway.messages.decode import decode
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.simulator.faults.control import KINDS, Faults
-from gateway.simulator.simulator import Simulator
+from gateway.simulator.simulator import KINDS, Faults, Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.hostile.gateway_under_attack import (
     HEALTHY_SCENE,

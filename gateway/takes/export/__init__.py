@@ -5,8 +5,8 @@ and collects what has to be reported. C3D and TRC have one rate and no times per
 divides a take into parts with one rate and one set of labels, and puts their frames on a grid of the server's
 time stamps; CSV and MCAP keep the time of capture of each frame.
 
-- ``c3d``: the groups of a C3D file and its events; ``c3d_content`` has points, channels and force plates,
-  ``c3d_format`` the bytes.
+- ``c3d``: the groups of a C3D file, its events and its bytes; ``c3d_content`` has points, channels and force
+  plates.
 - ``mcap``: Foxglove's types, made by ``gateway.foxglove_schemas`` as for live viewers.
 - ``text_files``: CSV and TRC.
 

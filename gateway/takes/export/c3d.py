@@ -1,36 +1,225 @@
-"""Export to C3D: markers, analog channels, force plates and events, one file per measurement."""
+"""Export to C3D: markers, analog channels, force plates and events, one file per measurement.
 
+The format is that of the C3D user guide (c3d.org): a header, parameters in groups, and frames of 32-bit
+floats, all little-endian. What other programs write beyond its limits is used, too: more than 255 labels
+continue in LABELS2, LABELS3, …; the number of more than 65535 frames is in TRIAL:ACTUAL_END_FIELD.
+
+The file is written here and not by ezc3d, because ezc3d keeps the whole recording in memory (4 MB for each
+second of 55 markers and 69 analog channels), does not report a full disk, and cuts files at 65535 frames.
+"""
+
+import struct
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from gateway import version_text
+from gateway.descriptions.force_plates import ADDED_LABELS, CALIBRATED, calibration_of
 from gateway.descriptions.labels import MAX_EVENT_AGE_US, EventText, event_text, fitting_labels, printable
 from gateway.errors import TakeError
-from gateway.takes.export.c3d_content import C3dContent, content_of, encode_points, plate_group, residual_step
-from gateway.takes.export.c3d_format import (
-    BLOCK_BYTES,
-    MAX_FRAMES,
+from gateway.takes.export.c3d_content import (
     MAX_LIST,
-    MAX_TEXT_BYTES,
-    MAX_WORD,
-    Groups,
-    Parameter,
-    Shape,
-    encode_head,
-    encode_text,
-    rate_in_float32,
-    standard_groups,
-    text_lists,
+    C3dContent,
+    PlatePlan,
+    content_of,
+    encode_points,
+    residual_step,
 )
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, named_measurements, utc_text
+from gateway.takes.export.measurements import Measurement, named_measurements, note_missing, utc_text
 from gateway.takes.files.component_rows import Array
-from gateway.takes.files.description import TakeDetails
-from gateway.takes.files.series import Series
+
+_BLOCK_BYTES: Final = 512
+_MAX_TEXT_BYTES: Final = 120
+"""Texts are cut to this: 255 of them must fit into one parameter, whose size is a signed 16-bit number."""
+_MAX_WORD: Final = 65535
+_MAX_FRAMES: Final = 2**24
+"""A float counts frames exactly up to here: 23 hours at 200 Hz."""
+
+_MAX_PARAMETER_BLOCKS: Final = 255
+_INTEL: Final = 84
+_HEADER: Final = struct.Struct("<BBHHHHHfHHf")
+_FOUR_CHARACTER_EVENTS: Final = 0x3039
+_FOUR_CHARACTER_EVENTS_OFFSET: Final = 149 * 2
+
+_Texts: TypeAlias = Sequence[str]
+_Values: TypeAlias = _Texts | npt.NDArray[Any] | int | float
+"""The values of a parameter: texts, or numbers: 16 bits if they are integers, and 32 bits if they are floats.
+
+An array has the dimensions in the order of the C3D user guide, the first one changing fastest.
+"""
+
+_Group: TypeAlias = dict[str, _Values]
+_Groups: TypeAlias = dict[str, _Group]
+
+_KEYS: Final = ("3d", "analog", "force")
+"""The components that can be in a file; the first one that a source has gives the rate of the frames."""
+
+_BLOCK_VALUES: Final = 2_000_000  # values in memory at once: 8 MB
+
+
+def export_c3d(job: ExportJob) -> None:
+    """Write each measurement of each source to a file of its own."""
+    for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
+        _write(job, content_of(job, measurement), path)
+        if measurement.source.tools is not None:
+            job.note("tools (6D) were left out: a C3D file has points, analog channels and events")
+
+
+def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
+    """Write one file. Raises TakeError if C3D cannot have its sizes."""
+    samples = content.samples_per_frame
+    if content.num_frames > _MAX_FRAMES:
+        raise TakeError(
+            f"{path.name} would have {content.num_frames} frames, but a C3D file has at most {_MAX_FRAMES}; "
+            "choose a part by --from and --to"
+        )
+    if content.num_channels * samples > _MAX_WORD or content.num_points > _MAX_WORD:
+        raise TakeError(
+            f"{path.name} would have {content.num_points} markers and {content.num_channels} analog "
+            f"channels with {samples} samples in each frame, more than a C3D file can have; export to .csv"
+        )
+    size = max(1, _BLOCK_VALUES // max(4 * content.num_points + content.num_channels * samples, 1))
+    blocks = [(start, min(start + size, content.num_frames)) for start in range(0, content.num_frames, size)]
+    scale = 1.0
+    if content.markers is not None:
+        job.progress(f"reading the residuals of {path.name}", 0, 0)
+        scale = residual_step(content.points(start, stop) for start, stop in blocks)
+    file = job.files.create(path)
+    file.write(_head(job, content, scale))
+    incomplete_samples = 0
+    for start, stop in blocks:
+        points = encode_points(content.points(start, stop), scale).reshape(stop - start, -1)
+        channels = content.channels(start, stop)
+        incomplete_samples += int(np.isnan(channels).any(axis=1).sum())
+        frames = np.concatenate([points, channels.reshape(stop - start, -1)], axis=1)
+        file.write(frames.astype("<f4").tobytes())
+        job.progress(f"writing {path.name}", stop, content.num_frames)
+    if content.num_frames <= _MAX_WORD:  # ezc3d reads longer files to their end
+        file.write(bytes(-file.tell() % _BLOCK_BYTES))
+    note_missing(job, path, content.measurement, content.first_row, content.num_frames)
+    if content.start_s * content.rate_hz >= 1:
+        begin = f"{content.start_s:.3f} s after the take's beginning"
+        utc = utc_text(content.measurement, content.start_s)
+        job.note(f"{path.name}: time 0 is its first frame, {begin} ({utc})")
+    if incomplete_samples:
+        job.note(f"{path.name}: {incomplete_samples} analog samples are missing in the take; they are NaN")
+
+
+_TEXT_SIZES: Final = (_MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
+"""How long labels may be, in bytes; the parameters of a file have 130 kB at most."""
+
+
+def _head(job: ExportJob, content: C3dContent, scale: float) -> bytes:
+    """Return everything before the frames, with texts as long as there is room for. Raises TakeError."""
+    for max_bytes in _TEXT_SIZES:
+        head = _encode_head(content, scale, _groups(job, content, scale, max_bytes))
+        if head is not None:
+            if max_bytes < _MAX_TEXT_BYTES:
+                job.note(
+                    "a C3D file has no room for so many texts: descriptions were left out, "
+                    f"and labels have at most {max_bytes} bytes"
+                )
+            return head
+    raise TakeError("the labels do not fit into a C3D file; export to .csv instead")
+
+
+def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -> _Groups:
+    """Return all groups; with descriptions only if texts can have their full size."""
+    details = content.measurement.source.details
+    groups = _standard_groups(content, scale)
+    labels: list[str] = []
+    descriptions: list[str] = []
+    if content.markers is not None:
+        labels += content.markers.series.labels
+        described = content.parameters.markers.markers if content.parameters.markers else ()
+        descriptions += _padded([marker.description for marker in described], len(labels))
+    groups["POINT"] |= _texts(job, labels, descriptions, max_bytes, "marker")
+    labels, descriptions, units = _channel_texts(content)
+    groups["ANALOG"] |= _texts(job, labels, descriptions, max_bytes, "channel")
+    groups["ANALOG"] |= _lists("UNITS", [printable(unit) for unit in units])
+    groups["TRIAL"] |= {
+        "DATE_TIME": [utc_text(content.measurement, content.start_s)],
+        "TIME_OFFSET": content.start_s,
+    }
+    for text in (details.subject, details.session):
+        if _encode_text(text) != text.encode():
+            job.note(f"{text!r} was cut: a C3D file has texts of at most {_MAX_TEXT_BYTES} bytes")
+    if details.session:
+        groups["TRIAL"]["SESSION"] = [details.session]
+    if details.note.strip():  # in lines as long as a parameter can have in any script
+        groups["TRIAL"]["NOTE"] = textwrap.wrap(details.note, _MAX_TEXT_BYTES // 4)
+    if details.subject:
+        groups["SUBJECTS"] = {"USED": 1, "USES_PREFIXES": 0, "NAMES": [printable(details.subject)]}
+    groups["FORCE_PLATFORM"] = _plate_group(content.plates)
+    events = _event_group(job, content.measurement, content.first_row, content.num_frames)
+    if events:
+        groups["EVENT"] = events
+    groups["MANUFACTURER"] = {"SOFTWARE": ["rtc3d-gateway"], "VERSION_LABEL": [version_text()]}
+    return groups
+
+
+def _texts(job: ExportJob, labels: list[str], descriptions: list[str], max_bytes: int, noun: str) -> _Group:
+    fitted = fitting_labels(labels, printable, max_bytes, noun)
+    changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
+    if changed and max_bytes == _MAX_TEXT_BYTES:
+        job.note(f"{changed} labels of {noun}s were changed, because a C3D file cannot hold them")
+    if max_bytes < _MAX_TEXT_BYTES or not any(descriptions):
+        descriptions = [""] * len(fitted)
+    return _lists("LABELS", fitted) | _lists("DESCRIPTIONS", [printable(text) for text in descriptions])
+
+
+def _channel_texts(content: C3dContent) -> tuple[list[str], list[str], list[str]]:
+    """Return the labels, descriptions and units of the analog channels, the added ones at the end."""
+    labels: list[str] = []
+    descriptions: list[str] = []
+    units: list[str] = []
+    if content.analog is not None:
+        series = content.analog.series
+        analog = series.parameters_of(0).analog
+        labels += series.labels
+        units += series.units
+        descriptions += _padded(
+            [channel.description for channel in analog.channels] if analog else [], len(labels)
+        )
+    for plan in content.added_plates:
+        labels += [f"{label}{plan.position + 1}" for label in ADDED_LABELS]
+        force = (plan.plate.channels[0].unit if plan.plate.channels else "") or "N"
+        units += [force] * 3 + [force + content.unit] * 3
+        descriptions += [plan.plate.label] * 6
+    return labels, descriptions, units
+
+
+def _padded(texts: list[str], count: int) -> list[str]:
+    return texts[:count] + [""] * (count - len(texts))
+
+
+def _plate_group(plans: list[PlatePlan]) -> _Group:
+    """Return the group FORCE_PLATFORM."""
+    num_rows = max((len(plan.channels) for plan in plans), default=0)
+    channels = [np.array(plan.channels + (-1,) * (num_rows - len(plan.channels))) + 1 for plan in plans]
+    units = {plan.plate.channels[0].unit for plan in plans if plan.plate.channels} - {"", "N"}
+    matrices = [calibration_of(plan.plate) if plan.type == CALIBRATED else np.zeros((6, 6)) for plan in plans]
+    return {
+        "USED": len(plans),
+        "TYPE": np.array([plan.type for plan in plans], int),
+        "ZERO": np.zeros(2, int),
+        "CORNERS": _stack([plan.geometry.corners.T for plan in plans]),
+        "ORIGIN": _stack([plan.geometry.origin for plan in plans]),
+        "CHANNEL": _stack(channels, int),
+        "CAL_MATRIX": _stack(matrices),
+        **({"UNITS": [units.pop()]} if len(units) == 1 else {}),
+    }
+
+
+def _stack(arrays: list[Array], dtype: type = float) -> Array:
+    """Return arrays along a new last dimension; an empty list if there are none."""
+    return np.stack(arrays, axis=-1) if arrays else np.zeros(0, dtype)
+
 
 _MINUTE_S: Final = 60.0
 _SIDES: Final = {"Left", "Right"}
@@ -38,11 +227,39 @@ _MARGIN_S: Final = 1.0
 """An event within this time before the first frame or after the last one belongs to the measurement."""
 
 
-def event_times_us(events: Series) -> Array:
-    """Return the server's time of each event: its own, or that of its frame if it is far from that."""
-    own = events.items["timestamp"]
-    is_near = abs(own.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
-    return np.where(is_near, own, events.timestamp_us)
+def _event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> _Group:
+    """Return the group EVENT with the events of these rows; {} if there are none.
+
+    The time of an event is its own, or that of its frame if it is far from that.
+    """
+    events = measurement.source.events
+    if events is None:
+        return {}
+    rate_hz = measurement.grid.rate_hz
+    own_us = events.items["timestamp"]
+    is_near = abs(own_us.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
+    times_us = np.where(is_near, own_us, events.timestamp_us)
+    seconds = measurement.seconds_of(times_us, events.capture_utime) - first_row / rate_hz
+    (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
+    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
+    if len(chosen) > MAX_LIST:
+        left_out = len(chosen) - MAX_LIST
+        job.note(f"{left_out} of {len(chosen)} events were left out: a C3D file has at most 255")
+        chosen = chosen[:MAX_LIST]
+    if not len(chosen):
+        return {}
+    subject = measurement.source.details.subject
+    texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
+    return {
+        "USED": len(chosen),
+        "CONTEXTS": [printable(_context_of(text)) for text in texts],
+        "LABELS": [printable(text.label) for text in texts],
+        "DESCRIPTIONS": [printable(text.description) for text in texts],
+        "SUBJECTS": [printable(_value_of(text, "subject") or subject) for text in texts],
+        "TIMES": np.stack(np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)),
+        "ICON_IDS": np.zeros(len(chosen), int),
+        "GENERIC_FLAGS": np.zeros(len(chosen), int),
+    }
 
 
 def _context_of(text: EventText) -> str:
@@ -65,218 +282,96 @@ def _value_of(text: EventText, name: str) -> str:
     return next((value for each, value in text.values if each.strip().casefold() == name), "")
 
 
-def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> list[Parameter]:
-    """Return the group EVENT with the events of these rows; [] if there are none."""
-    events = measurement.source.events
-    if events is None:
-        return []
-    rate_hz = measurement.grid.rate_hz
-    seconds = measurement.seconds_of(event_times_us(events), events.capture_utime) - first_row / rate_hz
-    (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
-    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
-    if len(chosen) > MAX_LIST:
-        job.note(
-            f"{len(chosen) - MAX_LIST} of {len(chosen)} events were left out: a C3D file has at most 255"
-        )
-        chosen = chosen[:MAX_LIST]
-    if not len(chosen):
-        return []
-    count = len(chosen)
-    subject = measurement.source.details.subject
-    texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
-    minutes, rest = np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)
-    return [
-        Parameter("USED", np.array(count, np.int16)),
-        Parameter("CONTEXTS", [printable(_context_of(text)) for text in texts]),
-        Parameter("LABELS", [printable(text.label) for text in texts]),
-        Parameter("DESCRIPTIONS", [printable(text.description) for text in texts]),
-        Parameter("SUBJECTS", [printable(_value_of(text, "subject") or subject) for text in texts]),
-        Parameter("TIMES", np.stack([minutes, rest]).astype(np.float32)),
-        Parameter("ICON_IDS", np.zeros(count, np.int16)),
-        Parameter("GENERIC_FLAGS", np.zeros(count, np.int16)),
-    ]
+def _lists(name: str, values: _Texts | npt.NDArray[Any]) -> _Group:
+    """Return a list of texts or numbers as NAME, and NAME2, NAME3, … if they are more than 255."""
+    parts = enumerate(range(0, max(len(values), 1), MAX_LIST), start=1)
+    return {name if part == 1 else f"{name}{part}": values[at : at + MAX_LIST] for part, at in parts}
 
 
-_TEXT_SIZES: Final = (MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
-"""How long labels may be, in bytes; the parameters of a file have 130 kB at most."""
+def _standard_groups(content: C3dContent, scale: float) -> _Groups:
+    """Return POINT, ANALOG and TRIAL with the sizes and rates; labels and the like are still missing."""
+    return {
+        "POINT": {
+            "USED": content.num_points,
+            "SCALE": -scale,
+            "RATE": content.rate_hz,
+            "DATA_START": 0,
+            "FRAMES": min(content.num_frames, _MAX_WORD),
+            "UNITS": [content.unit],
+            **({"LONG_FRAMES": float(content.num_frames)} if content.num_frames > _MAX_WORD else {}),
+        },
+        "ANALOG": {
+            "USED": content.num_channels,
+            "GEN_SCALE": 1.0,
+            "RATE": content.rate_hz * content.samples_per_frame if content.num_channels else 0.0,
+            "FORMAT": ["SIGNED"],
+            "BITS": 16,
+            **_lists("SCALE", np.ones(content.num_channels)),
+            **_lists("OFFSET", np.zeros(content.num_channels, int)),
+        },
+        "TRIAL": {
+            "ACTUAL_START_FIELD": np.array([1, 0]),
+            "ACTUAL_END_FIELD": np.array([content.num_frames & _MAX_WORD, content.num_frames >> 16]),
+            "CAMERA_RATE": content.rate_hz,
+        },
+    }
 
 
-def encode_head_that_fits(job: ExportJob, content: C3dContent, shape: Shape) -> bytes:
-    """Return everything before the frames, with texts as long as there is room for. Raises TakeError."""
-    error: TakeError | None = None
-    for max_bytes in _TEXT_SIZES:
-        try:
-            head = encode_head(shape, _groups(job, content, shape, max_bytes))
-        except TakeError as too_large:
-            error = too_large
-            continue
-        if error is not None:
-            job.note(
-                "a C3D file has no room for so many texts: descriptions were left out, "
-                f"and labels have at most {max_bytes} bytes"
-            )
-        return head
-    raise error or TakeError("there is no room for labels")
-
-
-def _groups(job: ExportJob, content: C3dContent, shape: Shape, max_bytes: int) -> Groups:
-    """Return all groups; with descriptions only if texts can have their full size."""
-    groups = standard_groups(shape, [content.unit])
-    labels, descriptions = _point_texts(content)
-    groups["POINT"] += _texts(job, labels, descriptions, max_bytes, "marker")
-    labels, descriptions, units = _channel_texts(content)
-    groups["ANALOG"] += _texts(job, labels, descriptions, max_bytes, "channel")
-    groups["ANALOG"] += text_lists("UNITS", [printable(unit) for unit in units])
-    groups["TRIAL"] += [
-        Parameter("DATE_TIME", [utc_text(content.measurement, content.start_s)]),
-        Parameter("TIME_OFFSET", np.array(content.start_s, np.float32)),
-        *_details(job, content.measurement.source.details),
-    ]
-    subject = content.measurement.source.details.subject
-    if subject:
-        groups["SUBJECTS"] = [
-            Parameter("USED", np.array(1, np.int16)),
-            Parameter("USES_PREFIXES", np.array(0, np.int16)),
-            Parameter("NAMES", [printable(subject)]),
-        ]
-    groups["FORCE_PLATFORM"] = plate_group(content.plates)
-    events = event_group(job, content.measurement, content.first_row, content.num_frames)
-    if events:
-        groups["EVENT"] = events
-    groups["MANUFACTURER"] = [
-        Parameter("SOFTWARE", ["rtc3d-gateway"]),
-        Parameter("VERSION_LABEL", [version_text()]),
-    ]
-    return groups
-
-
-def _details(job: ExportJob, details: TakeDetails) -> list[Parameter]:
-    """Return the session and the note, in lines as long as a parameter can have in any script."""
-    for text in (details.subject, details.session):
-        if encode_text(text) != text.encode():
-            job.note(f"{text!r} was cut: a C3D file has texts of at most {MAX_TEXT_BYTES} bytes")
-    texts = {"SESSION": [details.session], "NOTE": textwrap.wrap(details.note, MAX_TEXT_BYTES // 4)}
-    return [Parameter(name, lines) for name, lines in texts.items() if any(lines)]
-
-
-def _texts(
-    job: ExportJob, labels: list[str], descriptions: list[str], max_bytes: int, noun: str
-) -> list[Parameter]:
-    fitted = fitting_labels(labels, printable, max_bytes, noun)
-    changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
-    if changed and max_bytes == MAX_TEXT_BYTES:
-        job.note(f"{changed} labels of {noun}s were changed, because a C3D file cannot hold them")
-    if max_bytes < MAX_TEXT_BYTES or not any(descriptions):
-        descriptions = [""] * len(fitted)
-    return [
-        *text_lists("LABELS", fitted),
-        *text_lists("DESCRIPTIONS", [printable(text) for text in descriptions]),
-    ]
-
-
-def _point_texts(content: C3dContent) -> tuple[list[str], list[str]]:
-    """Return the labels and descriptions of the markers."""
-    if content.markers is None:
-        return [], []
-    labels = list(content.markers.series.labels)
-    described = content.parameters.markers.markers if content.parameters.markers else ()
-    return labels, _padded([marker.description for marker in described], len(labels))
-
-
-def _channel_texts(content: C3dContent) -> tuple[list[str], list[str], list[str]]:
-    """Return the labels, descriptions and units of the analog channels, the added ones at the end."""
-    labels: list[str] = []
-    descriptions: list[str] = []
-    units: list[str] = []
-    if content.analog is not None:
-        series = content.analog.series
-        analog = series.parameters_of(0).analog
-        labels += series.labels
-        units += series.units
-        descriptions += _padded(
-            [channel.description for channel in analog.channels] if analog else [], len(labels)
-        )
-    for plan in content.added_plates:
-        labels += plan.added_labels()
-        units += plan.added_units(content.unit)
-        descriptions += [plan.plate.label] * 6
-    return labels, descriptions, units
-
-
-def _padded(texts: list[str], count: int) -> list[str]:
-    return texts[:count] + [""] * (count - len(texts))
-
-
-_KEYS: Final = ("3d", "analog", "force")
-"""The components that can be in a file; the first one that a source has gives the rate of the frames."""
-
-_BLOCK_VALUES: Final = 2_000_000  # values in memory at once: 8 MB
-
-
-def export_c3d(job: ExportJob) -> None:
-    """Write each measurement of each source to a file of its own."""
-    for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
-        _write(job, content_of(job, measurement), path)
-        if measurement.source.tools is not None:
-            job.note("tools (6D) were left out: a C3D file has points, analog channels and events")
-
-
-def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
-    """Write one file."""
-    shape = _shape(content, path)
-    if content.markers is not None:
-        job.progress(f"reading the residuals of {path.name}", 0, 0)
-        step = residual_step(content.points(start, stop) for start, stop in _blocks(shape))
-        shape = shape._replace(scale=step)
-    file = job.files.create(path)
-    file.write(encode_head_that_fits(job, content, shape))
-    incomplete_samples = 0
-    for start, stop in _blocks(shape):
-        points = encode_points(content.points(start, stop), shape.scale).reshape(stop - start, -1)
-        channels = content.channels(start, stop)
-        incomplete_samples += int(np.isnan(channels).any(axis=1).sum())
-        frames = np.concatenate([points, channels.reshape(stop - start, -1)], axis=1)
-        file.write(frames.astype("<f4").tobytes())
-        job.progress(f"writing {path.name}", stop, content.num_frames)
-    if content.num_frames <= MAX_WORD:  # ezc3d reads longer files to their end
-        file.write(bytes(-file.tell() % BLOCK_BYTES))
-    missing = content.measurement.frames.num_missing(
-        content.first_row, content.first_row + content.num_frames
+def _encode_head(content: C3dContent, scale: float, groups: _Groups) -> bytes | None:
+    """Return everything before the frames, with POINT:DATA_START; None if the parameters are too large."""
+    num_blocks = -(-len(_encode_groups(groups)) // _BLOCK_BYTES)
+    if num_blocks > _MAX_PARAMETER_BLOCKS:
+        return None
+    data_block = groups["POINT"]["DATA_START"] = 2 + num_blocks
+    samples_per_frame = content.samples_per_frame if content.num_channels else 0
+    header = bytearray(_BLOCK_BYTES)
+    _HEADER.pack_into(
+        header,
+        0,
+        2,  # the block of the parameters
+        0x50,
+        content.num_points,
+        content.num_channels * samples_per_frame,
+        1,  # the number of the first frame
+        min(content.num_frames, _MAX_WORD),
+        10,  # the largest gap that may be interpolated, in frames
+        -scale,  # negative: the points are floats
+        data_block,
+        samples_per_frame,
+        content.rate_hz,
     )
-    if missing:
-        job.note(
-            f"{path.name}: {missing} of {content.num_frames} frames are missing in the take; they are empty"
-        )
-    start_s = content.start_s
-    if start_s * shape.rate_hz >= 1:
-        begin = utc_text(content.measurement, start_s)
-        job.note(
-            f"{path.name}: time 0 is its first frame, {start_s:.3f} s after the take's beginning ({begin})"
-        )
-    if incomplete_samples:
-        job.note(f"{path.name}: {incomplete_samples} analog samples are missing in the take; they are NaN")
+    struct.pack_into("<H", header, _FOUR_CHARACTER_EVENTS_OFFSET, _FOUR_CHARACTER_EVENTS)
+    return bytes(header) + _encode_groups(groups).ljust(num_blocks * _BLOCK_BYTES, b"\0")
 
 
-def _shape(content: C3dContent, path: Path) -> Shape:
-    """Return the sizes of a file. Raises TakeError if C3D cannot have them."""
-    samples = content.samples_per_frame
-    if content.num_frames > MAX_FRAMES:
-        raise TakeError(
-            f"{path.name} would have {content.num_frames} frames, but a C3D file has at most {MAX_FRAMES}; "
-            "choose a part by --from and --to"
-        )
-    if content.num_channels * samples > MAX_WORD or content.num_points > MAX_WORD:
-        raise TakeError(
-            f"{path.name} would have {content.num_points} markers and {content.num_channels} analog "
-            f"channels with {samples} samples in each frame, more than a C3D file can have; export to .csv"
-        )
-    rate_hz = rate_in_float32(content.measurement.grid.rate_hz, samples)
-    return Shape(content.num_points, content.num_channels, samples, content.num_frames, rate_hz, 1.0)
+def _encode_groups(groups: _Groups) -> bytes:
+    records = []
+    for number, (name, parameters) in enumerate(groups.items(), start=1):
+        records.append(_record(name, -number, b""))
+        records += [_record(each, number, _encode_values(values)) for each, values in parameters.items()]
+    body = b"".join(records) + b"\0\0"
+    num_blocks = -(-(4 + len(body)) // _BLOCK_BYTES)
+    return struct.pack("<BBBB", 1, 0x50, min(num_blocks, 255), _INTEL) + body
 
 
-def _blocks(shape: Shape) -> Iterator[tuple[int, int]]:
-    """Yield the first frame of each block, and the one after its last."""
-    values = 4 * shape.num_points + shape.num_channels * shape.samples_per_frame
-    size = max(1, _BLOCK_VALUES // max(values, 1))
-    for start in range(0, shape.num_frames, size):
-        yield start, min(start + size, shape.num_frames)
+def _record(name: str, number: int, content: bytes) -> bytes:
+    """Return a group or a parameter, with an empty description; the offset counts from itself."""
+    head = struct.pack("<bb", len(name), number) + name.encode("ascii")
+    return head + struct.pack("<H", 3 + len(content)) + content + b"\0"
+
+
+def _encode_values(values: _Values) -> bytes:
+    if isinstance(values, Sequence):
+        encoded = [_encode_text(text) for text in values]
+        width = max(map(len, encoded), default=0)
+        data = b"".join(text.ljust(width) for text in encoded)
+        return struct.pack("<bBBB", -1, 2, width, len(encoded)) + data
+    numbers = np.asarray(values)
+    kind, dtype = (4, "<f4") if numbers.dtype.kind == "f" else (2, "<i2")
+    sizes = struct.pack("<bB", kind, numbers.ndim) + bytes(numbers.shape)
+    return sizes + numbers.astype(dtype).tobytes(order="F")
+
+
+def _encode_text(text: str) -> bytes:
+    """Return a text as UTF-8 of at most _MAX_TEXT_BYTES, cut between two characters."""
+    return text.encode(errors="replace")[:_MAX_TEXT_BYTES].decode(errors="ignore").encode()

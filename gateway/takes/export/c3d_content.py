@@ -1,13 +1,11 @@
 """What one C3D file has: the components of a measurement, aligned by the server's time stamps."""
 
 from collections.abc import Iterable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from gateway.descriptions.force_plates import (
-    ADDED_LABELS,
-    CALIBRATED,
     FORCES_AND_MOMENTS,
     PlateGeometry,
     calibration_of,
@@ -20,10 +18,12 @@ from gateway.descriptions.force_plates import (
     possible_types,
 )
 from gateway.rtc3d.parameters import Parameters, Plate
-from gateway.takes.export.c3d_format import MAX_LIST, Parameter
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import Measurement, Part, Placed, place, seconds_of_row
 from gateway.takes.files.component_rows import Array
+
+MAX_LIST: Final = 255
+"""The highest number of values in one dimension of a parameter; a longer list continues in others."""
 
 _MAX_STEPS: Final = 127
 _BOTH_BYTES: Final = 257
@@ -86,34 +86,20 @@ class PlatePlan(NamedTuple):
     is_added: bool
     moment_factor: float
 
-    def added_labels(self) -> list[str]:
-        """Return the labels of the six added channels, such as Fx1."""
-        return [f"{label}{self.position + 1}" for label in ADDED_LABELS]
-
-    def added_units(self, position_unit: str) -> list[str]:
-        """Return the units of the six added channels."""
-        force = self.plate.channels[0].unit if self.plate.channels else ""
-        return [force or "N"] * 3 + [(force or "N") + position_unit] * 3
-
-    def added_values(self, loads: Array) -> Array:
-        """Return the six added channels, shape (samples, 6), from Force items of shape (samples, plates,
-        6)."""
-        return channels_from_loads(self._loads(loads), self.geometry)
-
     def explains(self, channels: Array, loads: Array) -> bool:
         """Whether readers compute the recorded loads from the plate's own channels.
 
         The server's loads may have the axes of the laboratory or those of the plate.
         """
-        calibration = calibration_of(self.plate)
-        computed = loads_from_channels(self.type, channels, calibration, self.geometry)
-        recorded = self._loads(loads)
-        if is_equal(computed, recorded):
-            return True
         own_axes = self.geometry._replace(rotation=np.eye(3), origin=np.zeros(3))
-        return is_equal(loads_from_channels(self.type, channels, calibration, own_axes), recorded)
+        calibration, recorded = calibration_of(self.plate), self.loads_of(loads)
+        return any(
+            is_equal(loads_from_channels(self.type, channels, calibration, geometry), recorded)
+            for geometry in (self.geometry, own_axes)
+        )
 
-    def _loads(self, loads: Array) -> Array:
+    def loads_of(self, loads: Array) -> Array:
+        """Return the plate's loads, shape (samples, 6), of Force items, shape (samples, plates, 6)."""
         return loads[:, self.position].astype(np.float64) * ([1.0] * 3 + [self.moment_factor] * 3)
 
 
@@ -157,54 +143,29 @@ def plan_plates(
 def _with_own_channels(
     plan: PlatePlan, parameters: Parameters, analog: Placed | None, forces: Placed | None
 ) -> PlatePlan | None:
-    """Return the plan with the server's own channels; None if the recorded loads do not follow from them."""
+    """Return the plan with the server's own channels; None if the recorded loads do not follow from them.
+
+    Values of the same times are compared, from the whole measurement.
+    """
     channels = own_channels(plan.plate, parameters.analog)
     if analog is None or not channels or max(channels) >= analog.num_items:
         return None
-    common = None
-    if forces is not None and plan.position < forces.num_items:
-        common = _common_samples(analog, forces)
-    for plate_type in possible_types(plan.plate, len(channels)):
-        own = plan._replace(type=plate_type, channels=channels)
-        if common is None or own.explains(common[0][:, channels], common[1]):
-            return own
-    return None
-
-
-def _common_samples(analog: Placed, forces: Placed) -> tuple[Array, Array] | None:
-    """Return analog and force values of the same times, from the whole measurement; None if there are
-    none."""
-    first, last = max(analog.first_row, forces.first_row), min(analog.last_row, forces.last_row)
-    starts = np.unique(
-        np.linspace(first, max(first, last - _COMPARED_ROWS + 1), _COMPARED_BLOCKS).astype(int)
-    )
-    channels = np.concatenate([analog.block(start, start + _COMPARED_ROWS) for start in starts.tolist()])
-    loads = np.concatenate([forces.block(start, start + _COMPARED_ROWS) for start in starts.tolist()])
-    known = np.isfinite(channels).all(axis=1) & np.isfinite(loads).all(axis=(1, 2))
-    return (channels[known].astype(np.float64), loads[known]) if known.any() else None
-
-
-def plate_group(plans: list[PlatePlan]) -> list[Parameter]:
-    """Return the group FORCE_PLATFORM."""
-    num_rows = max((len(plan.channels) for plan in plans), default=0)
-    channels = [np.array(plan.channels + (-1,) * (num_rows - len(plan.channels))) + 1 for plan in plans]
-    units = {plan.plate.channels[0].unit for plan in plans if plan.plate.channels} - {"", "N"}
-    matrices = [calibration_of(plan.plate) if plan.type == CALIBRATED else np.zeros((6, 6)) for plan in plans]
-    return [
-        Parameter("USED", np.array(len(plans), np.int16)),
-        Parameter("TYPE", np.array([plan.type for plan in plans], np.int16)),
-        Parameter("ZERO", np.zeros(2, np.int16)),
-        Parameter("CORNERS", _stack([plan.geometry.corners.T for plan in plans])),
-        Parameter("ORIGIN", _stack([plan.geometry.origin for plan in plans])),
-        Parameter("CHANNEL", _stack(channels, np.int16)),
-        Parameter("CAL_MATRIX", _stack(matrices)),
-        *([Parameter("UNITS", [units.pop()])] if len(units) == 1 else []),
+    plans = [
+        plan._replace(type=plate_type, channels=channels)
+        for plate_type in possible_types(plan.plate, len(channels))
     ]
-
-
-def _stack(arrays: list[Array], dtype: type[np.number[Any]] = np.float32) -> Array:
-    """Return arrays along a new last dimension; an empty list if there are none."""
-    return np.stack(arrays, axis=-1).astype(dtype) if arrays else np.zeros(0, dtype)
+    if forces is None or plan.position >= forces.num_items:
+        return next(iter(plans), None)
+    first, last = max(analog.first_row, forces.first_row), min(analog.last_row, forces.last_row)
+    latest = max(first, last - _COMPARED_ROWS + 1)
+    starts = np.unique(np.linspace(first, latest, _COMPARED_BLOCKS).astype(int)).tolist()
+    values, loads = (
+        np.concatenate([placed.block(start, start + _COMPARED_ROWS) for start in starts])
+        for placed in (analog, forces)
+    )
+    known = np.isfinite(values).all(axis=1) & np.isfinite(loads).all(axis=(1, 2))
+    values = values[known][:, channels].astype(np.float64)
+    return next((own for own in plans if not known.any() or own.explains(values, loads[known])), None)
 
 
 _MAX_TRIMMED_S: Final = 1.0
@@ -231,6 +192,17 @@ class C3dContent(NamedTuple):
     def start_s(self) -> float:
         """When the first frame was captured, in seconds since the beginning of the take."""
         return seconds_of_row(self.measurement, self.first_row)
+
+    @property
+    def rate_hz(self) -> float:
+        """The nearest rate of frames whose product with ``samples_per_frame`` is exact in 32 bits.
+
+        Readers divide ANALOG:RATE by POINT:RATE and need exactly ``samples_per_frame``.
+        """
+        bits = max(self.samples_per_frame - 1, 0).bit_length()
+        mantissa, exponent = np.frexp(np.float32(self.measurement.grid.rate_hz))
+        digits = 2.0 ** (24 - bits)
+        return float(np.ldexp(np.round(mantissa * digits) / digits, exponent))
 
     @property
     def num_points(self) -> int:
@@ -262,7 +234,7 @@ class C3dContent(NamedTuple):
             parts.append(self.analog.block(first, last))
         if self.forces is not None and self.added_plates:
             loads = self.forces.block(first, last)
-            parts += [plan.added_values(loads) for plan in self.added_plates]
+            parts += [channels_from_loads(plan.loads_of(loads), plan.geometry) for plan in self.added_plates]
         return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
@@ -273,7 +245,14 @@ def content_of(job: ExportJob, measurement: Measurement) -> C3dContent:
     analog, samples = _sampled(job, measurement, "analog", None)
     forces, samples = _sampled(job, measurement, "force", samples)
     samples = samples or 1
-    first, stop = _complete_rows(measurement, analog or forces, samples)
+    sampled, first, stop = analog or forces, 0, measurement.grid.num_rows
+    if sampled is not None:
+        most = _MAX_TRIMMED_S * measurement.grid.rate_hz
+        first_complete, stop_complete = -(-sampled.first_row // samples), (sampled.last_row + 1) // samples
+        first = first_complete if first_complete <= most else first
+        stop = stop_complete if stop - stop_complete <= most else stop
+        if first >= stop:
+            first, stop = 0, measurement.grid.num_rows
     left_out = measurement.grid.num_rows - (stop - first)
     if left_out:
         job.note(f"frames at the ends were left out because they have no analog samples: {left_out}")
@@ -306,16 +285,3 @@ def _sampled(
     if len(found) > 1:
         job.note(f"{key}: a part with other labels or another rate was left out; export to .csv has it")
     return Placed(found[chosen]), chosen[0]
-
-
-def _complete_rows(measurement: Measurement, analog: Placed | None, samples: int) -> tuple[int, int]:
-    """Return the rows without those at the ends that lack analog samples, if these are at most 1 s."""
-    stop = measurement.grid.num_rows
-    if analog is None:
-        return 0, stop
-    most = _MAX_TRIMMED_S * measurement.grid.rate_hz
-    first_complete = -(-analog.first_row // samples)
-    stop_complete = (analog.last_row + 1) // samples
-    first = first_complete if first_complete <= most else 0
-    stop = stop_complete if stop - stop_complete <= most else stop
-    return (first, stop) if first < stop else (0, measurement.grid.num_rows)

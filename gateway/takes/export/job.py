@@ -29,10 +29,6 @@ _INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
 _MAX_NAMED: Final = 10
 
 
-def _no_progress(*_: object) -> None:
-    """Show nothing."""
-
-
 def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     extension = job.out.suffix.lower()
@@ -66,7 +62,7 @@ class ExportJob:
     source: str | None = None
     from_s: float | None = None
     to_s: float | None = None
-    progress: Callable[[str, int, int], None] = _no_progress
+    progress: Callable[[str, int, int], None] = lambda *_: None
     notes: list[str] = field(default_factory=list)
     files: NewFiles = field(default_factory=NewFiles)
 
@@ -82,26 +78,22 @@ class ExportJob:
         """
         from gateway.takes.files.take import open_take  # noqa: PLC0415 - see above
 
-        text = f"reading {self.take.name}"
         take = open_take(
             self.take,
             sources=None if self.source is None else [self.source],
             components=components,
             from_s=self.from_s,
             to_s=self.to_s,
-            progress=lambda done, total: self.progress(text, done, total),
+            progress=lambda done, total: self.progress(f"reading {self.take.name}", done, total),
         )
         if take.num_damaged:
             places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"
             self.note(f"the take is damaged at {places}: {take.damaged_bytes} bytes cannot be read")
         if take.unknown:
-            channels = ", ".join([*take.unknown][:_MAX_NAMED]) + (
-                ", …" if len(take.unknown) > _MAX_NAMED else ""
-            )
-            count = sum(take.unknown.values())
-            self.note(
-                f"messages of other programs or versions were left out: {count}, on the channels {channels}"
-            )
+            more = ["…"] if len(take.unknown) > _MAX_NAMED else []
+            channels = ", ".join([*take.unknown][:_MAX_NAMED] + more)
+            left_out = f"{sum(take.unknown.values())}, on the channels {channels}"
+            self.note(f"messages of other programs or versions were left out: {left_out}")
         for source in take.sources.values():
             if not source.parameters:
                 self.note(

@@ -54,7 +54,7 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     order = order[np.concatenate([[True], np.diff(run.sequence[order]) > 0])]
     sequence = run.sequence[order]
     stamps = run.timestamp_us[order]
-    has_time_stamps = by_time_stamps and _progresses(stamps)
+    has_time_stamps = by_time_stamps and (len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5))
     times = stamps if has_time_stamps else run.capture_utime[order]
     period_us = regular_step(np.diff(times)[np.diff(sequence) == 1])
     rate_hz = _rate_hz(period_us, run.rate_hz)
@@ -69,10 +69,6 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
         Grid(rate_hz, rows[start:stop] - rows[start], order[start:stop], times[start:stop], has_time_stamps)
         for start, stop in zip([0, *cuts.tolist()], [*cuts.tolist(), len(order)], strict=True)
     ]
-
-
-def _progresses(stamps: Array) -> bool:
-    return len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5)
 
 
 def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
@@ -136,14 +132,6 @@ class Placed:
             block[part.rows[first:last] - start] = part.series.values[part.frames[first:last]]
         return block
 
-    def num_missing(self, start: int, stop: int) -> int:
-        """Return how many of these rows have no frame."""
-        found = np.zeros(stop - start, bool)
-        for part in self.parts:
-            first, last = np.searchsorted(part.rows, [start, stop])
-            found[part.rows[first:last] - start] = True
-        return int((~found).sum())
-
 
 class Measurement(NamedTuple):
     """One measurement of a source. ``grid`` has the places of the frames of ``base``.
@@ -161,10 +149,14 @@ class Measurement(NamedTuple):
         """The frames of ``base`` in their rows."""
         return Placed([Part(self.base, self.grid.rows, self.grid.frames)])
 
+    @property
+    def captures(self) -> Array:
+        """The times of capture of the frames of ``base``."""
+        return self.base.capture_utime[self.grid.frames]
+
     def runs_of(self, key: str) -> list[Series]:
         """Return the runs of a component that were captured at the time of this measurement."""
-        captures = self.base.capture_utime[self.grid.frames]
-        first, last = captures.min() - _MARGIN_US, captures.max() + _MARGIN_US
+        first, last = self.captures.min() - _MARGIN_US, self.captures.max() + _MARGIN_US
         found = self.runs.get(key, [])
         return [run for run in found if run.capture_utime.max() >= first and run.capture_utime.min() <= last]
 
@@ -187,7 +179,7 @@ class Measurement(NamedTuple):
     def seconds_of(self, times_us: Array, capture_utime: Array) -> Array:
         """Return times of the server in seconds from the first row; NaN if they are of another
         measurement."""
-        base_times, base_captures = self._times()
+        base_times, base_captures = self.grid.times_us, self.captures
         times = times_us if self.grid.has_time_stamps else capture_utime
         nearest = _nearest(base_times, times)
         offset_us = (capture_utime - times) - (base_captures - base_times)[nearest]
@@ -197,7 +189,7 @@ class Measurement(NamedTuple):
 
     def _row_of(self, run: Series, grid: Grid, rows_per_row: int) -> int | None:
         """Return the row of a run's first frame; None if it is not of this measurement."""
-        base_times, base_captures = self._times()
+        base_times, base_captures = self.grid.times_us, self.captures
         captures = run.capture_utime[grid.frames]
         if grid.has_time_stamps and self.grid.has_time_stamps:
             times = grid.times_us
@@ -221,10 +213,6 @@ class Measurement(NamedTuple):
         distance = round(float(times[anchor] - base_times[near]) / period_us)
         return int(self.grid.rows[near]) * rows_per_row + distance - int(grid.rows[anchor])
 
-    def _times(self) -> tuple[Array, Array]:
-        """Return the times of the base's frames on the server's clock, and on the gateway's."""
-        return self.grid.times_us, self.base.capture_utime[self.grid.frames]
-
 
 def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list[tuple[Measurement, Path]]:
     """Return the measurements of a take, each with the name of its file. Raises TakeError if there are none.
@@ -233,8 +221,11 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     called. A measurement begins where the server's time stamps start again or pause for more than 10 s, with
     each session, and where the labels change.
     """
-    by_source = {source.name: _measurements(source, keys) for source in job.open_take().sources.values()}
-    by_source = {name: found for name, found in by_source.items() if found}
+    by_source = {
+        source.name: found
+        for source in job.open_take().sources.values()
+        if (found := _measurements(source, keys))
+    }
     total = sum(map(len, by_source.values()))
     if not total:
         raise nothing_to_export(job, what)
@@ -247,19 +238,24 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     named = []
     for name, found in by_source.items():
         for number, measurement in enumerate(found, start=1):
-            source_part = name if len(by_source) > 1 else ""
-            number_part = str(number) if len(found) > 1 else ""
-            path = job.file_name(source_part, number_part) if total > 1 else job.out
-            named.append((measurement, path))
+            parts = (name if len(by_source) > 1 else "", str(number) if len(found) > 1 else "")
+            named.append((measurement, job.file_name(*parts)))
     return named
 
 
 def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement]:
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
     runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
-    base_key = next((key for key in keys if key in runs), None)
-    base_runs = [] if base_key is None else runs[base_key]
+    base_runs = next((runs[key] for key in keys if key in runs), [])
     return [Measurement(source, runs, run, grid) for run in base_runs for grid in place(run)]
+
+
+def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
+    """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
+    found = int(np.diff(np.searchsorted(measurement.grid.rows, [first, first + count])).sum())
+    missing = count - found
+    if missing:
+        job.note(f"{path.name}: {missing} of {count} frames are missing in the take; they are empty")
 
 
 def _nearest(times: Array, wanted: Array) -> Array:

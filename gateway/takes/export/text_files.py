@@ -6,8 +6,8 @@ CSV is written while the take is read, so that its size does not matter.
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from typing import IO, Final
 
 import numpy as np
@@ -16,8 +16,14 @@ from gateway.descriptions.labels import event_text, fitting_labels
 from gateway.errors import TakeError
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes.export.job import ExportJob, nothing_to_export
-from gateway.takes.export.measurements import Measurement, named_measurements, seconds_of_row, utc_text
-from gateway.takes.files.component_rows import Array, decode_rows
+from gateway.takes.export.measurements import (
+    Measurement,
+    named_measurements,
+    note_missing,
+    seconds_of_row,
+    utc_text,
+)
+from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series, SeriesBuilder
 from gateway.takes.files.take import Take
@@ -34,54 +40,27 @@ _Layout = tuple[str, str, tuple[str, ...]]  # source, key and columns of a file
 def export_csv(job: ExportJob) -> None:
     """Write a file for each component of each source; if its labels change, one for each set of labels."""
     take = job.open_take(components=())
-    writer = _Writer(job, take)
+    files: dict[_Layout, IO[bytes]] = {}
     for name, key, series in _parts(job, take):
         for run in series.runs():
-            writer.write(name, key, run)
-    if not job.files.paths:
+            layout = (name, key, _columns(key, run))
+            if layout not in files:
+                number = 1 + sum(each[:2] == layout[:2] for each in files)
+                if len(files) == _MAX_FILES:
+                    raise TakeError(
+                        f"the labels in {job.take} change so often that there would be more than "
+                        f"{_MAX_FILES} files; choose a part by --from and --to"
+                    )
+                parts = (name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
+                files[layout] = job.files.create(job.file_name(*parts))
+                files[layout].write(_line([*_HEAD, *layout[2]]).encode())
+            files[layout].writelines(row.encode() for row in _rows(key, run))
+    if not files:
         raise nothing_to_export(job, "frames")
-    writer.note_changes()
+    for (name, key), count in Counter(layout[:2] for layout in files).items():
+        if count > 1:
+            job.note(f"the labels of {key} of {name} change, so there are {count} files of it")
     job.note_malformed(take)
-
-
-class _Writer:
-    """Writes rows to the files of their components."""
-
-    def __init__(self, job: ExportJob, take: Take) -> None:
-        self._job = job
-        self._has_sources = len(take.sources) > 1
-        self._files: dict[_Layout, IO[bytes]] = {}
-
-    def write(self, name: str, key: str, run: Series) -> None:
-        """Append the rows of a run."""
-        columns = _columns(key, run)
-        layout = (name, key, columns)
-        if layout not in self._files:
-            self._files[layout] = self._create(name, key, columns)
-        rows = _event_rows(run) if key == ComponentType.EVENT.key else _value_rows(run)
-        self._files[layout].writelines(row.encode() for row in rows)
-
-    def note_changes(self) -> None:
-        """Report components that have several files."""
-        for name, key in dict.fromkeys((name, key) for name, key, _ in self._files):
-            count = self._number_of(name, key)
-            if count > 1:
-                self._job.note(f"the labels of {key} of {name} change, so there are {count} files of it")
-
-    def _create(self, name: str, key: str, columns: tuple[str, ...]) -> IO[bytes]:
-        if len(self._files) == _MAX_FILES:
-            raise TakeError(
-                f"the labels in {self._job.take} change so often that there would be more than {_MAX_FILES} "
-                "files; choose a part by --from and --to"
-            )
-        number = self._number_of(name, key) + 1
-        parts = (name if self._has_sources else "", key, str(number) if number > 1 else "")
-        file = self._job.files.create(self._job.file_name(*parts))
-        file.write(_line([*_HEAD, *columns]).encode())
-        return file
-
-    def _number_of(self, name: str, key: str) -> int:
-        return sum(layout[:2] == (name, key) for layout in self._files)
 
 
 def _parts(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
@@ -127,28 +106,23 @@ def _title(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-def _heads(run: Series) -> Iterator[str]:
-    """Yield the cells of ``_HEAD`` of each row."""
+def _rows(key: str, run: Series) -> Iterator[str]:
+    """Yield the lines of frames or events.
+
+    Values are the shortest texts that mean the same 32-bit numbers, and nothing for NaN.
+    """
     columns = [getattr(run, name).tolist() for name in _HEAD[1:]]
-    for seconds, *numbers in zip(run.seconds.tolist(), *columns, strict=True):
-        yield f"{seconds:.6f}," + ",".join(map(str, numbers))
-
-
-def _value_rows(run: Series) -> Iterator[str]:
-    """Yield the lines of frames: the shortest texts that mean the same 32-bit numbers, nothing for NaN."""
-    values = run.values.reshape(len(run), -1)
-    for head, row in zip(_heads(run), values, strict=True):
-        cells = ",".join(map(str, row)).replace("nan", "")
-        yield f"{head},{cells}\r\n" if len(row) else f"{head}\r\n"
-
-
-def _event_rows(run: Series) -> Iterator[str]:
-    """Yield the lines of events."""
-    for number, head in enumerate(_heads(run)):
-        item = run.items[number]
-        text = event_text(run.parameters_of(number), item)
-        cells = [item["id"], text.label, item["timestamp"], *(item[f"param{n}"] for n in (1, 2, 3))]
-        yield f"{head},{_line([*map(str, cells), text.description])}"
+    for row, (seconds, *numbers) in enumerate(zip(run.seconds.tolist(), *columns, strict=True)):
+        head = f"{seconds:.6f}," + ",".join(map(str, numbers))
+        if key == ComponentType.EVENT.key:
+            item = run.items[row]
+            text = event_text(run.parameters_of(row), item)
+            cells = [item["id"], text.label, item["timestamp"], *(item[f"param{n}"] for n in (1, 2, 3))]
+            yield f"{head},{_line([*map(str, cells), text.description])}"
+        else:
+            values = run.values[row].ravel()
+            cells_text = ",".join(map(str, values)).replace("nan", "")
+            yield f"{head},{cells_text}\r\n" if len(values) else f"{head}\r\n"
 
 
 def _line(cells: list[str]) -> str:
@@ -160,16 +134,6 @@ def _line(cells: list[str]) -> str:
 
 # TRC: markers of one rate, for OpenSim.
 
-_TRC_COLUMNS: Final = (
-    "DataRate",
-    "CameraRate",
-    "NumFrames",
-    "NumMarkers",
-    "Units",
-    "OrigDataRate",
-    "OrigDataStartFrame",
-    "OrigNumFrames",
-)
 _KNOWN_UNITS: Final = ("mm", "m")
 _NOT_IN_LABELS: Final = re.compile(r"[^\w.:+-]+")
 _MAX_LABEL_BYTES: Final = 100
@@ -177,17 +141,34 @@ _BLOCK_ROWS: Final = 500
 
 
 def export_trc(job: ExportJob) -> None:
-    """Write the markers of each measurement of each source to a file of its own."""
+    """Write the markers of each measurement of each source to a file of its own.
+
+    A line for each frame; a marker that is missing has three empty cells. Each cell ends in a tab: OpenSim
+    ignores an empty cell at the end of a line, unless a tab follows.
+    """
     for measurement, path in named_measurements(job, ("3d",), "markers"):
         file = job.files.create(path)
         file.write(_trc_head(job, measurement, path.name).encode())
-        _write_trc_rows(job, measurement, path, file)
+        frames, grid = measurement.frames, measurement.grid
+        start_s = seconds_of_row(measurement, 0)
+        for start in range(0, grid.num_rows, _BLOCK_ROWS):
+            stop = min(start + _BLOCK_ROWS, grid.num_rows)
+            positions = frames.block(start, stop)[..., :3]
+            positions[np.isnan(positions).any(axis=2)] = np.nan
+            for row, markers in enumerate(positions, start):
+                # The shortest texts that mean the same 32-bit numbers.
+                cells = "\t".join(map(str, markers.ravel())).replace("nan", "")
+                file.write(f"{row + 1}\t{start_s + row / grid.rate_hz:.6f}\t{cells}\t\n".encode())
+            job.progress(f"writing {path.name}", stop, grid.num_rows)
+        note_missing(job, path, measurement, 0, grid.num_rows)
 
 
 def _trc_head(job: ExportJob, measurement: Measurement, name: str) -> str:
     """Return the five lines before the frames, and an empty one."""
     markers, grid = measurement.base, measurement.grid
-    labels = fitting_labels(markers.labels, _valid, _MAX_LABEL_BYTES, "marker")
+    labels = fitting_labels(
+        markers.labels, lambda label: _NOT_IN_LABELS.sub("_", label.strip()), _MAX_LABEL_BYTES, "marker"
+    )
     changed = sum(old != new for old, new in zip(markers.labels, labels, strict=True))
     if changed:
         job.note(f"{changed} labels were changed: OpenSim's labels have no spaces and few special characters")
@@ -200,43 +181,10 @@ def _trc_head(job: ExportJob, measurement: Measurement, name: str) -> str:
     lines = [
         # Readers take the rest of the line as the name of the file. They allow no more keys in the next two.
         f"PathFileType\t4\t(X/Y/Z)\t{_NOT_IN_LABELS.sub('_', name)} time_0={utc_text(measurement)}",
-        "\t".join(_TRC_COLUMNS),
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
         "\t".join(map(str, values)),
         "Frame#\tTime\t" + "".join(f"{label}\t\t\t" for label in labels),
         "\t\t" + "".join(f"{axis}\t" for axis in axes),
         "",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _write_trc_rows(job: ExportJob, measurement: Measurement, path: Path, file: IO[bytes]) -> None:
-    """Write a line for each frame; a marker that is missing has three empty cells.
-
-    Each cell ends in a tab: OpenSim ignores an empty cell at the end of a line, unless a tab follows.
-    """
-    frames, grid = measurement.frames, measurement.grid
-    start_s = seconds_of_row(measurement, 0)
-    for start in range(0, grid.num_rows, _BLOCK_ROWS):
-        stop = min(start + _BLOCK_ROWS, grid.num_rows)
-        positions = frames.block(start, stop)[..., :3]
-        lines = [
-            f"{row + 1}\t{start_s + row / grid.rate_hz:.6f}\t{_cells(markers)}\n"
-            for row, markers in enumerate(positions, start)
-        ]
-        file.write("".join(lines).encode())
-        job.progress(f"writing {path.name}", stop, grid.num_rows)
-    missing = frames.num_missing(0, grid.num_rows)
-    if missing:
-        job.note(f"{path.name}: {missing} of {grid.num_rows} frames are missing in the take; they are empty")
-
-
-def _cells(positions: Array) -> str:
-    """Return the cells of markers, shape (markers, 3): the shortest texts that mean the same 32-bit
-    numbers."""
-    missing = np.isnan(positions).any(axis=1, keepdims=True)
-    cells = map(str, np.where(missing, np.float32(np.nan), positions).ravel())
-    return "\t".join(cells).replace("nan", "") + "\t"
-
-
-def _valid(label: str) -> str:
-    return _NOT_IN_LABELS.sub("_", label.strip())

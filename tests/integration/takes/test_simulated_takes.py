@@ -28,8 +28,8 @@ from gateway.rtc3d_server.measurement import ComputedScene
 from gateway.rtc3d_server.scene import Scene
 from gateway.service.gateway import Gateway
 from gateway.simulator.c3d_scene import C3dScene
-from gateway.simulator.faults.connection_faults import ChangeScene, Rename
-from gateway.simulator.faults.frame_faults import FrozenTimestamps
+from gateway.simulator.faults import ChangeScene, Rename
+from gateway.simulator.packet_faults import FrozenTimestamps
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SceneSettings, SyntheticScene
 from gateway.simulator.take_scene import TakeScene

@@ -28,7 +28,7 @@ class Lab:
         self.receiver = self.new_receiver()
 
     def new_receiver(self) -> FileReceiver:
-        return self.files.receiver(lambda error: self.lost.append(str(error)))
+        return FileReceiver(self.files, lambda error: self.lost.append(str(error)))
 
     def send(self, content: bytes, receiver: FileReceiver | None = None, piece_bytes: int = 300) -> None:
         """Send a whole file in pieces."""

@@ -10,9 +10,15 @@ from typer.testing import CliRunner, Result
 from gateway.cli.main import app
 from gateway.errors import ConfigError
 from gateway.rtc3d.components import ComponentType
-from gateway.simulator.faults.connection_faults import Cut, Delay, Restart
-from gateway.simulator.faults.control import COMMON_PARAMETERS, KINDS, describe_kinds, parameters_of
-from gateway.simulator.simulator import Scenario, load_scenario
+from gateway.simulator.faults import Cut, Delay, Restart
+from gateway.simulator.simulator import (
+    COMMON_PARAMETERS,
+    KINDS,
+    Scenario,
+    describe_kinds,
+    load_scenario,
+    parameters_of,
+)
 from gateway.simulator.synthetic import SceneSettings
 
 ROOT = Path(__file__).parents[3]

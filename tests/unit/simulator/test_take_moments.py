@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from gateway.simulator.take_moments import Moment, MomentBuilder, Recorded, RecordedParameters, TakeTimeline
+from gateway.simulator.take_moments import Moment, MomentBuilder, RecordedParameters, TakeTimeline
 
 START = 1_700_000_000_000_000
 PERIOD_US = 10_000
@@ -31,7 +31,7 @@ class Take:
         self._number += 1
         content = struct.pack(">iqi", self._number, time_us, 0)
         stamp = stamp or self._number.to_bytes(4, "big")
-        self.moments += self.builder.add(Recorded(kind, captured, session, stamp, content, PARAMETERS))
+        self.moments += self.builder.add(kind, captured, session, stamp, content, PARAMETERS)
 
     def finish(self) -> list[tuple[int, Content]]:
         """Return the time and the frame numbers of each moment."""

@@ -18,7 +18,7 @@ def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.Abstrac
 async def client(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[FaultyClient]:
     """A client for which nothing waits any more once the faults have ended."""
     clock = types.SimpleNamespace(monotonic=lambda: asyncio.get_running_loop().time())
-    monkeypatch.setattr("gateway.simulator.faults.pipeline.time", clock)
+    monkeypatch.setattr("gateway.simulator.fault_pipeline.time", clock)
     client = FaultyClient()
     yield client
     await client.faults.clear()

@@ -5,8 +5,8 @@ from typing import Any, cast
 
 from gateway.rtc3d.packets import Packet, PacketReader
 from gateway.rtc3d_server.client_connection import ClientConnection
-from gateway.simulator.faults.base import ActiveFault, Fault
-from gateway.simulator.faults.pipeline import FaultPipeline
+from gateway.simulator.fault_pipeline import FaultPipeline
+from gateway.simulator.faults import ActiveFault, Fault
 from gateway.simulator.simulator import Simulator
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.scripted_client import ScriptedClient

@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.connection_faults import (
+from gateway.simulator.fault_pipeline import MAX_WAITING_BYTES
+from gateway.simulator.faults import (
     Delay,
+    Fault,
     Garbage,
     HalfOpen,
     Jitter,
@@ -19,9 +20,8 @@ from gateway.simulator.faults.connection_faults import (
     Split,
     Undersize,
 )
-from gateway.simulator.faults.frame_faults import ConstantFrameNumbers, ShortEvents
-from gateway.simulator.faults.pipeline import MAX_WAITING_BYTES
-from gateway.simulator.faults.reply_faults import (
+from gateway.simulator.packet_faults import (
+    ConstantFrameNumbers,
     DoubledAcknowledgements,
     FramesFirst,
     LateAcknowledgements,
@@ -29,6 +29,7 @@ from gateway.simulator.faults.reply_faults import (
     MissingAcknowledgements,
     RefusedCommands,
     ReplyText,
+    ShortEvents,
 )
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, NO_DATA, XML, components_in, packet
 from tests.unit.simulator.faults.faulty_client import VERSION, FaultyClient
