@@ -86,7 +86,7 @@ def view(
 def _open_server(host: str, port: int) -> "ViewServer":
     """Return the server of the page. Raises ViewError."""
     try:
-        from gateway.display.view.server import open_server
+        from gateway.display.view.viewer import open_server
     except ImportError as error:
         if not (error.name or "").startswith("viser"):
             raise
@@ -99,7 +99,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
 
 def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     """Print where the page is, and open it. A computer without a browser is no error."""
-    from gateway.display.view.server import address_of
+    from gateway.display.view.viewer import address_of
 
     address = address_of(host, port)
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)
