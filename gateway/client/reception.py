@@ -15,7 +15,7 @@ from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES, MESSAGE_TYPES, NOT_PUBLISHED, VERSION_OFFSET
 from gateway.messages.host_time import now_utime
-from gateway.messages.sequence import SequenceCheck
+from gateway.messages.sequence_check import SequenceCheck
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters, encode_parameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY

@@ -202,13 +202,13 @@ class ParameterCache:
             await self._announce(None, self.version)
 
     def _log_change(self, reading: Reading, *, is_first: bool) -> None:
-        log, version = self._history.events.log, f"(parameters_version {self.version})"
+        events, version = self._history.events, f"(parameters_version {self.version})"
         if is_first:
             if self.version > 1:
-                log(logging.INFO, f"the server gives parameters again {version}", "given again")
+                events.log(logging.INFO, f"the server gives parameters again {version}", "given again")
             return
         if reading.renamed:
-            log(
+            events.log(
                 logging.WARNING,
                 f"markers or tools were renamed on the server: {reading.renamed}; programs that use the "
                 f"names need the new ones {version}",
@@ -216,7 +216,7 @@ class ParameterCache:
             )
         if reading.changed_sections:
             sections = ", ".join(reading.changed_sections)
-            log(logging.INFO, f"the server's parameters changed: {sections} {version}", "changed")
+            events.log(logging.INFO, f"the server's parameters changed: {sections} {version}", "changed")
 
     # While connections are open.
 

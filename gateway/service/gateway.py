@@ -16,7 +16,7 @@ from gateway.publish.routes import OPENING_S
 from gateway.queries.answers import FRAME_KEY, frame_answer
 from gateway.queries.service import SourceQueries, SourceQueryService
 from gateway.service.source import Source, SourceHistory
-from gateway.stream.tcp import Backoff
+from gateway.stream.supervisor import Backoff
 from gateway.workers import WorkerThread
 
 _STATUS_PERIOD_S: Final = 1.0

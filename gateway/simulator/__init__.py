@@ -10,7 +10,8 @@ The server itself is ``gateway.rtc3d_server``. A scene tells it which frames the
   requested.
 
 ``simulator`` joins a scene, the server and the faults: it begins and ends faults at once, or at the times in
-a scenario file. Their kinds are in ``faults`` and ``packet_faults``. ``fault_pipeline`` stands between the
-server and the socket of a connection: it passes what is sent through the active faults, and holds what is to
-be late.
+a scenario file. ``faults`` has the kinds that concern the bytes sent (delay, split), the connection (reset)
+and the server; ``packet_faults`` has those that change frames and replies. ``fault_pipeline`` stands between
+the server and the socket of a connection: it passes what is sent through the active faults, and holds what is
+to be late.
 """

@@ -6,15 +6,15 @@ component that a connection requests (§5.3.5), so components with different rat
 The path of a frame, as calls without a task between them: ``session`` reads bytes and gives them to
 ``rtc3d.client_protocol``, which returns frames. ``backlog`` passes a few frames on at once, and many that
 arrived together at a pace. ``ingest`` computes when each frame was captured (``clock``), counts the frames
-that the server left out, skips late ones if the configuration says so, and calls ``publish.fan_out``, whose
-routes call the publishers of the outputs.
+that the server left out (``missing_frames``), skips late ones if the configuration says so, and calls
+``publish.fan_out``, whose routes call the publishers of the outputs.
 
 Around it, from the outside to the inside:
 
 - ``streams``: which streams a source has, as configured or as ``plan`` derives them from the server's
   parameters.
-- ``supervisor``: one stream, kept running. It opens a connection (``tcp``), runs a session, waits and tries
-  again.
+- ``supervisor``: one stream, kept running. It opens a connection (``tcp``), runs a session, waits
+  (``Backoff``) and tries again.
 - ``session``: one TCP connection, used once. It reads when other sources had their turn and no ``backlog``
   waits.
 - ``stream_requests``: what a session asks the server for, handshake and signs of life included, and what the

@@ -265,7 +265,9 @@ class StreamStatus:
 
         ``held_up_s`` is how long the event loop of this gateway did not run lately.
         """
-        text = f"frames arrive {1000 * lag_s:.0f} ms late{request and f'; {request}'}"
+        text = f"frames arrive {1000 * lag_s:.0f} ms late"
+        if request:
+            text = f"frames arrive {1000 * lag_s:.0f} ms late; {request}"
         if held_up_s >= lag_s / 2:
             text = f"{text}; this gateway did not run for {held_up_s:.1f} s: check the load of this computer"
         self._warnings.failed(id(self), text)

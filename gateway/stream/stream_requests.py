@@ -163,14 +163,14 @@ class StreamRequests:
         else:
             # A late refusal need not say what it refuses, so the server may have accepted a form after all.
             if not (self._is_slow and await session.wait_for_data(self._source.reply_timeout_s)):
-                verb = "refuses or ignores" if self._is_slow else "refuses"
-                text = (
-                    f"{verb} StreamFrames in every form that the protocol has; "
-                    "check its real-time output settings"
-                )
-                if not session.replies.answered:
-                    text = "accepts connections and answers no command; restart its application"
-                raise RequestError(f"{session.server} {text}")
+                text = f"{session.server} accepts connections and answers no command; restart its application"
+                if session.replies.answered:
+                    verb = "refuses or ignores" if self._is_slow else "refuses"
+                    text = (
+                        f"{session.server} {verb} StreamFrames in every form that the protocol has; "
+                        "check its real-time output settings"
+                    )
+                raise RequestError(text)
             self.accepted = self._requested = forms[-1]
         if ignored and (not has_answered or ignored[0].components != self.accepted.components):
             # The server was not answering at all, or may have hung for a moment, so it may know the form that

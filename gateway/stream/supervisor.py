@@ -2,11 +2,12 @@
 
 import asyncio
 import logging
+import random
 import time
 from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
-from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError
 from gateway.logs.failures import log_fields
 from gateway.messages.host_time import host_clock
@@ -21,7 +22,7 @@ from gateway.stream.session import FileReceiver, Session, defect_error
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_requests import StreamRequests, StreamTarget
-from gateway.stream.tcp import Backoff, Connect, open_connection
+from gateway.stream.tcp import Connect, open_connection
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +55,52 @@ class Listener:
 
     def ended(self, stream: "Supervisor", error: LinkError) -> None:
         """Called when a connection ended, or could not be made."""
+
+
+STEADY_S: Final = 10.0
+"""A connection with data that lasted this long has succeeded: the delays start again."""
+
+_MAX_DOUBLINGS: Final = 30
+
+
+class Backoff:
+    """The delays between attempts: doubling up to a maximum, each shortened at random by up to half.
+
+    The randomness prevents many gateways from reconnecting to a restarted server at the same moment.
+
+    A connection that brings data and lasts for STEADY_S starts the delays again. One that breaks earlier
+    counts as a failure. So a server that sends a few good frames and breaks, again and again, is tried as
+    rarely as one that is off. There is one exception: the delays that have grown while a server was off start
+    again with the first data. So a server that comes back and is restarted once more is not kept waiting.
+    """
+
+    def __init__(self, reconnect: ReconnectSettings) -> None:
+        self._first_s = reconnect.first_delay_s
+        self._max_s = reconnect.max_delay_s
+        self._num_failures = 0  # attempts in a row without data
+        self._num_breaks = 0  # connections in a row with data, but not for STEADY_S
+
+    @property
+    def shortest_s(self) -> float:
+        """A first delay, shortened at random."""
+        return self._shortened(self._first_s)
+
+    def delay_after(self, lasted_s: float, *, had_data: bool) -> float:
+        """Return the delay after an attempt that lasted so long, and brought data or not."""
+        if not had_data:
+            self._num_failures += 1
+        elif lasted_s < STEADY_S:
+            self._num_failures = 0
+            self._num_breaks += 1
+        else:
+            self._num_failures = 1
+            self._num_breaks = 0
+        doublings = min(self._num_failures + self._num_breaks - 1, _MAX_DOUBLINGS)
+        return self._shortened(min(self._first_s * 2.0**doublings, self._max_s))
+
+    @staticmethod
+    def _shortened(delay_s: float) -> float:
+        return delay_s * random.uniform(0.5, 1.0)  # noqa: S311 - spreads load, hides nothing
 
 
 class Supervisor:
@@ -154,7 +201,7 @@ class Supervisor:
             await self._run_session()
         except LinkError as error:
             return error
-        except (Exception, asyncio.CancelledError) as defect:  # noqa: BLE001 - ends only this connection  # noqa: BLE001 - see below
+        except (Exception, asyncio.CancelledError) as defect:  # noqa: BLE001 - ends only this connection
             # A defect in one stream must not stop the others. One that happens while a session is closed must
             # not replace the CancelledError, or the stream would never end. A CancelledError that nobody
             # asked for, of something that the session waited for, is a defect.

@@ -2,6 +2,7 @@
 
 import platform
 import statistics
+import textwrap
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
@@ -57,7 +58,8 @@ def report(soak: Soak) -> str:
         "time that the gateway took to notice the fault and waited to reconnect:",
         _faults(soak.rounds),
     ]
-    return "\n\n".join(sections) + "\n"
+    wrapped = (each if each.startswith("|") else textwrap.fill(each, 120) for each in sections)
+    return "\n\n".join(wrapped) + "\n"
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

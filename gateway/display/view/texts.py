@@ -234,7 +234,7 @@ def _losses_html(source: LiveSource, components: Mapping[str, LiveComponent]) ->
             name = html_text(output.output)
             rows.append((f"output {name}", NONE, _figure(dropped), NONE, _figure(dropped)))
     parts = [table(("lost messages", "server", "gateway", "here", "all"), rows), _NOTE] if rows else []
-    parts += [f"<p class={level}>{text}</p>" for level, text in _causes(source, components)]
+    parts += [f"<p class={level.value}>{text}</p>" for level, text in _causes(source, components)]
     return "".join(parts) or "<p class=good>nothing lost, dropped or skipped</p>"
 
 

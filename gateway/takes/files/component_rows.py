@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.messages.encode import ITEMS_OFFSET
-from gateway.messages.sequence import MAX_LATE
+from gateway.messages.sequence_check import MAX_LATE
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 
 HEAD: Final = np.dtype(

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from gateway.descriptions.labels import describe
-from gateway.messages.sequence import SequenceCheck
+from gateway.messages.sequence_check import SequenceCheck
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array, Rows, find_restarts

@@ -19,8 +19,7 @@ from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.replies import Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from gateway.stream.supervisor import Callbacks, Listener, Supervisor
-from gateway.stream.tcp import STEADY_S, Backoff
+from gateway.stream.supervisor import STEADY_S, Backoff, Callbacks, Listener, Supervisor
 from tests.support.clocks import STEP_S, read_clocks, settle, until
 from tests.support.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to

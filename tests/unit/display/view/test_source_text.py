@@ -72,6 +72,7 @@ def test_messages_that_are_lost_on_the_way(lab: Lab) -> None:
     assert "3d: 2 gaps in the numbers of the messages" in text
     assert "3d: numbers restarted 1 time" in text
     assert "nothing lost" not in text
+    assert "<p class=bad>3d: 2 gaps" in source_html(lab.source, is_take=False)
 
 
 def test_drops_by_cause_of_streams_and_outputs(lab: Lab) -> None:

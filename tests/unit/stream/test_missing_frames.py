@@ -5,14 +5,14 @@ from collections.abc import Iterable
 
 import pytest
 
-from gateway.stream.ingest import FrameNumbers
+from gateway.stream.missing_frames import MissingFrames
 
 PERIOD_US = 2500
 
 
 def num_missing(numbers: Iterable[int], period_us: float = PERIOD_US) -> int:
     """Return how many frames are missing among these numbers; the time stamps follow the numbers."""
-    observer = FrameNumbers()
+    observer = MissingFrames()
     return sum(observer.observe(number, round(number * period_us)) for number in numbers)
 
 
@@ -32,7 +32,7 @@ def test_two_gaps_close_together_both_count() -> None:
 
 
 def test_jitter_of_the_time_stamps_does_not_matter() -> None:
-    observer, rng = FrameNumbers(), random.Random(1)
+    observer, rng = MissingFrames(), random.Random(1)
     numbers = [*range(300), *range(310, 400)]
     assert sum(observer.observe(each, each * PERIOD_US + rng.randint(-500, 500)) for each in numbers) == 10
 
@@ -59,14 +59,14 @@ def test_what_may_have_another_reason_is_not_counted(numbers: list[int]) -> None
 
 
 def test_a_jump_of_the_numbers_without_one_of_the_time_is_not_counted() -> None:
-    observer = FrameNumbers()
+    observer = MissingFrames()
     numbers = [*range(300), *range(400, 700)]
     timestamps = (index * PERIOD_US for index in range(len(numbers)))
     assert sum(map(observer.observe, numbers, timestamps)) == 0
 
 
 def test_a_pause_that_the_caller_knows_of_is_not_counted() -> None:
-    observer = FrameNumbers()
+    observer = MissingFrames()
     for number in range(300):
         assert observer.observe(number, number * PERIOD_US) == 0
     observer.interrupt()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pytest
 
-from gateway.messages.sequence import SequenceCheck
+from gateway.messages.sequence_check import SequenceCheck
 
 
 def check_of(*numbers: int, utimes: Sequence[int] | None = None, pieces: int | None = None) -> SequenceCheck:
