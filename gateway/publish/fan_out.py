@@ -133,7 +133,7 @@ class FanOut:
 
     It numbers the messages of each component, and the frames, when they arrive. A message that is not
     published afterwards, whatever the reason, leaves a gap in the numbers. All outputs get the same message
-    under the same number, except for those with a maximum rate (ComponentRoute).
+    under the same number, except for those with a maximum rate (TopicRoute).
 
     It calls ``on_items_changed``, which may be assigned later, when the number of markers, tools, channels
     or plates changes within a session. ``forget_layouts`` belongs to the end of a connection.

@@ -78,6 +78,7 @@ def joined_socket(url: str) -> socket.socket:
     joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        joined.setblocking(False)  # or a datagram that was damaged on its way would keep the thread waiting
         joined.bind(destination)
         membership = struct.pack("=4s4s", ipaddress.IPv4Address(destination[0]).packed, bytes(4))
         joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
@@ -145,11 +146,14 @@ class LcmReceiver:
     def _run(self) -> None:
         opened: Callable[[str], lcm.LCM | socket.socket]
         opened = joined_socket if scheme_of(self._url) == "udpm" else open_lcm
-        with contextlib.closing(Waiting()) as self._waiting:
+        waiting = self._retry(Waiting)
+        if waiting is None:
+            return
+        with contextlib.closing(waiting) as self._waiting:
             connection = self._retry(lambda: opened(self._url))
             if connection is not None:
                 self._on_open()
-                self._receive(connection, self._waiting)
+                self._receive(connection, waiting)
         if isinstance(connection, socket.socket):
             connection.close()
 
@@ -182,7 +186,7 @@ class LcmReceiver:
                 else:
                     self._handle(*split_datagram(connection.recv(_MAX_DATAGRAM_BYTES)))
             except BlockingIOError:
-                pass  # the datagram was damaged on its way
+                pass  # the kernel has discarded a damaged datagram
             except OSError as error:
                 logger.debug("receiving LCM requests: %s", error)
                 self._closing.wait(_ERROR_PAUSE_S)

@@ -341,11 +341,12 @@ class ZenohOutput(Output):
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Publish the description of a C3D file on PREFIX/SOURCE/c3d, the key that returns it."""
-        if self._answers is not None and self.session is not None:
+        session = self.session  # closing it in another thread makes it None
+        if self._answers is not None and session is not None:
             key = zenoh_key(self.settings.prefix, source, "c3d")
             put = functools.partial(
                 self._put,
-                *(source, self.session.put, key, json_bytes(file.description)),
+                *(source, session.put, key, json_bytes(file.description)),
                 encoding=JSON,
                 congestion_control=_RELIABLE,
                 priority=_LOW_PRIORITY,

@@ -1,6 +1,9 @@
 """What happens to requests and subscriptions when LCM's TCP relay goes away and comes back."""
 
+import errno
 import logging
+import os
+import socket
 from collections.abc import AsyncIterator, Iterator
 
 import lcm
@@ -9,6 +12,7 @@ import rtc3d
 
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.support.lcm_relay import LcmRelay
@@ -82,3 +86,28 @@ def test_a_subscriber_logs_a_lost_relay_and_receives_again_when_it_is_back(
     subscriber.close()
     relay.close()  # before LCM frees the connection: it would connect again, and hold up this process
     assert caplog.messages[0].startswith("lcm: the connection is lost, so no more messages arrive: ")
+
+
+async def test_requests_are_received_once_there_are_file_descriptors(
+    relay: LcmRelay, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The thread that receives them tries again, and says what is missing, instead of ending."""
+    pairs = [socket.socketpair()]
+
+    def pair_at_the_second_call() -> tuple[socket.socket, socket.socket]:
+        if "no requests can be received" in caplog.text:
+            return pairs.pop()
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr("gateway.outputs.lcm.connection.socket.socketpair", pair_at_the_second_call)
+    receiver = LcmReceiver(relay.url, "MOCAP", None, lambda: None)
+    received: list[bytes] = []
+    receiver.add(REQUEST, received.append)
+    receiver.start()
+    await wait_until_async(lambda: f"^{REQUEST}$" in relay.subscribed)
+    monkeypatch.undo()
+    lcm.LCM(relay.url).publish(REQUEST, b"request")
+    await wait_until_async(lambda: received == [b"request"])
+    relay.close()
+    await receiver.close()
+    assert "Too many open files" in caplog.text
