@@ -20,6 +20,7 @@ from gateway.errors import QueryError
 from gateway.logs.safe_text import safe_json, safe_text
 from gateway.messages.decode import json_text
 from gateway.messages.host_time import now_utime
+from gateway.outputs.findings import counted
 from gateway.outputs.kind import DISCOVERY_S, missing_source
 
 _MAX_FILTER: Final = 60
@@ -109,7 +110,7 @@ class Display:
         order = self._order
         table = laid_out(sorted_by(filtered(self._shown, self._filter), order), width, order)
         clock = time.strftime("%H:%M:%S")
-        left = f"{self._title}  {len(sources)} source{'' if len(sources) == 1 else 's'}"
+        left = f"{self._title}  {counted(len(sources), 'source')}"
         if len(long := f"rtc3d-gateway top  {left}") + len(clock) + 2 <= width:
             left = long
         title: Line = [(left.ljust(width - len(clock)), Style.STRONG), (clock, Style.FAINT)]
