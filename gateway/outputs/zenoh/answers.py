@@ -54,9 +54,6 @@ LONG_ANSWER_BYTES: Final = 512 * 1024
 It also sends messages of the history.
 """
 
-_DROP: Final = zenoh.CongestionControl.DROP
-_BLOCK: Final = zenoh.CongestionControl.BLOCK
-
 _REST: Final = 3.0
 """How long the threads rest after they have made a payload, as a multiple of the time that this took.
 
@@ -313,15 +310,8 @@ class ZenohAnswers:
                 continue
             num_replies += 1
             attachment = json_bytes(answer.attachment) if answer.attachment else None
-            # A peer that asks for the history and does not read is not waited for. It asks again.
-            control = _DROP if _is_of_history(answer) else _BLOCK
             try:
-                query.reply(
-                    *(key, payload),
-                    encoding=answer.encoding,
-                    attachment=attachment,
-                    congestion_control=control,
-                )
+                query.reply(key, payload, encoding=answer.encoding, attachment=attachment)
             except zenoh.ZError as problem:
                 logger.debug("zenoh: replying to %s: %s", query.selector, problem)
         if error is not None and num_replies == 0:

@@ -15,7 +15,7 @@ from gateway.messages.history import (
     sequence_of,
     unpack_messages,
 )
-from tests.support.clocks import ManualClock
+from tests.support.clocks import Clock
 
 
 def message(sequence: int, utime: int = 0, size: int = 48) -> bytes:
@@ -48,7 +48,7 @@ def read_all(history: MessageHistory, key: str, wanted: WantedMessages) -> list[
 def test_a_range_has_every_message_that_is_kept(
     steps: list[tuple[int, float, int]], first: int, last: int | None, since_s: int
 ) -> None:
-    clock = ManualClock()
+    clock = Clock()
     history = MessageHistory(clock)
     history.set_limits(10.0, 1 << 20)
     sequence = -1
@@ -75,7 +75,7 @@ def test_a_range_has_every_message_that_is_kept(
 
 
 def test_old_messages_are_dropped_after_the_time_and_beyond_the_memory() -> None:
-    clock = ManualClock()
+    clock = Clock()
     history = MessageHistory(clock)
     history.set_limits(5.0, 100_000)
     history.add("3d", message(0))
@@ -95,7 +95,7 @@ def test_old_messages_are_dropped_after_the_time_and_beyond_the_memory() -> None
 
 
 def test_nothing_is_kept_without_limits_or_after_forgetting() -> None:
-    history = MessageHistory(ManualClock())
+    history = MessageHistory(Clock())
     history.add("3d", message(0))
     assert not history.is_kept
     assert history.find("3d", WantedMessages(0)) is None
