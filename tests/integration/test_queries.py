@@ -389,11 +389,12 @@ async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer_but_files_
         await wait_until_async(lambda: list(tmp_path.glob("*.c3d")))
         replies = await query_all(peer, "mocap/lab/*?format=json")
         assert {reply.key for reply in replies} == {
-            f"mocap/lab/{key}" for key in ("parameters", "3d", "status")
+            f"mocap/lab/{key}" for key in ("parameters", "3d", "status", "history")
         }
         assert {reply.encoding for reply in replies} == {"application/json"}
         keys = [reply.key for reply in await query_all(peer, "mocap/**")]
-        expected = ["parameters", *(f"parameters/{section}" for section in SECTIONS), "3d", "status"]
+        expected = ["parameters", *(f"parameters/{section}" for section in SECTIONS)]
+        expected += ["3d", "status", "history"]
         expected += [f"schema/{name}" for name in SCHEMA_TYPES]
         assert sorted(keys) == sorted(f"mocap/lab/{key}" for key in expected)
         assert server.count("SendCurrentFrame") == 0
