@@ -43,6 +43,10 @@ CONTROLS_PER_S: Final = 4.0
 """How many commands a second that start, stop or change something are carried out."""
 
 
+_FINDS_PER_S: Final = 200.0
+"""How many times a second messages are found in the history of a source: each takes about 0.1 ms."""
+
+
 class PublishedMessages(Protocol):
     """What was published of a source. Messages have the numbers that the output of a name has given them."""
 
@@ -83,6 +87,7 @@ class SourceQueries:
         self._recordings = Recordings(settings.name, self._requests, recording, history)
         self._newest_json = NewestJson()
         self._controls = TokenBucket(CONTROLS_PER_S)
+        self._finds = TokenBucket(_FINDS_PER_S)
         self.parameters: ParameterCache = ParameterCache(
             settings, self._requests, announce_parameters, history
         )
@@ -198,6 +203,11 @@ class SourceQueries:
             return Answer(json_bytes(self._published.history.overview), JSON)
         if question.wanted is None:
             return self._message_answer(self._status_message(), question, output)
+        if not self._finds.try_take():
+            raise QueryError(
+                f"the gateway finds messages of a source {_FINDS_PER_S:g} times a second; ask again",
+                code="rate",
+            )
         found = self._published.find(question.name, output, question.wanted)
         if found is None and not self._published.history.is_kept:
             raise QueryError(
