@@ -25,6 +25,10 @@ _BLOCK_S: Final = 1.0
 
 _LENGTH_BYTES: Final = 4
 
+_CAPTURE_OFFSET: Final = FINGERPRINT_BYTES + 8
+_SEQUENCE_OFFSET: Final = FINGERPRINT_BYTES + 16
+_SESSION_OFFSET: Final = FINGERPRINT_BYTES + 24
+
 
 class WantedMessages(NamedTuple):
     """Which messages of a key are wanted: from number ``first``, or since ``since_utime``, up to ``last``.
@@ -184,16 +188,12 @@ class _Block:
 
 def sequence_of(message: bytes) -> int:
     """Return the sequence number of an encoded message."""
-    return int.from_bytes(message[_SEQUENCE], "big", signed=True)
+    return int.from_bytes(message[_SEQUENCE_OFFSET:_SESSION_OFFSET], "big", signed=True)
 
 
 def utime_of(message: bytes) -> int:
     """Return when an encoded message was published, in µs since the Unix epoch."""
-    return int.from_bytes(message[_UTIME], "big", signed=True)
-
-
-_UTIME: Final = slice(FINGERPRINT_BYTES, FINGERPRINT_BYTES + 8)
-_SEQUENCE: Final = slice(FINGERPRINT_BYTES + 16, FINGERPRINT_BYTES + 24)
+    return int.from_bytes(message[FINGERPRINT_BYTES:_CAPTURE_OFFSET], "big", signed=True)
 
 
 def _first_since(runs: Sequence[list[bytes]], since_utime: int, otherwise: int) -> int:
