@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final, NamedTuple
 
-from gateway.messages.encode import FINGERPRINT_BYTES
+from gateway.messages.history import sequence_of, utime_of
 from gateway.messages.sequence_check import MAX_LATE, SequenceCheck
 
 GRACE_S: Final = 0.05
@@ -40,7 +40,7 @@ RETRY_CODES: Final = BUSY_CODES | {"timeout", "no-gateway", "zenoh"}
 
 
 class HistoryRequest(NamedTuple):
-    """A request for messages from ``first`` to ``last`` (None: the newest), or of the last ``last_s`` seconds.
+    """A request for messages from ``first`` to ``last`` (None: the newest), or of ``last_s`` seconds.
 
     ``known`` is the number and the time of a message that was handed on, if it should be among them. ``run``
     is which run of the gateway the numbers belong to.
@@ -105,7 +105,7 @@ class Completion:
         self.due_s = math.inf
         """When to request something; infinite if nothing is missing."""
         self.num_refilled = 0
-        """How many messages that were handed on came from the history."""
+        """How many messages came from the history because they were missing before others that arrived."""
         self.problem = ""
         """Why messages are only passed on; "" if gaps are filled."""
         self._hand_on = hand_on
@@ -171,7 +171,7 @@ class Completion:
         return message
 
     def _pass(self, sequence: int, message: bytes) -> None:
-        self._next, self._next_utime = sequence + 1, _utime_of(message)
+        self._next, self._next_utime = sequence + 1, utime_of(message)
         self._hand_on(message)
 
     @property
@@ -210,9 +210,9 @@ class Completion:
         """Take the answer to a request."""
         if request.run != self._run or self.problem:
             return
-        numbered = [(_sequence_of(message), message) for message in answer.messages]
+        numbered = [(sequence_of(message), message) for message in answer.messages]
         if self._is_of_other_run(numbered, request.known):
-            self._pass_by(min(map(_utime_of, answer.messages)), answer.newest, now_s)
+            self._pass_by(min(map(utime_of, answer.messages)), answer.newest, now_s)
             return
         self._nobody_s = NOBODY_S
         former = self._next
@@ -242,8 +242,8 @@ class Completion:
         what is held and has a larger number.
         """
         first = min(self._held, default=-1)
-        first_utime = _utime_of(self._held[first]) if self._held else 0
-        utimes = {number: _utime_of(message) for number, message in numbered}
+        first_utime = utime_of(self._held[first]) if self._held else 0
+        utimes = {number: utime_of(message) for number, message in numbered}
         if known is not None and known[0] in utimes:
             return utimes[known[0]] != known[1]
         return any(
@@ -254,13 +254,13 @@ class Completion:
     def _refill(self, number: int, message: bytes) -> None:
         """Take a message of the history, which may be one that has arrived meanwhile."""
         if number == self._next:
-            self.num_refilled += 1
+            self.num_refilled += number < self._newest  # later ones were not missed
             if number in self._held:
                 self._release(number)
             self._pass(number, message)
         elif self._next is not None and number > self._next and number not in self._held:
             self._hold(number, message)
-            self.num_refilled += number in self._held
+            self.num_refilled += number in self._held and number < self._newest
 
     def _skip_to(self, number: int) -> None:
         """Go on at a number: what is missing before it exists no more."""
@@ -325,7 +325,7 @@ class Completion:
 
         ``utime`` is the time of one of its messages, and ``newest`` the number of its newest one.
         """
-        self._begin_run([number for number, held in self._held.items() if _utime_of(held) >= utime], now_s)
+        self._begin_run([number for number, held in self._held.items() if utime_of(held) >= utime], now_s)
         self._until = max(self._until, newest)
         self._knows_end = self._is_ending
         self._look(now_s)
@@ -353,16 +353,7 @@ class Completion:
     def abandon(self) -> None:
         """Hand on what is held, and request nothing more."""
         if not self.problem:
-            self._pass_on_only("it has ended")
-
-
-_UTIME: Final = slice(FINGERPRINT_BYTES, FINGERPRINT_BYTES + 8)
-_SEQUENCE: Final = slice(FINGERPRINT_BYTES + 16, FINGERPRINT_BYTES + 24)
-
-
-def _utime_of(message: bytes) -> int:
-    return int.from_bytes(message[_UTIME], "big", signed=True)
-
-
-def _sequence_of(message: bytes) -> int:
-    return int.from_bytes(message[_SEQUENCE], "big", signed=True)
+            self._flush()
+        self._is_ending = True
+        self._run += 1
+        self._next, self.due_s = None, math.inf
