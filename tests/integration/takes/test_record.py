@@ -125,7 +125,15 @@ class Lab(NamedTuple):
 
 
 @contextmanager
-def lab(folder: Path, side: str = "zenoh", *scene: str, **source: Any) -> Iterator[Lab]:
+def lab(
+    folder: Path,
+    side: str = "zenoh",
+    *scene: str,
+    router: str | None = None,
+    history_s: float = 60.0,
+    **source: Any,
+) -> Iterator[Lab]:
+    """Run a gateway, which also connects to a ``router`` on Zenoh if there is one."""
     endpoint, url = free_endpoint(), lcm_url()
     published: defaultdict[str, list[bytes]] = defaultdict(list)
 
@@ -137,12 +145,13 @@ def lab(folder: Path, side: str = "zenoh", *scene: str, **source: Any) -> Iterat
 
     with ExitStack() as stack:
         port, _ = stack.enter_context(simulator(*SCENE, *scene))
-        keys = zenoh_keys("peer", listen=endpoint)
+        keys = zenoh_keys("peer", listen=endpoint, connect=router)
         configuration = {
             "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port, **source}],
             "zenoh": {"enabled": side == "zenoh", "tool_poses": True, "config": keys},
             "lcm": {"enabled": side == "lcm", "tool_poses": True, "url": url},
             "metrics": {"enabled": False},
+            "history": {"seconds": history_s},
         }
         (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
         gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
