@@ -113,8 +113,8 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
 
     @property
     def has_room(self) -> bool:
-        """See Reception. What is refilled must not crowd out what arrives while the disk is slow."""
-        return self.queued_bytes < MAX_QUEUED_BYTES // 2
+        """See Reception. What arrives needs the rest of the queue while the disk is slow."""
+        return self.queued_bytes < MAX_QUEUED_BYTES // 16
 
     def _completes(self, series: RecordedSeries) -> bool:
         return series.is_recorded and super()._completes(series)
