@@ -192,7 +192,7 @@ def size_text(num_bytes: float) -> str:
 _ORDER: Final = ("3d", "6d", f"{POSE}*", "analog", "force", "event", "status", "clock", "parameters")
 _MAX_NOTES: Final = 10
 _MAX_RANGES: Final = 3
-_COLUMNS: Final = ("messages", "size", "rate", "refilled", "gaps", "lost", "not written")
+_COLUMNS: Final = ("messages", "size", "rate", "refilled", "lost", "not written")
 
 
 def print_summary(recording: TakeRecording, out: TextIO) -> bool:
@@ -235,9 +235,8 @@ def _cells(series: Sequence[RecordedSeries], file: FileWriter) -> Iterator[str]:
     yield size_text(sum(each.num_bytes for each in series) - num_unwritten_bytes)
     yield f"{sum(_rate_hz(each) for each in series):.1f} Hz"
     num_refilled = sum(each.completion.num_refilled for each in series if each.completion is not None)
-    num_gaps = sum(each.check.num_gaps for each in series)
     num_lost = sum(each.check.num_lost for each in series)
-    for number in (num_refilled, num_gaps, num_lost, num_unwritten):
+    for number in (num_refilled, num_lost, num_unwritten):
         yield str(number) if number else "-"
 
 

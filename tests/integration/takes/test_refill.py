@@ -25,7 +25,7 @@ MARKERS: Final = "MOCAP_LAB_1_3D"
 
 def refilled(ended: Ended) -> int:
     """Return how many messages with markers were refilled, according to the table."""
-    match = re.search(r"^Lab-1 +3d .* Hz +(\S+) +\S+ +\S+ +\S+$", ended.stdout, re.MULTILINE)
+    match = re.search(r"^Lab-1 +3d .* Hz +(\S+) +\S+ +\S+$", ended.stdout, re.MULTILINE)
     assert match is not None, ended
     return 0 if match[1] == "-" else int(match[1])
 
