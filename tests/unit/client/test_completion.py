@@ -236,6 +236,37 @@ def test_what_exists_no_more_is_named() -> None:
     assert (gap.stop - gap.missing, gap.stop) == (1, 16)
 
 
+def test_one_request_shows_that_nothing_of_a_gap_exists_any_more() -> None:
+    network = Network(window=1)
+    network.arrives(0)
+    network.arrives(20)
+    network.ask()
+    assert network.numbers == [0, 20]
+    assert network.completion.due_s == math.inf
+
+
+def test_messages_so_long_that_an_answer_has_only_one_are_refilled() -> None:
+    """The message that shows that the gateway has not restarted must not take the place of all others."""
+    network = Network()
+    network.arrives(0)
+    network.arrives(5)
+    start_s = network.completion.due_s
+    while network.completion.due_s < math.inf:
+        network.ask(1)
+    assert network.numbers == [*range(6)]
+    assert network.now_s == start_s
+
+
+def test_a_restart_after_which_the_clock_was_set_back_is_one() -> None:
+    """Otherwise, its messages would be left out as late until the numbers are past those before."""
+    network = Network()
+    network.arrives(5000)
+    network.restart()
+    network._utime = -1000
+    network.arrives(0)
+    assert network.handed_on == [(0, 5000), (1, 0)]
+
+
 @pytest.mark.parametrize(
     ("code", "patience_s"), [("timeout", PATIENCE_S), ("busy", PATIENCE_S), ("no-gateway", NOBODY_S)]
 )
