@@ -107,4 +107,5 @@ def _refill(recording: "TakeRecording", progress: "RecordProgress") -> None:
         while refill.num_incomplete and time.monotonic() < end_s:
             time.sleep(_TICK_S)
             progress.tick()
+        time.sleep(_TICK_S)  # an answer can overtake the parameters that describe its messages
         refill.close()

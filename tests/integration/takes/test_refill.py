@@ -117,10 +117,10 @@ def test_a_late_joiner_gets_the_last_seconds_and_then_what_is_live(tmp_path: Pat
         where = gateway.options[-1]
         address = GatewayAddress(is_lcm=side == "lcm", connect=where, url=where)
         with GatewayClient(address) as client:
-            subscriber = client.subscribe(["Lab-1"], ["3d"], Messages(receive), complete=True, last_s=1.5)
+            subscriber = client.subscribe(["Lab-1"], ["3d"], Messages(receive), complete=True, last_s=60)
             try:
                 wait_until(lambda: received and received[-1] > newest + 100)
             finally:
                 subscriber.close()
     assert received == [*range(received[0], received[0] + len(received))]
-    assert received[0] < newest - 20
+    assert received[0] == 0
