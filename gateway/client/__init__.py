@@ -17,6 +17,8 @@
   gateways report about them, ask until there is a reply, and subscribe.
 - A subscriber sorts what arrives by source and key, for a ``reception``, which keeps it in bounds, and counts
   it, and what is missing.
+- With ``complete``, each series has a ``completion``, which puts its messages in order and decides what to
+  request; the threads of ``refill`` request it, on LCM with ``lcm_refill``.
 """
 
 from typing import TYPE_CHECKING, Any
