@@ -104,6 +104,8 @@ class Completion:
     ) -> None:
         self.due_s = math.inf
         """When to request something; infinite if nothing is missing."""
+        self.reached_utime = 0
+        """The time of the newest message that was handed on; 0 before the first."""
         self.num_refilled = 0
         """How many messages came from the history because they were missing before others that arrived."""
         self.problem = ""
@@ -172,6 +174,7 @@ class Completion:
 
     def _pass(self, sequence: int, message: bytes) -> None:
         self._next, self._next_utime = sequence + 1, utime_of(message)
+        self.reached_utime = self._next_utime
         self._hand_on(message)
 
     @property

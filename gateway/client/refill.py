@@ -63,6 +63,12 @@ class Refill:
             due[series] = self._completions[series]
             self._changed.notify_all()
 
+    def reached_utime(self, source: "Source") -> float:
+        """Return until when all series of a source are complete; infinite if nothing is missing."""
+        due = self._due.get(source)
+        incomplete = () if due is None else (each for each in due.values() if each.due_s < math.inf)
+        return min((each.reached_utime for each in incomplete), default=math.inf)
+
     # In any thread.
 
     @property
@@ -120,9 +126,10 @@ class Refill:
         while not self._is_closed:
             for series in [each for each, completion in due.items() if completion.due_s == math.inf]:
                 del due[series]
-            first = min(due, key=lambda series: due[series].due_s, default=None)
-            wait_s = None if first is None else due[first].due_s - time.monotonic()
-            if wait_s is not None and wait_s <= 0:
-                return first
-            self._changed.wait(wait_s)
+            now_s = time.monotonic()
+            ready = [series for series in due if due[series].due_s <= now_s]
+            if ready:  # so no series is far ahead of the others
+                return min(ready, key=lambda series: due[series].reached_utime)
+            first_s = min((completion.due_s for completion in due.values()), default=None)
+            self._changed.wait(None if first_s is None else first_s - now_s)
         return None

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import heapq
 import math
 import os
 import time
@@ -12,6 +13,7 @@ from typing import Final
 
 from gateway.client.reception import Reception, Series, Source
 from gateway.errors import SelectionError, TakeError
+from gateway.messages.history import utime_of
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import published_again
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
@@ -22,6 +24,10 @@ from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES, LogFile, WriterT
 
 _WAIT_S: Final = 1.5
 """How long the messages of a new source wait for its description; each second brings a status."""
+
+
+_MAX_EARLY_BYTES: Final = 16 * 1024 * 1024
+"""How much waits for earlier messages. What is beyond comes before them in the file."""
 
 
 class RecordedSeries(Series):
@@ -36,6 +42,8 @@ class RecordedSeries(Series):
         self.num_refused = 0
         """How many of them were not written, because too many waited for the disk."""
         self.num_refused_bytes = 0
+        self.merged_utime = 0
+        """The time of the newest message, which orders it among those of other series."""
 
 
 class RecordedSource(Source):
@@ -49,6 +57,8 @@ class RecordedSource(Source):
         """Whether this program has made that message, and no gateway."""
         self.description: SourceDescription | None = None
         """What the file says of it; None before that, when its messages wait."""
+        self.early: list[tuple[int, int, RecordedSeries, bytes]] = []
+        """A heap of messages that wait for those of before, which other series miss: time, number, …"""
 
     @property
     def is_waiting(self) -> bool:
@@ -91,13 +101,15 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         self._writer = WriterThread("record")
         self._held: deque[tuple[RecordedSeries, bytes]] = deque()
         self._held_bytes = 0
+        self._num_early = 0  # so far
+        self._early_bytes = 0
         self._is_starting = True
         self._start_end_s = time.monotonic() + start_s
 
     @property
     def queued_bytes(self) -> int:
         """How many bytes are not written yet."""
-        return self._writer.queued_bytes + self._held_bytes
+        return self._writer.queued_bytes + self._held_bytes + self._early_bytes
 
     @property
     def num_messages(self) -> int:
@@ -114,7 +126,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
     @property
     def has_room(self) -> bool:
         """See Reception. What arrives needs the rest of the queue while the disk is slow."""
-        return self.queued_bytes < MAX_QUEUED_BYTES // 16
+        return self.queued_bytes - self._early_bytes < MAX_QUEUED_BYTES // 16
 
     def _completes(self, series: RecordedSeries) -> bool:
         return series.is_recorded and super()._completes(series)
@@ -128,7 +140,32 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
 
     def _take(self, series: RecordedSeries, message: bytes) -> None:
         if series.is_recorded:
+            self._put_in_order(series, message)
+
+    def _put_in_order(self, series: RecordedSeries, message: bytes) -> None:
+        """Put a message when no series of the source misses one of before any more.
+
+        A replay follows the file, and takes a message of long before for a clock that was set back.
+        """
+        series.merged_utime = max(series.merged_utime, utime_of(message))
+        early = series.source.early
+        if not early and self._reached_utime(series.source) == math.inf:
             self._put(series, message)
+            return
+        self._num_early += 1
+        heapq.heappush(early, (series.merged_utime, self._num_early, series, message))
+        self._early_bytes += len(message)
+        self._put_early(series.source)
+
+    def _put_early(self, source: RecordedSource, *, is_end: bool = False) -> None:
+        early, reached_utime = source.early, self._reached_utime(source)
+        while early and (is_end or early[0][0] <= reached_utime or self._early_bytes > _MAX_EARLY_BYTES):
+            _, _, series, message = heapq.heappop(early)
+            self._early_bytes -= len(message)
+            self._put(series, message)
+
+    def _reached_utime(self, source: RecordedSource) -> float:
+        return math.inf if self.refill is None else self.refill.reached_utime(source)
 
     def _take_parameters(
         self, series: RecordedSeries, message: bytes, *, is_first: bool, is_made: bool
@@ -163,6 +200,8 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         """
         with self._lock:
             heard = self._heard()
+            for source in self.sources.values():
+                self._put_early(source)
             if self._is_starting:
                 if not heard or time.monotonic() < self._start_end_s:
                     return
@@ -215,6 +254,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         with self._lock:
             self._is_closed = True
             for source in self.sources.values():
+                self._put_early(source, is_end=True)
                 source.found_s = -math.inf  # describe it by what is known now
             heard = self._heard()
         if heard:

@@ -1,6 +1,7 @@
 """What `record` writes: each source described before its first message; the clock is the test's."""
 
 import re
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,10 +9,12 @@ import pytest
 import rtc3d
 
 from gateway.client import reception
+from gateway.client.completion import HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
+from gateway.messages.history import sequence_of
 from gateway.rtc3d.components import ComponentType
 from gateway.takes import recorder
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
@@ -28,6 +31,10 @@ MARKERS = MESSAGE_TYPES[ComponentType.MARKERS]
 def markers(sequence: int, version: int = 1) -> bytes:
     utime = UTIME + 5000 * sequence
     return FINGERPRINTS["3d"] + PREFIX.pack(utime, utime, sequence, 1, version) + bytes(16)
+
+
+def events(sequence: int) -> bytes:
+    return FINGERPRINTS["event"] + markers(sequence)[8:]
 
 
 def status(source: str, sequence: int = 0) -> bytes:
@@ -94,6 +101,37 @@ class Recorded:
 
     def channels(self) -> list[str]:
         return [channel for channel, _ in self.events()]
+
+
+def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
+    recorded: Recorded,
+) -> None:
+    """Otherwise, a replay would take the refilled messages for a clock that was set back."""
+    may_answer = threading.Event()
+
+    def ask(series: RecordedSeries, request: HistoryRequest) -> HistoryAnswer:
+        assert may_answer.wait(60)
+        first = 0 if request.known is None else request.known[0]
+        assert request.last is not None
+        new = markers if series.key == "3d" else events
+        found = [new(number) for number in range(first, request.last + 1)]
+        return HistoryAnswer(found, first, request.last, 9)
+
+    recorded.recording.complete(ask, None)
+    recorded.describe("lab")
+    for number in range(10):
+        if number not in range(2, 7):
+            recorded.receive("lab", "3d", markers(number))
+            recorded.receive("lab", "event", events(number))
+    may_answer.set()
+    wait_until(lambda: recorded.recording.num_messages >= 21)
+    numbers = [
+        (sequence_of(data), name) for name, data in recorded.events() if name.endswith(("3D", "EVENT"))
+    ]
+    assert sorted(numbers) == [
+        (number, f"MOCAP_LAB_{key}") for number in range(10) for key in ("3D", "EVENT")
+    ]
+    assert [number for number, _ in numbers] == sorted(number for number, _ in numbers)
 
 
 @pytest.fixture(autouse=True)
