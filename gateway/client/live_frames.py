@@ -1,0 +1,291 @@
+"""What ``live`` gives: frames in numpy, decoded from messages that have arrived."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, cast
+
+from gateway.client.queued_reception import Arrival, DescribedSource, QueuedReception, QueuedSeries
+from gateway.descriptions.labels import Description, describe
+from gateway.messages.host_time import now_utime
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.parameters import Parameters
+from gateway.takes.files.component_rows import Rows, decode_rows
+from gateway.takes.files.row import Row
+from gateway.takes.files.series import Series, SeriesBuilder
+
+
+class ClockDifference:
+    """How far this host's clock is from the gateway's, as far as arriving messages show.
+
+    No message arrives before it is sent: the least difference between both is at most the delay of the
+    network. Up to 20 ms, it is taken for that, and both clocks for the same.
+    """
+
+    SAME_US: Final = 20_000
+    _WINDOW_US: Final = 30_000_000
+
+    def __init__(self) -> None:
+        self.offset_us = 0
+        """What to add to the gateway's times, in µs."""
+        self._least_us: deque[tuple[int, int]] = deque(maxlen=2)  # begin of a window, least difference in it
+
+    def add(self, utime: int, arrived_utime: int) -> None:
+        """Take the time of a message, on the gateway's clock, and when it arrived, on this host's."""
+        difference_us = arrived_utime - utime
+        if not self._least_us or arrived_utime - self._least_us[-1][0] > self._WINDOW_US:
+            self._least_us.append((arrived_utime, difference_us))
+        elif difference_us < self._least_us[-1][1]:
+            self._least_us[-1] = (self._least_us[-1][0], difference_us)
+        else:
+            return
+        least_us = min(least for _, least in self._least_us)
+        self.offset_us = 0 if 0 <= least_us <= self.SAME_US else least_us
+
+
+class LiveSource(DescribedSource):
+    """A source that ``live`` receives."""
+
+    def __init__(self, name: str, channels: str) -> None:
+        super().__init__(name, channels)
+        self.clock = ClockDifference()
+        self._descriptions: dict[tuple[str, int], tuple[Parameters, Description]] = {}
+
+    def describe(self, component: ComponentType, parameters: Parameters, num_items: int) -> Description:
+        """Return the description of a component; the newest one of each number of items is kept."""
+        known = self._descriptions.get((component.key, num_items))
+        if known is None or known[0] is not parameters:
+            if len(self._descriptions) > _MAX_DESCRIPTIONS:
+                self._descriptions.clear()
+            known = (parameters, describe(component, parameters, num_items))
+            self._descriptions[component.key, num_items] = known
+        return known[1]
+
+
+_MAX_DESCRIPTIONS: Final = 64
+_NO_PARAMETERS: Final = Parameters()
+
+
+class LiveReception(QueuedReception[LiveSource]):
+    """What ``live`` receives."""
+
+    start_utime = 0
+    """The time of the first message, in µs since 1970 on its gateway's clock."""
+
+    def _new_source(self, name: str, channels: str) -> LiveSource:
+        return LiveSource(name, channels)
+
+    def _take(self, series: QueuedSeries, message: bytes) -> None:
+        super()._take(series, message)
+        if not self.start_utime and series.has_data:
+            self.start_utime = series.first_utime
+
+
+class Frame:
+    """One message of a source, or all components of one instant if they are joined.
+
+    ``markers``, ``tools``, ``analog``, ``forces`` and ``events`` are what it has, each a ``Row``: the arrays
+    and names of a take's ``Series``, for one frame. Reading one that it does not have raises AttributeError;
+    ``rows`` has those that exist, by "3d", "6d", "analog", "force" and "event".
+
+    ``key`` is the component that it belongs to; ``sequence``, ``capture_utime`` and the other numbers are of
+    this component. ``gap`` is how many messages are missing before it, on the way or because the program was
+    too slow. If components are joined, it is the sum.
+    """
+
+    __slots__ = ("_offset_us", "_others", "_parts", "_source", "_start_utime", "gap", "key")
+
+    def __init__(
+        self, source: LiveSource, key: str, parts: Mapping[str, Sequence[Row]], gap: int, start_utime: int
+    ) -> None:
+        self._source = source
+        self._start_utime = start_utime
+        self._offset_us = source.clock.offset_us
+        self._parts = parts
+        self.key = key
+        self.gap = gap
+        self._others: dict[str, Frame] = {}
+
+    def __repr__(self) -> str:
+        """Return a summary."""
+        return f"<Frame of {self.source}: {', '.join(self._parts)}, number {self.sequence}>"
+
+    @property
+    def source(self) -> str:
+        """The name of the source."""
+        return self._source.name
+
+    @property
+    def sources(self) -> "dict[str, Frame]":
+        """The frames of all sources of this instant by name: others than its own only if they are joined."""
+        return {self.source: self, **self._others}
+
+    @property
+    def row(self) -> Row:
+        """The row of ``key``."""
+        return self._parts[self.key][-1]
+
+    @property
+    def rows(self) -> dict[str, Row]:
+        """The components that it has, by their keys; of one that came several times, the newest."""
+        return {key: rows[-1] for key, rows in self._parts.items()}
+
+    @property
+    def series(self) -> dict[str, Series]:
+        """The same as in a take: for each component, an array of everything since the frame before."""
+        found = {key: self._series_of(rows) for key, rows in self._parts.items()}
+        return {key: series for key, series in found.items() if series is not None}
+
+    @property
+    def markers(self) -> Row:
+        """The markers; AttributeError if it has none."""
+        return self._row("3d", "markers")
+
+    @property
+    def tools(self) -> Row:
+        """The tools; AttributeError if it has none."""
+        return self._row("6d", "tools")
+
+    @property
+    def analog(self) -> Row:
+        """The analog channels; AttributeError if it has none."""
+        return self._row("analog", "analog channels")
+
+    @property
+    def forces(self) -> Row:
+        """The force plates; AttributeError if it has none."""
+        return self._row("force", "forces")
+
+    @property
+    def events(self) -> Row:
+        """The events; AttributeError if it has none."""
+        return self._row("event", "events")
+
+    @property
+    def parameters(self) -> Parameters:
+        """The server's parameters that describe it; without any section if they are not known."""
+        return self.row.parameters
+
+    @property
+    def capture_utime(self) -> int:
+        """When the server captured it, in µs since 1970 on the gateway's clock, as in a take."""
+        return self.row.capture_utime
+
+    @property
+    def capture_time(self) -> float:
+        """When the server captured it, in s since 1970 on this host's clock: compare it with time.time()."""
+        return (self.capture_utime + self._offset_us) / 1e6
+
+    @property
+    def age_s(self) -> float:
+        """How long ago the server captured it, in s. It grows while the frame is kept."""
+        return now_utime() / 1e6 - self.capture_time
+
+    @property
+    def seconds(self) -> float:
+        """The time of capture in s since the first message, on the gateway's clock."""
+        return (self.capture_utime - self._start_utime) / 1e6
+
+    @property
+    def utime(self) -> int:
+        """When the gateway received it, in µs since 1970 on its clock."""
+        return self.row.utime
+
+    @property
+    def sequence(self) -> int:
+        """The number of the message."""
+        return self.row.sequence
+
+    @property
+    def session(self) -> int:
+        """The number of the gateway's connection to the server: it grows with each new one."""
+        return self.row.session
+
+    @property
+    def frame_number(self) -> int:
+        """The server's number, unchanged."""
+        return self.row.frame_number
+
+    @property
+    def timestamp_us(self) -> int:
+        """The server's time stamp in µs since its start, unchanged."""
+        return self.row.timestamp_us
+
+    def joined(self, others: Iterable["Frame"]) -> "Frame":
+        """Return this frame with everything that others have, of this source and of others."""
+        frames: dict[LiveSource, list[Frame]] = {self._source: [self]}
+        for other in others:
+            frames.setdefault(other._source, []).append(other)  # noqa: SLF001 - of the same class
+        joined = [_merged(each) for each in frames.values()]
+        joined[0]._others = {frame.source: frame for frame in joined[1:]}  # noqa: SLF001
+        return joined[0]
+
+    def _row(self, key: str, noun: str) -> Row:
+        rows = self._parts.get(key)
+        if rows is None:
+            raise AttributeError(
+                f"this frame of {self.source} has no {noun}; it has {', '.join(self._parts)}"
+            )
+        return rows[-1]
+
+    def _series_of(self, rows: Sequence[Row]) -> Series | None:
+        """Return rows as a series; None if they are messages without an event."""
+        builder = SeriesBuilder(rows[0].component)
+        for row in rows:
+            builder.add(Rows(row.heads, {len(row.items): row.items[None]}, 0))
+        return builder.build(self._source.entries, self._start_utime)
+
+
+def _merged(frames: Sequence[Frame]) -> Frame:
+    """Return frames of one source as one, with the numbers of the first."""
+    first = frames[0]
+    if len(frames) == 1:
+        return first
+    parts: dict[str, list[Row]] = {}
+    for frame in frames:
+        for key, rows in frame._parts.items():  # noqa: SLF001 - of the same class
+            parts.setdefault(key, []).extend(rows)
+    gap = sum(frame.gap for frame in frames)
+    return Frame(first._source, first.key, parts, gap, first._start_utime)  # noqa: SLF001 - see above
+
+
+def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Frame]:
+    """Yield the frames in messages, in their order. Messages that cannot be read are left out."""
+    messages: dict[QueuedSeries, list[bytes]] = {}
+    for series, message, _, _ in arrivals:
+        messages.setdefault(series, []).append(message)
+    decoded = {series: _rows(series, each) for series, each in messages.items()}
+    for arrival in arrivals:
+        series = arrival.series
+        found = next(decoded[series])
+        if found is None:
+            series.num_malformed += 1
+            series.malformed_gap += 1 + arrival.gap
+            continue
+        heads, items = found
+        source = cast(LiveSource, series.source)
+        utime = int(heads["utime"][0])
+        source.clock.add(utime, arrival.arrived_utime)
+        entry = source.entry_of(int(heads["parameters_version"][0]), utime)
+        parameters = _NO_PARAMETERS if entry is None else entry.parameters
+        component = COMPONENTS_BY_KEY[series.key]
+        description = source.describe(component, parameters, items.shape[1])
+        row = Row(component, heads, items, parameters, description)
+        gap, series.malformed_gap = arrival.gap + series.malformed_gap, 0
+        yield Frame(source, series.key, {series.key: (row,)}, gap, start_utime)
+
+
+def _rows(series: QueuedSeries, messages: list[bytes]) -> Iterator[tuple[Any, Any] | None]:
+    """Yield the head and the items of each message, of shape (1,) and (1, items); None if it is malformed."""
+    component = COMPONENTS_BY_KEY[series.key]
+    rows = decode_rows(component, messages)
+    if rows.malformed and len(messages) > 1:
+        for message in messages:
+            yield from _rows(series, [message])
+        return
+    if rows.malformed:
+        yield None
+    num_taken = dict.fromkeys(rows.items, 0)
+    for place, num_items in enumerate(rows.heads["num_items"].tolist()):
+        first = num_taken[num_items]
+        num_taken[num_items] = first + 1
+        yield rows.heads[place : place + 1], rows.items[num_items][first : first + 1]
