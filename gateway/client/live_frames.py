@@ -2,16 +2,18 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, cast
+from typing import Final, cast
+
+import numpy as np
 
 from gateway.client.queued_reception import Arrival, DescribedSource, QueuedReception, QueuedSeries
 from gateway.descriptions.labels import Description, describe
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.takes.files.component_rows import Rows, decode_rows
+from gateway.takes.files.component_rows import HEAD, Array, Rows, decode_rows
 from gateway.takes.files.row import Row
-from gateway.takes.files.series import Series, SeriesBuilder
+from gateway.takes.files.series import ParametersEntry, Series, SeriesBuilder
 
 
 class ClockDifference:
@@ -48,17 +50,24 @@ class LiveSource(DescribedSource):
     def __init__(self, name: str, channels: str) -> None:
         super().__init__(name, channels)
         self.clock = ClockDifference()
-        self._descriptions: dict[tuple[str, int], tuple[Parameters, Description]] = {}
+        self._described: dict[tuple[str, int, int], tuple[Parameters, Description]] = {}
+        self._described_by: list[ParametersEntry] = []
 
-    def describe(self, component: ComponentType, parameters: Parameters, num_items: int) -> Description:
-        """Return the description of a component; the newest one of each number of items is kept."""
-        known = self._descriptions.get((component.key, num_items))
-        if known is None or known[0] is not parameters:
-            if len(self._descriptions) > _MAX_DESCRIPTIONS:
-                self._descriptions.clear()
-            known = (parameters, describe(component, parameters, num_items))
-            self._descriptions[component.key, num_items] = known
-        return known[1]
+    def describe(
+        self, component: ComponentType, version: int, utime: int, num_items: int
+    ) -> tuple[Parameters, Description]:
+        """Return the parameters of a frame, by their version and its time, and what they say about it."""
+        if self._described_by is not self.entries:
+            self._described_by = self.entries
+            self._described.clear()
+        known = self._described.get((component.key, version, num_items))
+        if known is None:
+            entry = self.entry_of(version, utime)
+            parameters = _NO_PARAMETERS if entry is None else entry.parameters
+            known = parameters, describe(component, parameters, num_items)
+            if len(self._described) < _MAX_DESCRIPTIONS and self.is_unique(version):
+                self._described[component.key, version, num_items] = known
+        return known
 
 
 _MAX_DESCRIPTIONS: Final = 64
@@ -231,7 +240,7 @@ class Frame:
         """Return rows as a series; None if they are messages without an event."""
         builder = SeriesBuilder(rows[0].component)
         for row in rows:
-            builder.add(Rows(row.heads, {len(row.items): row.items[None]}, 0))
+            builder.add(Rows(np.array([row.head], HEAD), {len(row.items): row.items[None]}, 0))
         return builder.build(self._source.entries, self._start_utime)
 
 
@@ -254,30 +263,24 @@ def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Fra
     for series, message, _, _ in arrivals:
         messages.setdefault(series, []).append(message)
     decoded = {series: _rows(series, each) for series, each in messages.items()}
-    for arrival in arrivals:
-        series = arrival.series
+    for series, _, arrived_utime, gap in arrivals:
         found = next(decoded[series])
         if found is None:
             series.num_malformed += 1
-            series.malformed_gap += 1 + arrival.gap
+            series.malformed_gap += 1 + gap
             continue
-        heads, items = found
+        head, items = found
         source = cast(LiveSource, series.source)
-        utime = int(heads["utime"][0])
-        source.clock.add(utime, arrival.arrived_utime)
-        entry = source.entry_of(int(heads["parameters_version"][0]), utime)
-        parameters = _NO_PARAMETERS if entry is None else entry.parameters
+        source.clock.add(head[1], arrived_utime)
         component = COMPONENTS_BY_KEY[series.key]
-        description = source.describe(component, parameters, items.shape[1])
-        row = Row(component, heads, items, parameters, description)
-        gap, series.malformed_gap = arrival.gap + series.malformed_gap, 0
-        yield Frame(source, series.key, {series.key: (row,)}, gap, start_utime)
+        row = Row(component, head, items, *source.describe(component, head[5], head[1], items.shape[1]))
+        total_gap, series.malformed_gap = gap + series.malformed_gap, 0
+        yield Frame(source, series.key, {series.key: (row,)}, total_gap, start_utime)
 
 
-def _rows(series: QueuedSeries, messages: list[bytes]) -> Iterator[tuple[Any, Any] | None]:
-    """Yield the head and the items of each message, of shape (1,) and (1, items); None if it is malformed."""
-    component = COMPONENTS_BY_KEY[series.key]
-    rows = decode_rows(component, messages)
+def _rows(series: QueuedSeries, messages: list[bytes]) -> Iterator[tuple[tuple[int, ...], Array] | None]:
+    """Yield the fields of HEAD and the items, shape (1, items), of each message; None if it is malformed."""
+    rows = decode_rows(COMPONENTS_BY_KEY[series.key], messages)
     if rows.malformed and len(messages) > 1:
         for message in messages:
             yield from _rows(series, [message])
@@ -285,7 +288,7 @@ def _rows(series: QueuedSeries, messages: list[bytes]) -> Iterator[tuple[Any, An
     if rows.malformed:
         yield None
     num_taken = dict.fromkeys(rows.items, 0)
-    for place, num_items in enumerate(rows.heads["num_items"].tolist()):
-        first = num_taken[num_items]
-        num_taken[num_items] = first + 1
-        yield rows.heads[place : place + 1], rows.items[num_items][first : first + 1]
+    for head in rows.heads.tolist():
+        first = num_taken[head[-1]]
+        num_taken[head[-1]] = first + 1
+        yield head, rows.items[head[-1]][first : first + 1]

@@ -39,6 +39,9 @@ _CLOSE_S: Final = 0.5
 _COLLECT_S: Final = 0.05
 """How often ``collect`` takes what has arrived."""
 
+_MIN_STEP_S: Final = 0.004
+"""How long after one decoding the next one begins: it saves a third of the CPU at 2200 messages a second."""
+
 _BATCH: Final = 256
 """How many messages are decoded at once: of those that still wait, the oldest can be left out."""
 
@@ -115,6 +118,7 @@ class Live:
         self._pending_s = 0.0
         self._given_up: set[tuple[object, bytes]] = set()
         self._ready: deque[Frame] = deque()
+        self._decoded_s = 0.0
         self._join = Join(sources, components) if join else None
 
     # Opening and closing.
@@ -198,27 +202,34 @@ class Live:
     def __iter__(self) -> Iterator[Frame]:
         self._start_queueing()
         while not self._is_closed:
+            if self._ready:
+                with contextlib.suppress(IndexError):  # another thread was faster
+                    yield self._ready.popleft()
+                continue
             num_seen = self._reception.num_changes
-            frame, wait_s = self._next()
-            if frame is None:
+            wait_s = self._decode()
+            if not self._ready:
                 self._reception.wait(num_seen, wait_s)
-            else:
-                yield frame
+                time.sleep(self._early_s())
 
     async def __aiter__(self) -> AsyncIterator[Frame]:
         await asyncio.to_thread(self._start_queueing)
         loop = asyncio.get_running_loop()
         while not self._is_closed:
+            if self._ready:
+                with contextlib.suppress(IndexError):  # another thread was faster
+                    yield self._ready.popleft()
+                continue
             num_seen = self._reception.num_changes
-            frame, wait_s = self._next()
-            if frame is not None:
-                yield frame
+            wait_s = self._decode()
+            if self._ready:
                 continue
             changed = asyncio.Event()
             self._reception.call_at_change(num_seen, lambda: loop.call_soon_threadsafe(changed.set))  # noqa: B023 - used before the next one
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
                     await changed.wait()
+            await asyncio.sleep(self._early_s())
 
     def on_frame(self, function: Callable[[Frame], object]) -> Self:
         """Call a function with each frame, in a thread of its own, until ``close``.
@@ -264,23 +275,23 @@ class Live:
         self._reception.is_queueing = True
         self.open()
 
-    def _next(self) -> tuple[Frame | None, float | None]:
-        """Return the next frame; None, and how long to wait unless something arrives, if none is ready."""
+    def _decode(self) -> float | None:
+        """Make frames of what waits, if it is known what describes them.
+
+        Returns how long to wait for the next call unless something arrives; None if not before.
+        """
         with self._taking:
-            now_s = time.monotonic()
-            wait_s = None
-            if not self._ready:
-                arrivals, wait_s = self._described(now_s)
-                frames = decode_frames(arrivals, self._reception.start_utime)
-                if self._join is None:
-                    self._ready.extend(frames)
-                else:
-                    for frame in frames:
-                        self._join.add(frame, now_s)
-                    self._ready.extend(self._join.take(now_s))
-                    waits = [wait_s, self._join.wait_s(now_s)]
-                    wait_s = min((each for each in waits if each is not None), default=None)
-            ready = self._ready.popleft() if self._ready else None
+            now_s = self._decoded_s = time.monotonic()
+            arrivals, wait_s = self._described(now_s)
+            frames = decode_frames(arrivals, self._reception.start_utime)
+            if self._join is None:
+                self._ready.extend(frames)
+            else:
+                for frame in frames:
+                    self._join.add(frame, now_s)
+                self._ready.extend(self._join.take(now_s))
+                waits = [wait_s, self._join.wait_s(now_s)]
+                wait_s = min((each for each in waits if each is not None), default=None)
         if self.num_dropped and not self._is_slow:
             self._is_slow = True
             warnings.warn(
@@ -289,7 +300,11 @@ class Live:
                 RuntimeWarning,
                 stacklevel=3,
             )
-        return ready, wait_s
+        return wait_s
+
+    def _early_s(self) -> float:
+        """Return how long to wait before decoding again, so that much that arrives is decoded together."""
+        return max(0.0, self._decoded_s + _MIN_STEP_S - time.monotonic())
 
     def _described(self, now_s: float) -> tuple[list[Arrival], float | None]:
         """Return the next messages if their parameters are known; none, and how long to wait for these."""

@@ -97,6 +97,10 @@ class DescribedSource(Source):
         """Return whether there are parameters of this version."""
         return version in self._entries_by_version
 
+    def is_unique(self, version: int) -> bool:
+        """Return whether at most one has this version: they start again with the gateway."""
+        return len(self._entries_by_version.get(version, ())) <= 1
+
     def entry_of(self, version: int, utime: int) -> ParametersEntry | None:
         """Return the parameters that describe a frame, by the rule of ``Series``; None if there are none."""
         entries = self._entries_by_version.get(version)

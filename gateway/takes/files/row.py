@@ -122,19 +122,19 @@ class Row(ItemValues):
     describe it, without any section if they are not known.
     """
 
-    __slots__ = ("_description", "_items", "component", "heads", "parameters")
+    __slots__ = ("_description", "_items", "component", "head", "parameters")
 
     def __init__(
         self,
         component: ComponentType,
-        heads: Array,
+        head: tuple[int, ...],
         items: Array,
         parameters: Parameters,
         description: Description | None = None,
     ) -> None:
         self.component = component
-        self.heads = heads
-        """What is before the items, with the dtype HEAD, shape (1,)."""
+        self.head = head
+        """What is before the items: the fields of HEAD."""
         self._items = items  # shape (1, items), as in Rows
         self.parameters = parameters
         self._description = description or describe(component, parameters, items.shape[1])
@@ -185,34 +185,34 @@ class Row(ItemValues):
     @property
     def utime(self) -> int:
         """When the gateway received the frame, in µs since 1970 on its clock."""
-        return int(self.heads["utime"][0])
+        return self.head[1]
 
     @property
     def capture_utime(self) -> int:
         """When the server captured the frame, in µs since 1970 on the gateway's clock."""
-        return int(self.heads["capture_utime"][0])
+        return self.head[2]
 
     @property
     def sequence(self) -> int:
         """The number of the message."""
-        return int(self.heads["sequence"][0])
+        return self.head[3]
 
     @property
     def session(self) -> int:
         """The number of the connection to the server."""
-        return int(self.heads["session"][0])
+        return self.head[4]
 
     @property
     def parameters_version(self) -> int:
         """The version of the parameters that describe the frame."""
-        return int(self.heads["parameters_version"][0])
+        return self.head[5]
 
     @property
     def frame_number(self) -> int:
         """The server's number, unchanged."""
-        return int(self.heads["frame_number"][0])
+        return self.head[6]
 
     @property
     def timestamp_us(self) -> int:
         """The server's time stamp in µs since its start, unchanged."""
-        return int(self.heads["timestamp_us"][0])
+        return self.head[7]
