@@ -101,7 +101,7 @@ class Frame:
     too slow. If components are joined, it is the sum.
     """
 
-    __slots__ = ("_offset_us", "_others", "_parts", "_source", "_start_utime", "gap", "key")
+    __slots__ = ("_head", "_offset_us", "_others", "_parts", "_source", "_start_utime", "gap", "key")
 
     def __init__(
         self, source: LiveSource, key: str, parts: Mapping[str, Sequence[Row]], gap: int, start_utime: int
@@ -110,6 +110,7 @@ class Frame:
         self._start_utime = start_utime
         self._offset_us = source.clock.offset_us
         self._parts = parts
+        self._head = parts[key][-1].head
         self.key = key
         self.gap = gap
         self._others: dict[str, Frame] = {}
@@ -177,7 +178,7 @@ class Frame:
     @property
     def capture_utime(self) -> int:
         """When the server captured it, in µs since 1970 on the gateway's clock, as in a take."""
-        return self.row.capture_utime
+        return self._head[2]
 
     @property
     def capture_time(self) -> float:
@@ -197,27 +198,27 @@ class Frame:
     @property
     def utime(self) -> int:
         """When the gateway received it, in µs since 1970 on its clock."""
-        return self.row.utime
+        return self._head[1]
 
     @property
     def sequence(self) -> int:
         """The number of the message."""
-        return self.row.sequence
+        return self._head[3]
 
     @property
     def session(self) -> int:
         """The number of the gateway's connection to the server: it grows with each new one."""
-        return self.row.session
+        return self._head[4]
 
     @property
     def frame_number(self) -> int:
         """The server's number, unchanged."""
-        return self.row.frame_number
+        return self._head[6]
 
     @property
     def timestamp_us(self) -> int:
         """The server's time stamp in µs since its start, unchanged."""
-        return self.row.timestamp_us
+        return self._head[7]
 
     def joined(self, others: Iterable["Frame"]) -> "Frame":
         """Return this frame with everything that others have, of this source and of others."""

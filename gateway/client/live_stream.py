@@ -89,7 +89,7 @@ def live(
 class Live:
     """Frames that arrive: iterate (``for`` or ``async for``), or use ``on_frame``, ``latest`` or ``collect``.
 
-    It connects when it is first used, and waits for gateways that are not there yet. Opening raises
+    It connects when it is first used, and waits for sources that are not there yet. Opening raises
     QueryError if Zenoh does not open, OutputError if LCM does not. ``with`` closes it at the end of the
     block; otherwise, it is closed when nothing refers to it.
 
