@@ -1,6 +1,7 @@
 """Record 5 s into a file of numpy: python examples/live_record.py lab.npz [tcp/192.0.2.5:7447]"""
 
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from gateway.client import live
 from gateway.takes import Take
 
 
-def arrays(take: Take) -> dict[str, np.ndarray]:
+def arrays(take: Take) -> dict[str, Any]:
     """Return what to save of a take, which was received or comes from open_take."""
     found = {}
     for name, source in take.sources.items():

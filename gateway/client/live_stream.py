@@ -169,7 +169,7 @@ class Live:
         with self._taking:
             for each in self._reception.sources_now:
                 if source in {None, each.name}:
-                    each.update()
+                    each.update_parameters()
                     if each.newest_entry is not None:
                         return each.newest_entry.parameters
         return Parameters()
@@ -331,7 +331,7 @@ class Live:
 
     def _update_sources(self) -> None:
         for source in self._reception.sources_now:
-            source.update()
+            source.update_parameters()
 
     def _take_batches(self) -> list[MessageBatch]:
         """Return what waits, by source and component."""

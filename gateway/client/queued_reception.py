@@ -58,7 +58,7 @@ class Arrival(NamedTuple):
 class DescribedSource(Source):
     """A source, and the server's parameters that describe its frames.
 
-    ``update`` and what it changes belong to one thread.
+    ``update_parameters`` and what it changes belong to one thread.
     """
 
     def __init__(self, name: str, channels: str) -> None:
@@ -68,7 +68,7 @@ class DescribedSource(Source):
         self.num_unreadable = 0
         """How many parameters could not be read."""
         self.unread: deque[bytes] = deque(maxlen=_MAX_ENTRIES)
-        """What has arrived since the last ``update``."""
+        """What has arrived since the last ``update_parameters``."""
         self._history = ParametersHistory()
         self._entries_by_version: dict[int, list[ParametersEntry]] = {}
 
@@ -77,7 +77,7 @@ class DescribedSource(Source):
         """The newest parameters; None before the first."""
         return self._history.newest
 
-    def update(self) -> None:
+    def update_parameters(self) -> None:
         """Decode the parameters that have arrived."""
         while self.unread:
             try:
