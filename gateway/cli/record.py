@@ -4,14 +4,21 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from gateway.cli import options
 from gateway.cli.run import StopSignals
 
+if TYPE_CHECKING:
+    from gateway.cli.record_output import RecordProgress
+    from gateway.takes.recorder import TakeRecording
+
 _TICK_S: Final = 0.1
+
+_REFILL_S: Final = 5.0
+"""How long the end waits for what is missing."""
 
 
 @options.with_options
@@ -61,7 +68,9 @@ def record(
     )
     sources = list(dict.fromkeys(source or ()))
     try:
-        subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(sources, component, recording)
+        subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(
+            sources, component, recording, complete=True
+        )
         progress = RecordProgress(recording, subscriber, sources, quiet=quiet)
         start_s = time.monotonic()
         try:
@@ -73,6 +82,7 @@ def record(
                 first_s = recording.first_heard_s or start_s
                 if seconds is not None and time.monotonic() - first_s >= seconds:
                     break
+            _refill(recording, progress)
             # Write everything that has arrived. A disk that is full loses it; for a slow one, wait.
             recording.stop()
             if recording.file is not None:
@@ -87,3 +97,14 @@ def record(
         target.discard_empty()
     if not is_complete:
         raise typer.Exit(1)
+
+
+def _refill(recording: "TakeRecording", progress: "RecordProgress") -> None:
+    """Request what is missing until now."""
+    if (refill := recording.refill) is not None:
+        end_s = time.monotonic() + _REFILL_S
+        refill.end()
+        while refill.num_incomplete and time.monotonic() < end_s:
+            time.sleep(_TICK_S)
+            progress.tick()
+        refill.close()

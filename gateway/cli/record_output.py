@@ -169,12 +169,14 @@ class RecordProgress:
         former_messages, former_bytes = self._former
         self._former = (recording.num_messages, recording.num_bytes)
         minutes, seconds = divmod(int(now_s - self._start_s), 60)
+        num_incomplete = 0 if recording.refill is None else recording.refill.num_incomplete
         parts = [
             f"{minutes}:{seconds:02}",
             "waiting for messages" if file is None else size_text(file.num_bytes),
             f"{(recording.num_messages - former_messages) / elapsed_s:.0f} messages/s",
             f"{size_text((recording.num_bytes - former_bytes) / elapsed_s)}/s",
             f"{self._num_lost} lost" if self._num_lost else "no gaps",
+            *([f"{num_incomplete} keys are refilled"] if num_incomplete else []),
             f"{size_text(recording.queued_bytes)} to be written",
         ]
         return "  ".join(parts)
@@ -189,7 +191,8 @@ def size_text(num_bytes: float) -> str:
 
 _ORDER: Final = ("3d", "6d", f"{POSE}*", "analog", "force", "event", "status", "clock", "parameters")
 _MAX_NOTES: Final = 10
-_COLUMNS: Final = ("messages", "size", "rate", "gaps", "lost", "not written")
+_MAX_RANGES: Final = 3
+_COLUMNS: Final = ("messages", "size", "rate", "refilled", "gaps", "lost", "not written")
 
 
 def print_summary(recording: TakeRecording, out: TextIO) -> bool:
@@ -231,9 +234,10 @@ def _cells(series: Sequence[RecordedSeries], file: FileWriter) -> Iterator[str]:
     yield str(sum(each.num_messages for each in series) - num_unwritten)
     yield size_text(sum(each.num_bytes for each in series) - num_unwritten_bytes)
     yield f"{sum(_rate_hz(each) for each in series):.1f} Hz"
+    num_refilled = sum(each.completion.num_refilled for each in series if each.completion is not None)
     num_gaps = sum(each.check.num_gaps for each in series)
     num_lost = sum(each.check.num_lost for each in series)
-    for number in (num_gaps, num_lost, num_unwritten):
+    for number in (num_refilled, num_gaps, num_lost, num_unwritten):
         yield str(number) if number else "-"
 
 
@@ -272,6 +276,10 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
     num_lost = sum(series.check.num_lost for series in all_series)
     if num_lost:
         yield f"{num_lost} messages were lost between the gateway and this computer, or in the gateway"
+        incomplete = [series for series in all_series if series.check.num_lost]
+        yield from map(_missing_text, incomplete[:_MAX_NOTES])
+        if len(incomplete) > _MAX_NOTES:
+            yield f"… and {len(incomplete) - _MAX_NOTES} other keys"
     for source in recording.sources_now:
         if any(series.check.has_two_publishers for series in source.series):
             yield (
@@ -281,6 +289,20 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
     num_refused = sum(series.num_refused for series in all_series)
     if num_refused:
         yield f"{num_refused} messages were not written, because too many waited for the disk"
+
+
+def _missing_text(series: RecordedSeries) -> str:
+    """Return which messages of a series are missing, and why, if that is known."""
+    gaps = series.check.gaps
+    ranges = [
+        f"{gap.stop - gap.missing} to {gap.stop - 1}" if gap.missing > 1 else str(gap.stop - 1)
+        for gap in gaps[:_MAX_RANGES]
+    ]
+    more = series.check.num_gaps - len(ranges)
+    others = f" and {more} other places" if more else ""
+    problem = series.completion.problem if series.completion is not None else ""
+    reason = f" ({problem})" if problem else ""
+    return f"{series.source.name} {series.key}: the messages {', '.join(ranges)}{others} are missing{reason}"
 
 
 def _notes(recording: TakeRecording) -> Iterator[str]:

@@ -8,7 +8,15 @@ from typing import IO, Any, Final, NamedTuple, Self
 
 from gateway.client.lcm_transport import LcmTransport
 from gateway.client.reception import Reception
-from gateway.client.transport import FoundSources, GatewaySubscriber, Query, Replies, Reply, Transport
+from gateway.client.transport import (
+    Completeness,
+    FoundSources,
+    GatewaySubscriber,
+    Query,
+    Replies,
+    Reply,
+    Transport,
+)
 from gateway.client.zenoh_transport import ZenohTransport
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import DEFAULT_LCM_PREFIX
@@ -151,15 +159,23 @@ class GatewayClient:
     # What gateways publish.
 
     def subscribe(
-        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
+        self,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        *,
+        complete: bool = False,
+        last_s: float | None = None,
     ) -> GatewaySubscriber:
         """Subscribe to these sources (all, if empty) and components (None: all).
 
-        The subscriber has a connection of its own. Raises QueryError if Zenoh does not open.
+        With ``complete``, the messages of each key come in the order of their numbers, and those that were
+        missed come from the gateway's history; ``last_s`` seconds from before the first one come first. The
+        subscriber has a connection of its own. Raises QueryError if Zenoh does not open.
         """
         transport = _open(self._address)
         try:
-            return transport.subscribe(sources, components, reception)
+            return transport.subscribe(sources, components, reception, Completeness(complete, last_s))
         except Exception:
             transport.close()
             raise

@@ -15,10 +15,13 @@ from typing import Any, Final
 
 import rtc3d
 
+from gateway.client.completion import BUSY_CODES, HistoryAnswer, HistoryRequest
+from gateway.client.lcm_refill import LcmRefill
 from gateway.client.reception import FINGERPRINTS, POSE, Reception, Series, Source
 from gateway.client.transport import (
-    BUSY_CODES,
+    INCOMPLETE,
     RETRY_S,
+    Completeness,
     FoundSources,
     GatewaySubscriber,
     Query,
@@ -51,6 +54,7 @@ class LcmTransport(Transport):
 
     def __init__(self, url: str, queries_url: str, prefix: str) -> None:
         self._url = url
+        self._queries_url = queries_url
         self._prefix = prefix
         self._requester = LcmRequester(queries_url, prefix)
 
@@ -157,10 +161,18 @@ class LcmTransport(Transport):
     # Subscribing.
 
     def subscribe(
-        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
+        self,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        completeness: Completeness = INCOMPLETE,
     ) -> "LcmGatewaySubscriber":
         """See Transport."""
-        return LcmGatewaySubscriber(self._url, self._prefix, sources, components, reception, self._requester)
+        return LcmGatewaySubscriber(
+            *(self._url, self._prefix, sources, components, reception, completeness),
+            requester=self._requester,
+            refill=LcmRefill(self._queries_url, self._prefix, self._requester),
+        )
 
     def close(self) -> None:
         """See Transport."""
@@ -222,12 +234,17 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         sources: Collection[str],
         components: Collection[str] | None,
         reception: Reception[Any, Any],
+        completeness: Completeness,
         requester: "LcmRequester",
+        refill: LcmRefill,
     ) -> None:
-        super().__init__(prefix, reception)
+        super().__init__(prefix, reception, completeness)
         self._url = url
         self._names = {lcm_channel(prefix, name): name for name in sources}
         self._requester = requester
+        self._refill = refill
+        self._pose_keys: dict[Series, str] = {}
+        """The keys of poses on Zenoh: channels do not say the labels of tools exactly."""
         self._take_requests: dict[str, Any] = {}
         """The newest request for the takes of each source, by the beginning of its channels."""
         channels = "|".join(map(re.escape, self._names)) or f"{re.escape(prefix)}_.+"
@@ -239,7 +256,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
     def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
-        if address.endswith(("_REQUEST", "_REPLY", "_RECONNECTED")):
+        if address.endswith(("_REQUEST", "_REPLY", "_REFILL", "_RECONNECTED")):
             return None
         key = _KEYS_BY_FINGERPRINT.get(message[:8])
         if key == POSE:
@@ -269,6 +286,16 @@ class LcmGatewaySubscriber(GatewaySubscriber):
                 name = decode(message).source
                 if lcm_channel(self._prefix, name) == source.channels:
                     source.name, source.has_known_name = name, True
+
+    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+        """See GatewaySubscriber."""
+        channels = series.source.channels
+        key = self._pose_keys.get(series, series.key)
+        if key.startswith(POSE) and series not in self._pose_keys:
+            for each in self._refill.keys(channels):
+                if f"{channels}{lcm_channel('', *each.split('/', 1))}".encode() == series.channel:
+                    key = self._pose_keys[series] = each
+        return self._refill.ask(channels, {"key": key, **request.options})
 
     def _query(self, source: Source) -> None:
         """See GatewaySubscriber. Every gateway sends its status."""
@@ -309,9 +336,9 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         """See GatewaySubscriber."""
         return no_gateway_on_lcm(" ".join(self._names) or self._prefix, self._url)
 
-    def close(self) -> None:
-        """See GatewaySubscriber."""
+    def _close(self) -> None:
         self._subscriber.close()
+        self._refill.close()
         self._requester.close()
 
 

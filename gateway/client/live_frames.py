@@ -77,16 +77,18 @@ _NO_PARAMETERS: Final = Parameters()
 class LiveReception(QueuedReception[LiveSource]):
     """What ``live`` receives."""
 
-    start_utime = 0
-    """The time of the first message, in µs since 1970 on its gateway's clock."""
+    _start_utime = 0
+
+    @property
+    def start_utime(self) -> int:
+        """The time of the first message, in µs since 1970 on its gateway's clock; 0 before."""
+        if not self._start_utime:
+            times = [source.first_utime for source in self.sources_now]
+            self._start_utime = min((each for each in times if each), default=0)
+        return self._start_utime
 
     def _new_source(self, name: str, channels: str) -> LiveSource:
         return LiveSource(name, channels)
-
-    def _take(self, series: QueuedSeries, message: bytes) -> None:
-        super()._take(series, message)
-        if not self.start_utime and series.has_data:
-            self.start_utime = series.first_utime
 
 
 class Frame:

@@ -50,10 +50,12 @@ _VERSION: Final = slice(VERSION_OFFSET, VERSION_OFFSET + 4)
 logger = logging.getLogger(__name__)
 
 
-def live(
+def live(  # noqa: PLR0913 - each is an option of its own, by name
     *sources: str,
     components: Collection[str] | None = None,
     join: bool = False,
+    complete: bool = False,
+    last_s: float | None = None,
     connect: str | None = None,
     zenoh_config: PathLike[str] | str | None = None,
     lcm: bool = False,
@@ -71,7 +73,9 @@ def live(
 
     ``sources`` (names; none: all) and ``components`` (of 3d, 6d, analog, force, event; None: all) say what is
     received. Without ``join``, each message is a frame. With it, each frame of the first component has
-    everything that the other components, and other sources, have had since the frame before.
+    everything that the other components, and other sources, have had since the frame before. With
+    ``complete``, what was lost on the way comes from the gateway's history, in its order; ``last_s`` seconds
+    from before the first message come first.
 
     Gateways on Zenoh are found by multicast, or at an endpoint (``connect``), such as tcp/192.0.2.5:7447, or
     as a configuration file of Zenoh says. With ``lcm`` or ``url``, they are received on LCM. ``prefix`` is
@@ -83,7 +87,7 @@ def live(
         raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
     config = None if zenoh_config is None else Path(zenoh_config)
     address = GatewayAddress(lcm or url is not None, connect, config, url, prefix)
-    return Live(address, sources, components, join=join)
+    return Live(address, sources, components, join=join, complete=complete, last_s=last_s)
 
 
 class Live:
@@ -105,10 +109,13 @@ class Live:
         components: Collection[str] | None = None,
         *,
         join: bool = False,
+        complete: bool = False,
+        last_s: float | None = None,
     ) -> None:
         self.client = GatewayClient(address)
         """Asks the same gateways, starts, stops and saves takes: ``live.client.start_take("walk")``."""
         self._wanted = (tuple(sources), tuple(components or COMPONENTS_BY_KEY))
+        self._completeness = complete or last_s is not None, last_s
         self._reception = LiveReception(is_queueing=False)
         self._connection: _Connection | None = None
         self._is_closed = False
@@ -127,7 +134,10 @@ class Live:
         """Connect now, and not when it is first used."""
         with self._taking:
             if self._connection is None and not self._is_closed:
-                subscriber = self.client.subscribe(*self._wanted, self._reception)
+                complete, last_s = self._completeness
+                subscriber = self.client.subscribe(
+                    *self._wanted, self._reception, complete=complete, last_s=last_s
+                )
                 self._connection = _Connection(subscriber, self._reception)
                 weakref.finalize(self, self._connection.close)
         return self

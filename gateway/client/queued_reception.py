@@ -128,6 +128,7 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         """How often a message or parameters have arrived."""
         self._waiting: deque[Arrival] = deque()
         self._waiting_bytes = 0
+        self._num_asleep = 0  # threads in ``wait``
         self._changed = threading.Condition(self._lock)
         self._on_change: list[Callable[[], object]] = []
 
@@ -157,7 +158,9 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         """Wait until ``num_changes`` is no longer ``num_seen``, or it is closed."""
         with self._lock:
             if self.num_changes == num_seen and not self._is_closed:
+                self._num_asleep += 1
                 self._changed.wait(timeout_s)
+                self._num_asleep -= 1
 
     def call_at_change(self, num_seen: int, function: Callable[[], object]) -> None:
         """Call a function, once, when ``wait`` would return."""
@@ -166,6 +169,11 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
                 self._on_change.append(function)
                 return
         function()
+
+    @property
+    def has_room(self) -> bool:
+        """Whether more messages can be taken now without leaving out older ones."""
+        return len(self._waiting) < MAX_WAITING // 2 and self._waiting_bytes < MAX_WAITING_BYTES // 2
 
     def close(self) -> None:
         """Take nothing more, and wake all that wait."""
@@ -211,11 +219,13 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
 
     def _notify(self) -> None:
         self.num_changes += 1
-        self._changed.notify_all()
-        waiting, self._on_change = self._on_change, []
-        for function in waiting:
-            with contextlib.suppress(RuntimeError):  # an event loop that is closed
-                function()
+        if self._num_asleep:
+            self._changed.notify_all()
+        if self._on_change:
+            waiting, self._on_change = self._on_change, []
+            for function in waiting:
+                with contextlib.suppress(RuntimeError):  # an event loop that is closed
+                    function()
 
     # For subclasses.
 

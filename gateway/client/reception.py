@@ -7,10 +7,13 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 import rtc3d
 
+from gateway.client.completion import Completion
+from gateway.client.refill import Ask, Refill
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES, MESSAGE_TYPES, NOT_PUBLISHED, VERSION_OFFSET
@@ -50,6 +53,10 @@ FINGERPRINTS: Final[dict[str, bytes]] = {
 }
 
 
+_MAX_LISTED: Final = 8
+"""How many places are listed where messages are missing. All are counted."""
+
+
 class Series:
     """The messages of one key of a source. ``row`` is its line in tables: the key, or 6d/* for poses."""
 
@@ -58,7 +65,9 @@ class Series:
         self.key = key
         self.row = f"{POSE}*" if key.startswith(POSE) else key
         self.channel = channel.encode()
-        self.check = SequenceCheck(counts_first=True)
+        self.check = SequenceCheck(counts_first=True, max_listed=_MAX_LISTED)
+        self.completion: Completion | None = None
+        """What fills the gaps, if that is wanted; then the messages are counted after it."""
         self.first_utime = 0
         self.last_utime = 0
         """The times of the first and the newest message with a number, in µs since the Unix epoch."""
@@ -77,7 +86,7 @@ class Series:
         return message[:8] == self._fingerprint and len(message) >= PREFIX_END
 
     def count(self, message: bytes) -> None:
-        """Count a message that has arrived, and those that are missing before it."""
+        """Count a message, and those that are missing before it."""
         self.add(message)
         utime, _, sequence, session = _FIELDS.unpack_from(message, FINGERPRINT_BYTES)
         if sequence != NOT_PUBLISHED:
@@ -195,6 +204,8 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         self.num_defects = 0
         self.first_heard_s: float | None = None
         """When the first message arrived, on the monotonic clock; None before."""
+        self.refill: Refill | None = None
+        """What fills the gaps of all series, if that is wanted."""
         self._lock = threading.Lock()
         self._num_series = 0
         self._is_closed = False
@@ -239,6 +250,8 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
             series = source.series_by_key[key] = self._new_series(source, key, free)
             self._num_series += 1
+            if self.refill is not None and self._completes(series):
+                series.completion = self.refill.add(series, partial(self._hand_on, series))
         return series
 
     def receive(self, series: SeriesT, message: bytes) -> None:
@@ -249,11 +262,27 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             if not series.accepts(message):
                 self.num_foreign += 1
                 return
-            series.count(message)
-            self._hear(series.source)
+            now_s = self._hear(series.source)
             if series.key == "status":
                 series.source.status = message
+            completion = series.completion
+            if completion is not None:
+                utime, _, sequence, session = _FIELDS.unpack_from(message, FINGERPRINT_BYTES)
+                if sequence >= 0:
+                    completion.receive(message, sequence, utime, session, now_s)
+                    if completion.due_s < math.inf and self.refill is not None:
+                        self.refill.check(series)
+                    return
+            self._hand_on(series, message)
+
+    def _hand_on(self, series: SeriesT, message: bytes) -> None:
+        if not self._is_closed:
+            series.count(message)
             self._take(series, message)
+
+    def complete(self, ask: Ask, last_s: float | None) -> None:
+        """Fill the gaps of all series from now on, with what ``ask`` returns; see Refill."""
+        self.refill = Refill(self, self._lock, ask, last_s)
 
     def ignore(self, *, beyond_limit: bool) -> None:
         """Count a message that is left out."""
@@ -318,12 +347,22 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             return  # of another program
         source.running_take = str(running[0]) if running else ""
 
-    def _hear(self, source: Source) -> None:
-        source.heard_s = time.monotonic()
+    def _hear(self, source: Source) -> float:
+        source.heard_s = now_s = time.monotonic()
         if self.first_heard_s is None:
-            self.first_heard_s = source.heard_s
+            self.first_heard_s = now_s
+        return now_s
 
     # For subclasses.
+
+    @property
+    def has_room(self) -> bool:
+        """Whether more messages can be taken now. Nothing is requested otherwise."""
+        return True
+
+    def _completes(self, series: SeriesT) -> bool:
+        """Whether to fill the gaps of a series."""
+        return series.key != "parameters"
 
     @abstractmethod
     def _new_source(self, name: str, channels: str) -> SourceT: ...

@@ -4,9 +4,10 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
+from gateway.client.completion import HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SERIES, Reception, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
@@ -100,9 +101,6 @@ def read_status(message: bytes, name: str, gateway: str = "") -> SourceReport:
 RETRY_S: Final = 0.5
 """How long to wait before repeating a query that got no reply, or came while there were too many."""
 
-BUSY_CODES: Final = frozenset({"busy", "rate"})
-"""The codes of a gateway that gets too many queries. They count as no reply as long as there is time."""
-
 _CLOSE_S: Final = 0.5
 
 ReceivedT = TypeVar("ReceivedT")
@@ -187,15 +185,27 @@ class TimeLimits:
         )
 
 
+class Completeness(NamedTuple):
+    """Whether to request what was missed; each series begins with the messages of ``last_s`` seconds."""
+
+    is_complete: bool = False
+    last_s: float | None = None
+
+
+INCOMPLETE: Final = Completeness()
+
+
 class GatewaySubscriber(ABC):
     """Hands what gateways publish to a Reception, sorted by source and key.
 
     An address is what a message arrives under: its key on Zenoh, or its channel on LCM.
     """
 
-    def __init__(self, prefix: str, reception: Reception[Any, Any]) -> None:
+    def __init__(self, prefix: str, reception: Reception[Any, Any], completeness: Completeness) -> None:
         self._prefix = prefix
         self._reception = reception
+        if completeness.is_complete:
+            reception.complete(self._ask_history, completeness.last_s)
         self._series: dict[str, Series | None] = {}  # by address; None: left out
 
     # In the threads that receive.
@@ -236,6 +246,12 @@ class GatewaySubscriber(ABC):
     def _take(self, series: Series, message: bytes, sample: Any) -> None:
         """Hand a message to the reception."""
 
+    # In the threads that request what is missing.
+
+    @abstractmethod
+    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+        """Request messages of a series, and return the answer. Raises QueryError."""
+
     # In one other thread.
 
     def tick(self) -> None:
@@ -256,9 +272,14 @@ class GatewaySubscriber(ABC):
     def silence(self) -> str:
         """Return that no gateway is found, or none with these sources; "" if one is. It may take 1 s."""
 
-    @abstractmethod
     def close(self) -> None:
         """Unsubscribe. It may block while a peer does not read."""
+        if self._reception.refill is not None:
+            self._reception.refill.close()
+        self._close()
+
+    @abstractmethod
+    def _close(self) -> None: ...
 
 
 class Transport(ABC):
@@ -277,13 +298,27 @@ class Transport(ABC):
 
     @abstractmethod
     def subscribe(
-        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
+        self,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        completeness: Completeness = INCOMPLETE,
     ) -> GatewaySubscriber:
         """See GatewayClient. Closing the subscriber closes this connection."""
 
     @abstractmethod
     def close(self) -> None:
         """Close the connection."""
+
+
+def history_answer(
+    facts: Mapping[str, Any], messages: Sequence[bytes], *, is_whole: bool = True
+) -> HistoryAnswer:
+    """Return messages as the answer that the gateway's ``facts`` describe. Raises ProtocolError."""
+    first, last, newest = (facts.get(name) for name in ("from", "to", "newest"))
+    if not (isinstance(first, int) and isinstance(last, int) and isinstance(newest, int)):
+        raise ProtocolError("an answer with messages from the history does not say which they are")
+    return HistoryAnswer(messages, first, last, newest, is_whole)
 
 
 def silence_text(subscriber: GatewaySubscriber, reception: Reception[Any, Any]) -> str:

@@ -9,10 +9,13 @@ from urllib.parse import unquote
 
 import zenoh
 
+from gateway.client.completion import BUSY_CODES, HistoryAnswer, HistoryRequest
 from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
+from gateway.client.refill import REPLY_S
 from gateway.client.transport import (
-    BUSY_CODES,
+    INCOMPLETE,
     RETRY_S,
+    Completeness,
     FoundSources,
     GatewaySubscriber,
     Query,
@@ -20,9 +23,11 @@ from gateway.client.transport import (
     Reply,
     TimeLimits,
     Transport,
+    history_answer,
 )
-from gateway.errors import QueryError
+from gateway.errors import ProtocolError, QueryError
 from gateway.messages.decode import TEXT
+from gateway.messages.history import unpack_messages
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
 from gateway.outputs.kind import DISCOVERY_S
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
@@ -177,10 +182,16 @@ class ZenohTransport(Transport):
     # Subscribing.
 
     def subscribe(
-        self, sources: Collection[str], components: Collection[str] | None, reception: Reception[Any, Any]
+        self,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        completeness: Completeness = INCOMPLETE,
     ) -> "ZenohGatewaySubscriber":
         """See Transport."""
-        return ZenohGatewaySubscriber(self._session, self._prefix, sources, components, reception)
+        return ZenohGatewaySubscriber(
+            self._session, self._prefix, sources, components, reception, completeness
+        )
 
     def close(self) -> None:
         """See Transport."""
@@ -207,8 +218,9 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         sources: Collection[str],
         components: Collection[str] | None,
         reception: Reception[Any, Any],
+        completeness: Completeness,
     ) -> None:
-        super().__init__(prefix, reception)
+        super().__init__(prefix, reception, completeness)
         self._session = session
         self._sources = sources
         for name in served_sources(session, prefix):
@@ -260,6 +272,25 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             float(age_s) if isinstance(age_s, int | float) and 0 <= age_s < 1e9 else 0.0,
         )
 
+    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+        """See GatewaySubscriber."""
+        options = ";".join(f"{name}={value}" for name, value in request.options.items())
+        selector = f"{zenoh_key(self._prefix, series.source.name)}/{series.key}?{options}"
+        error = QueryError("no gateway keeps these messages", code="no-gateway")
+        try:
+            for reply in self._session.get(
+                selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=REPLY_S
+            ):
+                if reply.ok is not None:
+                    messages = unpack_messages(reply.ok.payload.to_bytes())
+                    return history_answer(attached_facts(reply.ok), messages)
+                if reply.err is not None:
+                    text = reply.err.payload.to_bytes().decode("utf-8", "replace")
+                    error = QueryError(text, code=error_code(reply.err) or "timeout")
+        except (zenoh.ZError, ProtocolError) as problem:
+            error = QueryError(str(problem), code="zenoh")
+        raise error
+
     def _query(self, source: Source) -> None:
         def take_parameters(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -293,8 +324,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         """See GatewaySubscriber."""
         return no_gateway_on_zenoh(self._prefix, self._sources, served_sources(self._session, self._prefix))
 
-    def close(self) -> None:
-        """See GatewaySubscriber."""
+    def _close(self) -> None:
         self._session.close()
 
 

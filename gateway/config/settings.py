@@ -278,6 +278,16 @@ class SpoolSettings(Section):
         return folder_of(self.directory, "c3d")
 
 
+class HistorySettings(Section):
+    """The newest messages, kept in memory, so that subscribers can ask for those they have missed."""
+
+    seconds: values.IntervalSeconds = 60.0
+    """How long messages are kept. 0 keeps none."""
+
+    max_bytes: values.ByteLimit = 128 * 1024 * 1024
+    """The memory for the messages of all sources, which share it equally. The oldest are dropped first."""
+
+
 class MetricsSettings(Section):
     """Monitoring over HTTP: Prometheus metrics on /metrics, the health check on /healthz."""
 
@@ -309,6 +319,9 @@ class Settings(Section):
 
     spool: SpoolSettings = SpoolSettings()
     """Storage for C3D files from the servers."""
+
+    history: HistorySettings = HistorySettings()
+    """The newest messages, for subscribers that have missed some."""
 
     metrics: MetricsSettings = MetricsSettings()
     """Monitoring over HTTP."""

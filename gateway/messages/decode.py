@@ -23,6 +23,9 @@ TEXT: Final = "text/plain"
 LCM: Final = "application/x-lcm"
 """The encoding of every message; its schema is the LCM type: ``application/x-lcm;rtc3d.markers_t``."""
 
+LCM_MESSAGES: Final = "application/x-lcm-messages"
+"""The encoding of several messages in one answer (gateway.messages.history); its schema is their type."""
+
 
 def json_bytes(value: Any) -> bytes:
     """Return ``value`` as compact JSON in UTF-8. Raises ValueError for NaN and infinity."""

@@ -147,6 +147,13 @@ class SequenceCheck:
         for sequence, utime in zip(sequences[done:].tolist(), utimes[done:].tolist(), strict=True):
             self.add(sequence, utime)
 
+    def end(self, stop: int) -> None:
+        """Take what follows the newest message, before number ``stop``, as missing: nothing follows it."""
+        current = self._current
+        if current is not None and stop > current.newest + 1:
+            self._add_gap(Gap(current.utime, stop - current.newest - 1, stop), current.gaps)
+            current.newest = stop - 1
+
     def _fill_gap(self, current: _Numbering, sequence: int, utime: int) -> bool:
         """Return whether a message was missing, and was only overtaken by others."""
         if not (0 < current.newest - sequence <= MAX_LATE and utime <= current.utime):
@@ -178,15 +185,18 @@ class SequenceCheck:
             num_lost = max(0, sequence) if self._counts_first else 0
         if num_lost:
             current.gap = gap = Gap(utime, num_lost, sequence)
-            gaps.append(gap)
-            self.num_gaps += 1
-            self.num_lost += num_lost
-            if len(self._listed) < self._max_listed:
-                self._listed.append(gap)
-            if self._max_listed and (self._largest is None or num_lost > self._largest.missing):
-                self._largest = gap
+            self._add_gap(gap, gaps)
         self._former.append(current)
         self._current = _Numbering(sequence, utime, 1, gaps)
+
+    def _add_gap(self, gap: Gap, gaps: deque[Gap]) -> None:
+        gaps.append(gap)
+        self.num_gaps += 1
+        self.num_lost += gap.missing
+        if len(self._listed) < self._max_listed:
+            self._listed.append(gap)
+        if self._max_listed and (self._largest is None or gap.missing > self._largest.missing):
+            self._largest = gap
 
     def _find_former(self, current: _Numbering, sequence: int) -> _Numbering | None:
         """Return the interrupted numbering that a message continues; None if it continues none."""
@@ -196,7 +206,7 @@ class SequenceCheck:
         if current.num_messages > 1:
             return None
         # The message between may have been damaged or late, and the one after it lost.
-        followed = [each for each in (*self._former, current) if 0 < sequence - each.newest <= _MAX_GAP]
+        followed = [each for each in (current, *self._former) if 0 < sequence - each.newest <= _MAX_GAP]
         nearest = max(followed, key=lambda each: each.newest, default=current)
         return None if nearest is current else nearest
 

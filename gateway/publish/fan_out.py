@@ -8,10 +8,11 @@ from functools import lru_cache
 from typing import Final
 
 from gateway.messages.encode import MESSAGE_TYPES, Stamp, encode_content, has_lcm_form, lcm_content
+from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages
 from gateway.outputs.contract import Output, OutputStatus, ServerParameters
 from gateway.publish.routes import FrameRoute, OutputRoute, TopicRoute
 from gateway.publish.tool_poses import ToolPoses
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 
 _HOLD_S: Final = 30.0
@@ -92,10 +93,17 @@ class _ComponentPlan:
     """How to publish one component of a layout: its index and place in the frame, and its routes."""
 
     def __init__(
-        self, component: _Component, layout: FrameLayout, index: int, routes: list[TopicRoute]
+        self,
+        component: _Component,
+        layout: FrameLayout,
+        index: int,
+        routes: list[TopicRoute],
+        history: MessageHistory,
     ) -> None:
         self.routes = routes
         self._component = component
+        self._key = component.type.key
+        self._history = history
         self._index = index
         self._start, self._end = layout.content_spans[index]
         self._has_lcm_form = has_lcm_form(layout.components[index], layout.byte_order)
@@ -110,6 +118,7 @@ class _ComponentPlan:
         message = encode_content(component.type, content, stamp, component.sequence)
         component.sequence += 1
         component.newest = message
+        self._history.add(self._key, message)
         return message
 
 
@@ -148,7 +157,9 @@ class FanOut:
         self._routes: list[OutputRoute] = []
         self._frame_routes: list[FrameRoute] = []
         self._last_routes: dict[str, OutputRoute] = {}  # by the output's name, including closed ones
-        self._tool_poses = ToolPoses()
+        self.history = MessageHistory()
+        """What was published last, and what was numbered and not published."""
+        self._tool_poses = ToolPoses(self.history)
         self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
         self._plan: _Plan | None = None  # of the previous frame
         self._item_counts = ItemCounts(source)
@@ -172,7 +183,9 @@ class FanOut:
 
     def _open_route(self, output: Output) -> OutputRoute:
         route = OutputRoute(
-            self._source, output, self.frames, self._last_routes.get(output.name), self.forget_layouts
+            *(self._source, output, self.frames, self.history),
+            predecessor=self._last_routes.get(output.name),
+            on_wanted_changed=self.forget_layouts,
         )
         self._last_routes[output.name] = route
         if self._is_streaming:
@@ -199,11 +212,22 @@ class FanOut:
         there, it has the number of the last message before it. None if no such frame has arrived.
         """
         message = self._components[component].newest
-        for route in self._routes:
-            component_route = route.components.get(component)
-            if message is not None and route.output.name == output and component_route is not None:
-                return component_route.numbered(message)
-        return message
+        paced = self._paced_route(component, output)
+        return message if paced is None or message is None else paced.numbered(message)
+
+    def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages of a key from the history, as they are numbered on the output of this name.
+
+        ``key`` is that of a component, "status", "clock" or "6d/TOOL". None if it has no messages.
+        """
+        component = COMPONENTS_BY_KEY.get(key)
+        paced = None if component is None else self._paced_route(component, output)
+        return self.history.find(key if paced is None else paced.history_key, wanted)
+
+    def _paced_route(self, component: ComponentType, output: str) -> TopicRoute | None:
+        """Return the route to the output of this name if it numbers a component itself."""
+        routes = (route.components.get(component) for route in self._routes if route.output.name == output)
+        return next((route for route in routes if route is not None and route.is_paced), None)
 
     @property
     def outputs(self) -> list[tuple[Output, OutputStatus]]:
@@ -257,6 +281,7 @@ class FanOut:
                     if (component_route := route.components.get(component.type)) is not None
                     and not component_route.is_idle
                 ],
+                self.history,
             )
             for index, component in indexed
         ]
@@ -295,8 +320,9 @@ class FanOut:
             for route in self._routes:
                 route.output.show_measurement(self._source, is_running)
 
-    def check_losses(self) -> None:
-        """Log the end of each period in which messages were lost. Called once a second."""
+    def maintain(self) -> None:
+        """Log the end of each period in which messages were lost, and drop old ones. Called once a second."""
+        self.history.begin_block()
         for route in self._routes:
             route.losses.check()
         self._item_counts.check()
@@ -308,12 +334,14 @@ class FanOut:
 
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""
+        self.history.add("status", message)
         for route in self._routes:
             if not route.status_route.is_idle:
                 route.status_route.send(message)
 
     def publish_clock(self, message: bytes) -> None:
         """Publish an encoded ``clock_t``."""
+        self.history.add("clock", message)
         for route in self._routes:
             if not route.clock_route.is_idle:
                 route.clock_route.send(message)

@@ -11,6 +11,7 @@ import rtc3d
 from gateway.errors import OutputError
 from gateway.logs.losses import Losses
 from gateway.messages.encode import MESSAGE_TYPES, Stamp, lcm_type_name, message_timestamp_us, with_sequence
+from gateway.messages.history import MessageHistory
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import WHOLE_FRAME, FramePublisher, Output, OutputStatus
 from gateway.outputs.pacing import Pacer
@@ -34,9 +35,9 @@ class SentCounter:
 class OutputRoute:
     """Everything that one source publishes on one output.
 
-    ``sequences`` are the next sequence number of each component. The route continues the counters of
-    ``predecessor``, an earlier route to an output of the same name. ``on_wanted_changed`` is called when
-    ``is_idle`` of a topic may have changed.
+    ``sequences`` are the next sequence number of each component. ``history`` keeps the messages that the
+    route numbers itself. The route continues the counters of ``predecessor``, an earlier route to an output
+    of the same name. ``on_wanted_changed`` is called when ``is_idle`` of a topic may have changed.
     """
 
     def __init__(
@@ -44,11 +45,13 @@ class OutputRoute:
         source: str,
         output: Output,
         sequences: Mapping[ComponentType, int],
+        history: MessageHistory,
         predecessor: "OutputRoute | None" = None,
         on_wanted_changed: Callable[[], None] = lambda: None,
     ) -> None:
         self.source = source
         self.output = output
+        self.history = history
         self.sent: dict[str, SentCounter] = {} if predecessor is None else predecessor.sent
         """By component key, or by "status", "clock", "6d/tool" or WHOLE_FRAME."""
         self.losses: Losses = (
@@ -133,6 +136,9 @@ class TopicRoute:
         self._sent = output_route.sent.setdefault(counted_as, SentCounter())
         self._pacer = None if max_rate_hz is None else Pacer(max_rate_hz)
         self._sequence = sequence  # of the next message; only used if the route is paced
+        self._history = output_route.history
+        self.history_key = f"{counted_as} on {output_route.output.name}"
+        """Under which the history keeps the messages that this route numbers itself."""
         if predecessor is not None and predecessor._pacer is not None:  # noqa: SLF001 - of the same class
             self._sequence = predecessor._sequence  # noqa: SLF001
 
@@ -150,8 +156,7 @@ class TopicRoute:
         if self._pacer is not None and stamp is not None:
             if not _is_due(self._pacer, message, stamp):
                 return
-            message = with_sequence(message, self._sequence)
-            self._sequence += 1  # even if the output does not accept it, so that subscribers see the loss
+            message = self._number(message)
         try:
             self._publish(message)
         except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
@@ -165,8 +170,23 @@ class TopicRoute:
         if self._pacer is not None:
             if not _is_due(self._pacer, message, stamp):
                 return False
-            self._sequence += 1
+            self._number(message)
         return True
+
+    def _number(self, message: bytes) -> bytes:
+        """Return a message with its number on a paced route, which it uses up and the history keeps.
+
+        If the output does not accept the message, subscribers see the loss.
+        """
+        message = with_sequence(message, self._sequence)
+        self._sequence += 1
+        self._history.add(self.history_key, message)
+        return message
+
+    @property
+    def is_paced(self) -> bool:
+        """Whether the route leaves messages out, and numbers the others itself."""
+        return self._pacer is not None
 
     def numbered(self, message: bytes) -> bytes:
         """Return the newest message with the number of the newest one that this route has let through."""

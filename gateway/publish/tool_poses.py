@@ -8,6 +8,7 @@ import rtc3d
 from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp, tool_poses
+from gateway.messages.history import MessageHistory
 from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.publish.routes import OutputRoute, TopicRoute
@@ -47,7 +48,8 @@ class _Tool:
 class ToolPoses:
     """Publishes the poses of one source's tools, in SI units, on topics named after their labels."""
 
-    def __init__(self) -> None:
+    def __init__(self, history: MessageHistory) -> None:
+        self._history = history
         self._output_routes: Sequence[OutputRoute] = ()
         self._labels: tuple[str, ...] = ()
         self._parameters = Parameters()
@@ -123,6 +125,7 @@ class ToolPoses:
         for tool, message in zip(tools, messages, strict=True):
             if not tool.is_wanted:  # not sent, but not lost either
                 continue
+            self._history.add(_key(tool.name), message)
             for route in tool.routes.values():
                 if route.publisher.wanted:
                     route.send(message, stamp)
@@ -139,12 +142,18 @@ class ToolPoses:
             label = self._labels[index].strip() if index < len(self._labels) else ""
             name = unique_name(label or f"tool {index + 1}", names, MAX_LABEL_LENGTH)
             names.add(name)
+            if name not in self._sequences:
+                self._history.forget(_key(name))
             self._sequences[name] = self._sequences.pop(name, 0)  # the newest names are at the end
             tool = _Tool(name)
             tool.set_routes(self._output_routes)
             self._tools.append(tool)
         for name in list(self._sequences)[:-_MAX_REMEMBERED_NAMES]:
             del self._sequences[name]
+
+
+def _key(name: str) -> str:
+    return f"{ComponentType.TOOLS.key}/{name}"
 
 
 def _num_tools(frame: Frame, indices: Sequence[int]) -> int:

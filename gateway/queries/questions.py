@@ -2,11 +2,14 @@
 
 from collections.abc import Collection, Iterable, Mapping
 from typing import Final, Literal, NamedTuple
+from urllib.parse import unquote
 
 import rtc3d
 
 from gateway.errors import QueryError
 from gateway.logs.safe_text import quoted
+from gateway.messages.history import WantedMessages
+from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import KeyPath
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS
@@ -16,13 +19,16 @@ SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 """The message types, and the types they contain."""
 
 RECORDING: Final[KeyPath] = ("recording",)
+HISTORY: Final[KeyPath] = ("history",)
 
-_ANY: Final = {"NAME", "OPTIONS"}
+_ANY: Final = {"NAME", "OPTIONS", "NUMBER"}
 """Each stands for the values of an option that is any text."""
 
 _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "parameters": {"format": ("xml", "json"), "fresh": ("true", "false"), "stale": ("ok",)},
     "component": {"format": ("lcm", "json")},
+    "messages": {"from": ("NUMBER",), "last_s": ("NUMBER",), "since_utime": ("NUMBER",), "to": ("NUMBER",)},
+    "history": {},
     "status": {"format": ("lcm", "json")},
     "c3d": {},
     "schema": {},
@@ -31,21 +37,30 @@ _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
 """The options of each kind of question, with the values that each accepts."""
 
 
+_BEGIN_OPTIONS: Final = {"from", "last_s", "since_utime"}
+_RANGE_OPTIONS: Final = {*_BEGIN_OPTIONS, "to"}
+"""The options that select messages of the history."""
+
+_MAX_DIGITS: Final = 19
+"""Sequence numbers and times have 63 bits."""
+
+
 class Question(NamedTuple):
     """A query for one key of one source. ``kind`` decides which of the other fields are used.
 
-    ``name`` is the section ("" for all), the component's key, the type, or the name of a recording. ``set``
-    is start, stop, or "" if the query does not have it. ``options`` are for the server that starts a
-    recording.
+    ``name`` is the section ("" for all), the key of the messages, the type, or the name of a recording.
+    ``set`` is start, stop, or "" if the query does not have it. ``options`` are for the server that starts a
+    recording. ``wanted`` says which messages of the history.
     """
 
-    kind: Literal["parameters", "component", "status", "c3d", "schema", "recording"]
+    kind: Literal["parameters", "component", "messages", "history", "status", "c3d", "schema", "recording"]
     name: str = ""
     as_json: bool = False
     fresh: bool = False
     stale_ok: bool = False
     set: str = ""
     options: str = ""
+    wanted: WantedMessages | None = None
 
 
 def known_keys(components: Collection[ComponentType]) -> list[KeyPath]:
@@ -55,6 +70,7 @@ def known_keys(components: Collection[ComponentType]) -> list[KeyPath]:
         *(("parameters", section) for section in SECTIONS),
         *((component.key,) for component in WIRE_ORDER if component in components),
         ("status",),
+        HISTORY,
         ("c3d",),
         RECORDING,
         *(("schema", name) for name in SCHEMA_TYPES),
@@ -75,7 +91,8 @@ def parse_question(
     Raises QueryError, with what is accepted, for an unknown key, section, option or value, and for a
     component that is not configured.
     """
-    kind, name = _kind_and_name(path, components)
+    options = _split_again(options)
+    kind, name = _kind_and_name(path, options, components)
     _check_options(options, [kind])
     for option in ("name", "options"):
         if option in options and options.get("set") != "start":
@@ -91,7 +108,45 @@ def parse_question(
         stale_ok="stale" in options,
         set=options.get("set", ""),
         options=options.get("options", ""),
+        wanted=_wanted(options) if kind == "messages" else None,
     )
+
+
+def _split_again(options: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the options of a query for messages as if ``;`` were between them: many people write ``&``."""
+    if _RANGE_OPTIONS.isdisjoint(options):
+        return options
+    texts = [text for name, value in options.items() for text in f"{name}={value}".split("&")]
+    return {name: value for name, _, value in (text.partition("=") for text in texts)}
+
+
+def _wanted(options: Mapping[str, str]) -> WantedMessages:
+    """Return which messages are wanted. Raises QueryError."""
+    if len(_BEGIN_OPTIONS & options.keys()) != 1:
+        raise QueryError(f"messages of the history need one of {', '.join(sorted(_BEGIN_OPTIONS))}")
+    first = since_utime = None
+    if "from" in options:
+        first = _whole_number("from", options)
+    elif "since_utime" in options:
+        since_utime = _whole_number("since_utime", options)
+    else:
+        try:
+            last_us = round(1e6 * float(options["last_s"]))
+        except (ValueError, OverflowError):
+            last_us = -1
+        if last_us < 0:
+            raise QueryError(
+                f"last_s={quoted(options['last_s'])} is not accepted; accepted: a number of seconds"
+            )
+        since_utime = max(0, now_utime() - last_us)
+    return WantedMessages(first, since_utime, _whole_number("to", options) if "to" in options else None)
+
+
+def _whole_number(name: str, options: Mapping[str, str]) -> int:
+    text = options[name]
+    if not (text.isascii() and text.isdigit() and len(text) < _MAX_DIGITS):
+        raise QueryError(f"{name}={quoted(text)} is not accepted; accepted: a whole number, 0 or more")
+    return int(text)
 
 
 def parse_questions(
@@ -102,13 +157,19 @@ def parse_questions(
     Each key gets the options that it accepts. Raises QueryError for an option or value that none of them
     accepts, and as ``parse_question`` does.
     """
-    kinds = {path: _kind_and_name(path, components)[0] for path in paths}
+    options = _split_again(options)
+    kinds = {path: _kind_and_name(path, options, components)[0] for path in paths}
     _check_options(options, dict.fromkeys(kinds.values()))
     accepted = {
-        kind: {name: value for name, value in options.items() if value in _OPTIONS[kind].get(name, ())}
+        kind: {name: value for name, value in options.items() if _is_accepted(kind, name, value)}
         for kind in kinds.values()
     }
     return {path: parse_question(path, accepted[kind], components) for path, kind in kinds.items()}
+
+
+def _is_accepted(kind: str, name: str, value: str) -> bool:
+    values = _OPTIONS[kind].get(name, ())
+    return value in values or not _ANY.isdisjoint(values)
 
 
 def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
@@ -127,28 +188,38 @@ def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
             raise QueryError(f"{name}={quoted(value)} is not accepted; accepted: {', '.join(accepted[name])}")
 
 
-def _kind_and_name(path: KeyPath, components: Collection[ComponentType]) -> tuple[str, str]:
+def _kind_and_name(
+    path: KeyPath, options: Mapping[str, str], components: Collection[ComponentType]
+) -> tuple[str, str]:
     """Return the first two fields of the Question for a key; raises QueryError."""
+    wants_messages = not _RANGE_OPTIONS.isdisjoint(options)
+    found: tuple[str, str]
     match path:
+        case ("6d", tool):
+            found = "messages", f"6d/{unquote(tool)}"
+        case ("status" | "clock" as key,) if wants_messages:
+            found = "messages", key
         case ("parameters",):
-            return "parameters", ""
+            found = "parameters", ""
         case ("parameters", section):
             check_sections([section])
-            return "parameters", section
+            found = "parameters", section
         case (key,) if key in COMPONENTS_BY_KEY:
             if COMPONENTS_BY_KEY[key] not in components:
                 configured = ", ".join(component.key for component in WIRE_ORDER if component in components)
                 raise QueryError(
                     f"component {key!r} is not configured for this source; accepted: {configured}"
                 )
-            return "component", key
-        case ("status" | "c3d" | "recording" as kind,):
-            return kind, ""
+            found = "messages" if wants_messages else "component", key
+        case ("status" | "history" | "c3d" | "recording" as kind,):
+            found = kind, ""
         case ("schema", name) if name.removeprefix("rtc3d.") in SCHEMA_TYPES:
-            return "schema", name.removeprefix("rtc3d.")
+            found = "schema", name.removeprefix("rtc3d.")
         case ("schema", *_):
             raise QueryError(f"unknown type; accepted: {', '.join(SCHEMA_TYPES)}")
-    raise QueryError(f"unknown key {quoted('/'.join(path))}; accepted: {accepted_keys(components)}")
+        case _:
+            raise QueryError(f"unknown key {quoted('/'.join(path))}; accepted: {accepted_keys(components)}")
+    return found
 
 
 def check_sections(sections: Iterable[str]) -> None:

@@ -6,14 +6,16 @@ The server gets one request at a time, and equal questions at the same time shar
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from gateway.config.settings import SourceSettings
 from gateway.descriptions.source_frame import source_frame
 from gateway.errors import FrameError, QueryError
+from gateway.logs.safe_text import quoted
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.decode import JSON, XML, json_bytes, prefix_of
+from gateway.messages.decode import JSON, LCM_MESSAGES, XML, json_bytes, message_type, prefix_of
 from gateway.messages.encode import NOT_PUBLISHED, Stamp, encode_message
+from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages, pack_messages
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
@@ -41,10 +43,25 @@ CONTROLS_PER_S: Final = 4.0
 """How many commands a second that start, stop or change something are carried out."""
 
 
+_FINDS_PER_S: Final = 200.0
+"""How many times a second messages are found in the history of a source: each takes about 0.1 ms."""
+
+
+class PublishedMessages(Protocol):
+    """What was published of a source. Messages have the numbers that the output of a name has given them."""
+
+    history: MessageHistory
+
+    def newest(self, component: ComponentType, output: str) -> bytes | None:
+        """Return the newest message of a component; None before the first."""
+
+    def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages of a key from the history; None if it has none of this key."""
+
+
 class SourceQueries:
     """Answers questions about one source; ``parameters`` has those of its server.
 
-    ``newest_message`` returns the newest message of a component as the output of a name numbers it.
     ``last_c3d`` raises QueryError if there is no file. ``announce_parameters`` takes the server's parameters
     when they change.
     """
@@ -53,7 +70,7 @@ class SourceQueries:
         self,
         settings: SourceSettings,
         streams: Callable[[], Sequence[StreamAccess]],
-        newest_message: Callable[[ComponentType, str], bytes | None],
+        published: PublishedMessages,
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
         recording: RecordingAccess,
@@ -63,13 +80,14 @@ class SourceQueries:
         self.settings = settings
         """A reload can replace them by others that differ only in the frame of poses."""
         self._streams = streams
-        self._newest_message = newest_message
+        self._published = published
         self._status_message = status_message
         self._last_c3d = last_c3d
         self._requests = ServerRequests(settings, streams)
         self._recordings = Recordings(settings.name, self._requests, recording, history)
         self._newest_json = NewestJson()
         self._controls = TokenBucket(CONTROLS_PER_S)
+        self._finds = TokenBucket(_FINDS_PER_S)
         self.parameters: ParameterCache = ParameterCache(
             settings, self._requests, announce_parameters, history
         )
@@ -121,8 +139,8 @@ class SourceQueries:
                 return await self._parameters(question)
             case "component":
                 return await self._component(question, output)
-            case "status":
-                return self._message_answer(self._status_message(), question, output)
+            case "messages" | "history" | "status":
+                return self._without_server(question, output)
             case "schema":
                 return schema_answer(question.name)
             case "c3d":
@@ -163,7 +181,7 @@ class SourceQueries:
         if stream.connection is None:
             raise self._requests.no_connection_error()
         if stream.status.state is StreamState.STREAMING:
-            message = self._newest_message(component, output)
+            message = self._published.newest(component, output)
             if message is None or prefix_of(message).session != session:
                 raise QueryError(
                     f"no {component.key} has arrived from source {self.settings.name!r} in this session",
@@ -178,6 +196,31 @@ class SourceQueries:
                 current, Stamp(utime, utime, session, self._requests.parameters_version), NOT_PUBLISHED
             )
         return self._message_answer(message, question, output)
+
+    def _without_server(self, question: Question, output: str) -> Answer:
+        """Return the status, or what the history has: all keys, or messages of MAX_ANSWER_BYTES at most."""
+        if question.kind == "history":
+            return Answer(json_bytes(self._published.history.overview), JSON)
+        if question.wanted is None:
+            return self._message_answer(self._status_message(), question, output)
+        if not self._finds.try_take():
+            raise QueryError(
+                f"the gateway finds messages of a source {_FINDS_PER_S:g} times a second; ask again",
+                code="rate",
+            )
+        found = self._published.find(question.name, output, question.wanted)
+        if found is None and not self._published.history.is_kept:
+            raise QueryError(
+                "the gateway keeps no messages; to keep some, set history.seconds in its configuration",
+                code="disabled",
+            )
+        if found is None:
+            name = self.settings.name
+            text = f"the history of source {name!r} has no messages of {quoted(question.name)}"
+            raise QueryError(text, code="nothing-yet")
+        messages = found.messages
+        schema = f";rtc3d.{message_type(messages[0]).__name__}" if messages else ""
+        return Answer(pack_messages(messages), f"{LCM_MESSAGES}{schema}", found.facts)
 
     def _message_answer(self, message: bytes, question: Question, output: str) -> Answer:
         payload: JsonPayload | None = None

@@ -49,6 +49,7 @@ class Gateway:
             self._serve_queries(output)
         for source in settings.sources:
             self._add_source(source)
+        self._share_history()
 
     @property
     def sources(self) -> Sequence[Source]:
@@ -166,7 +167,10 @@ class Gateway:
                     source.spool = self._spool
                 changes.append("spool changed")
             changes += await self._change_sources(settings.sources)
+            if settings.history != self.settings.history:
+                changes.append("history changed")
             self.settings = settings
+            self._share_history()
             return changes
 
     def _build_outputs(self, settings: Settings) -> list[GuardedOutput]:
@@ -225,6 +229,13 @@ class Gateway:
         if defects:
             raise defects[0]
         return changes + _changes("source", stopped, new)
+
+    def _share_history(self) -> None:
+        """Divide the memory for the newest messages among the sources. A removed one keeps none."""
+        limits = self.settings.history
+        for name, history in self._histories.items():
+            max_bytes = limits.max_bytes // len(self._sources) if name in self._sources else 0
+            history.fan_out.history.set_limits(limits.seconds, max_bytes)
 
     async def _stop_source(self, name: str) -> None:
         task = self._source_tasks.pop(name, None)

@@ -74,7 +74,7 @@ class Source:
                 StreamAccess(stream.settings.components, stream.status, stream.session)
                 for stream in self.streams
             ],
-            newest_message=self.fan_out.newest,
+            published=self.fan_out,
             status_message=lambda: self._newest_status,
             last_c3d=self._last_c3d,
             recording=RecordingAccess(self._record, self._follow_recording),
@@ -191,7 +191,7 @@ class Source:
     def _check_logs(self) -> None:
         for stream in self._streams.known:
             stream.status.check()
-        self.fan_out.check_losses()
+        self.fan_out.maintain()
 
     def _publish_newest_status(self) -> None:
         for stream in self.streams:

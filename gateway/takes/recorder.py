@@ -111,6 +111,14 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
 
     # Messages and answers. Any thread.
 
+    @property
+    def has_room(self) -> bool:
+        """See Reception. What arrives needs the rest of the queue while the disk is slow."""
+        return self.queued_bytes < MAX_QUEUED_BYTES // 16
+
+    def _completes(self, series: RecordedSeries) -> bool:
+        return series.is_recorded and super()._completes(series)
+
     def _new_source(self, name: str, channels: str) -> RecordedSource:
         return RecordedSource(name, channels)
 

@@ -278,6 +278,8 @@ class RunningGateway:
                 ),
             ],
             "spool": {"directory": str(self.folder / "spool")},
+            # It fills soon, so that its growth is not that of an attack.
+            "history": {"max_bytes": 8 * 1024 * 1024},
             "zenoh": {"config": zenoh_keys("peer", listen=self.zenoh_endpoint)},
             "lcm": {"url": self.lcm_url},
             "metrics": {"port": self.metrics_port},

@@ -7,7 +7,7 @@ import signal
 import socket
 import struct
 from asyncio.subprocess import DEVNULL, Process
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -94,6 +94,24 @@ async def test_askers_that_do_not_read_the_answers(
             stalled.send_signal(signal.SIGSTOP)
             await asyncio.sleep(6)
             # Answers to others wait for the stalled one, frames do not.
+    gateway.report.check(MAX_GROWTH_MIB)
+
+
+async def stop_after_its_questions(process: Process) -> None:
+    await printed(process)
+    process.send_signal(signal.SIGSTOP)
+
+
+async def test_askers_for_the_whole_history_that_do_not_read_the_answers(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"lab": dense_server}) as gateway, AsyncExitStack() as askers:
+        await wait_for_frames(gateway)
+        selectors = ("mocap/lab/3d?from=0", "mocap/lab/analog?last_s=60;_x={}", "mocap/*/*?since_utime=0")
+        stalled = [await askers.enter_async_context(asker(gateway, 600, *selectors)) for _ in range(10)]
+        await asyncio.gather(*map(stop_after_its_questions, stalled))
+        await asyncio.sleep(6)  # longer than Zenoh waits for a peer that does not read
+        await still_answers(gateway, "mocap/healthy/3d?last_s=1")
     gateway.report.check(MAX_GROWTH_MIB)
 
 

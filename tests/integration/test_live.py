@@ -15,6 +15,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import Take, open_take
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import run_gateway, wait_until_cached
+from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
@@ -85,6 +86,26 @@ async def test_live_data_are_those_of_the_take_that_the_gateway_records(
         assert found[key].items[here].tobytes() == recorded[key].items[there].tobytes()
         assert found[key].capture_utime[here].tolist() == recorded[key].capture_utime[there].tolist()
         assert (found[key].labels, found[key].units) == (recorded[key].labels, recorded[key].units)
+
+
+async def test_a_late_joiner_gets_what_the_gateway_has_kept_and_then_the_live_data(
+    where: tuple[dict[str, Any], dict[str, Any]],
+) -> None:
+    """In order, and each message once."""
+    gateway_options, options = where
+    scene = SyntheticScene(markers=2, rate_hz=100.0)
+    async with (
+        Simulator(scene) as simulator,
+        run_gateway(simulator.port, **gateway_options) as gateway,
+    ):
+        await wait_until_cached(gateway)
+        await wait_until_async(lambda: gateway.sources[0].statuses[0].frames_in > 50)
+
+        def receive() -> list[int]:
+            with live("lab", components=["3d"], last_s=30, **options) as data:
+                return [frame.sequence for frame, _ in zip(data, range(150), strict=False)]
+
+        assert await asyncio.to_thread(receive) == list(range(150))
 
 
 async def test_frames_can_be_awaited_beside_a_gateway_in_one_event_loop() -> None:

@@ -12,8 +12,9 @@ import pytest
 import rtc3d
 import zenoh
 
-from gateway.config.settings import StreamSettings
+from gateway.config.settings import HistorySettings, StreamSettings
 from gateway.messages.decode import decode, to_json
+from gateway.messages.history import WantedMessages, sequence_of, unpack_messages
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.queries.questions import SCHEMA_TYPES
@@ -32,7 +33,7 @@ from tests.support.queried_gateway import (
     wait_until_cached,
     zenoh_peer,
 )
-from tests.support.servers import ScriptedServer, c3d_file, packet
+from tests.support.servers import ScriptedServer, c3d_file, markers_frame, packet
 from tests.support.waiting import wait_until_async
 
 # Parameters ----------------------------------------------------------------------------------
@@ -130,6 +131,88 @@ async def test_without_frames_the_current_frame_is_requested() -> None:
         message = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
         assert (message.frame_number, message.sequence, message.session) == (7, -1, 1)
         assert server.commands[-1] == "SendCurrentFrame 3D"
+
+
+# The history ----------------------------------------------------------------------------------
+
+
+async def publish_frames(server: ParameterServer, gateway: Gateway, number: int) -> None:
+    """Send frames until the gateway has numbered this many messages of markers."""
+    await until_a_frame(gateway)
+    for index in range(1, number):
+        server.send(markers_frame(7 + index, (1.0, 2.0, float(index))))
+    fan_out = gateway.sources[0].fan_out
+    await wait_until_async(lambda: fan_out.frames[ComponentType.MARKERS] == number)
+
+
+async def test_on_zenoh_a_subscriber_gets_the_very_messages_that_it_has_missed() -> None:
+    server = ParameterServer()
+    async with gateway_with_server(server) as (_, _, gateway, peer):
+        received: list[bytes] = []
+        subscriber = peer.declare_subscriber(
+            "mocap/lab/3d", lambda sample: received.append(sample.payload.to_bytes())
+        )
+        await wait_until_async(lambda: gateway.sources[0].fan_out.has_subscribers([ComponentType.MARKERS]))
+        await publish_frames(server, gateway, 10)
+        await wait_until_async(lambda: received and sequence_of(received[-1]) == 9)
+        subscriber.undeclare()
+        reply = await query(peer, "mocap/lab/3d?from=3;to=5")
+        facts = {"from": 3, "to": 5, "oldest": 0, "newest": 9, "num_messages": 3}
+        assert (reply.attachment, reply.encoding) == (facts, "application/x-lcm-messages;rtc3d.markers_t")
+        assert unpack_messages(reply.payload) == [each for each in received if 3 <= sequence_of(each) <= 5]
+        everything = unpack_messages((await query(peer, "mocap/lab/3d?last_s=1000")).payload)
+        assert [sequence_of(each) for each in everything] == list(range(10))
+        assert everything[-len(received) :] == received
+        [reply] = await query_all(peer, "mocap/*/3d?from=8&to=99")
+        assert [sequence_of(each) for each in unpack_messages(reply.payload)] == [8, 9]
+        overview = (await query(peer, "mocap/lab/history")).json
+        assert overview["keys"]["3d"]["newest"] == 9
+        assert 0 < overview["num_bytes"] <= overview["max_bytes"]
+
+
+@pytest.mark.netns
+async def test_on_lcm_messages_are_sent_again_on_a_channel_of_their_own() -> None:
+    server, url, queries_url = ParameterServer(), lcm_url(), lcm_url()
+    async with (
+        ScriptedServer(server.script) as listening,
+        run_gateway(listening.port, lcm_url=url, queries_url=queries_url) as gateway,
+    ):
+        await publish_frames(server, gateway, 10)
+        replies: list[rtc3d.command_reply_t] = []
+        again: list[bytes] = []
+        peer = open_lcm(queries_url)
+        with (
+            closing(
+                LcmSubscriber(peer, "MOCAP_LAB_COMMAND_REPLY", lambda _, each: replies.append(decode(each)))
+            ),
+            closing(LcmSubscriber(peer, "MOCAP_LAB_3D_REFILL", lambda _, each: again.append(each))),
+        ):
+            for number, options in enumerate((["key=3d", "from=3", "to=5"], ["key=3d"], [])):
+                request = rtc3d.command_request_t()
+                request.request_id, request.requester, request.command = number, "test", "history"
+                request.options, request.num_options = options, len(options)
+                peer.publish("MOCAP_LAB_COMMAND_REQUEST", request.encode())
+                await wait_until_async(lambda: len(replies) == number + 1)  # noqa: B023 - awaited at once
+            await wait_until_async(lambda: len(again) == 3)
+        facts = {"from": 3, "to": 5, "oldest": 0, "newest": 9, "num_messages": 3}
+        assert json.loads(replies[0].content) == {"key": "3d", "channel": "MOCAP_LAB_3D_REFILL", **facts}
+        found = gateway.sources[0].fan_out.find("3d", "lcm", WantedMessages(3, None, 5))
+        assert found is not None
+        assert again == found.messages
+        assert "key= needs one of from=" in replies[1].error
+        assert json.loads(replies[2].content)["keys"]["3d"]["newest"] == 9
+
+
+async def test_a_reload_switches_the_history_off() -> None:
+    server = ParameterServer()
+    async with gateway_with_server(server) as (_, _, gateway, peer):
+        await publish_frames(server, gateway, 2)
+        off = HistorySettings(seconds=0)
+        assert await gateway.reload(gateway.settings.model_copy(update={"history": off})) == [
+            "history changed"
+        ]
+        reply = await query(peer, "mocap/lab/3d?from=0")
+        assert (reply.code, "history.seconds" in reply.error) == ("disabled", True)
 
 
 USE_SCHEMAS = """
@@ -306,11 +389,12 @@ async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer_but_files_
         await wait_until_async(lambda: list(tmp_path.glob("*.c3d")))
         replies = await query_all(peer, "mocap/lab/*?format=json")
         assert {reply.key for reply in replies} == {
-            f"mocap/lab/{key}" for key in ("parameters", "3d", "status")
+            f"mocap/lab/{key}" for key in ("parameters", "3d", "status", "history")
         }
         assert {reply.encoding for reply in replies} == {"application/json"}
         keys = [reply.key for reply in await query_all(peer, "mocap/**")]
-        expected = ["parameters", *(f"parameters/{section}" for section in SECTIONS), "3d", "status"]
+        expected = ["parameters", *(f"parameters/{section}" for section in SECTIONS)]
+        expected += ["3d", "status", "history"]
         expected += [f"schema/{name}" for name in SCHEMA_TYPES]
         assert sorted(keys) == sorted(f"mocap/lab/{key}" for key in expected)
         assert server.count("SendCurrentFrame") == 0

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import functools
 import logging
+import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final, NamedTuple
@@ -19,9 +20,10 @@ from gateway.errors import OutputError, QueryError
 from gateway.logs.failures import log_fields
 from gateway.logs.losses import Losses
 from gateway.logs.safe_text import quoted
-from gateway.messages.decode import JSON
+from gateway.messages.decode import JSON, LCM_MESSAGES, json_bytes
+from gateway.messages.history import unpack_messages
 from gateway.messages.texts import xml_text
-from gateway.messages.topics import lcm_channel
+from gateway.messages.topics import MAX_CHANNEL_LENGTH, escape_key_chunk, lcm_channel
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
 from gateway.outputs.lcm.receiver import MAX_PENDING, LcmReceiver
 from gateway.outputs.lcm.sender import LcmSender, LcmThreadSender, new_sender
@@ -35,6 +37,14 @@ LONG_REPLY_BYTES: Final = 32 * 1024
 MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
 
+HISTORY: Final = "history"
+"""The command that asks for messages again. Its option ``key`` is that of the messages on Zenoh."""
+
+_REFILL: Final = "_REFILL"
+
+_REFILL_BURST_S: Final = 0.002
+"""How far messages that are sent again may be ahead of their pace."""
+
 MAX_REMEMBERED: Final = 64
 """How many commands are remembered with their results, for requests that are repeated."""
 
@@ -42,10 +52,14 @@ logger = logging.getLogger(__name__)
 
 
 class ReplyContent(NamedTuple):
-    """What a reply contains, of ``num_bytes``. ``fill`` writes it to the reply, maybe in another thread."""
+    """What a reply contains, of ``num_bytes``. ``fill`` writes it to the reply, maybe in another thread.
+
+    ``messages`` follow the reply on a channel of their own.
+    """
 
     num_bytes: int
     fill: Callable[[Any], None]
+    messages: tuple[str, list[bytes]] = ("", [])
 
 
 class RequestKind(NamedTuple):
@@ -105,6 +119,8 @@ class LcmRequests:
         self._tasks: set[asyncio.Task[None]] = set()
         self._remembered: OrderedDict[tuple[Any, ...], asyncio.Task[ReplyContent]] = OrderedDict()
         self._defects = QueryDefects(logger)
+        self._refill_bytes_per_s = settings.max_reply_bytes_per_s
+        self._is_refilling = False
 
     def add(self, source: str) -> None:
         """Answer requests about one more source, while ``service`` serves it."""
@@ -198,6 +214,13 @@ class LcmRequests:
             self._send_error(kind, source, request, content)
             return
         send = functools.partial(self._send_reply, kind, source, request, content.fill)
+        channel, messages = content.messages
+        if messages:
+            self._is_refilling = True
+            refill = functools.partial(self._refill, source, send, channel, messages)
+            if not self.long_sender.offer(refill, content.num_bytes):
+                self._is_refilling = False
+            return
         if content.num_bytes <= LONG_REPLY_BYTES:
             send()
         elif not self.long_sender.offer(send, content.num_bytes):
@@ -246,8 +269,10 @@ class LcmRequests:
             self._remembered.popitem(last=False)
 
     async def _carry_out(self, source: str, command: str, options: dict[str, str]) -> ReplyContent:
-        if command not in self._service.commands():
-            accepted = ", ".join(self._service.commands())
+        if command == HISTORY and "key" in options:
+            return await self._find_messages(source, options)
+        if command not in (HISTORY, *self._service.commands()):
+            accepted = ", ".join((HISTORY, *self._service.commands()))
             raise QueryError(f"unknown command {quoted(command)}; accepted on LCM: {accepted}")
         if READ_OPTION in options:
             raise QueryError(
@@ -263,6 +288,43 @@ class LcmRequests:
             reply.content = content.decode()
 
         return ReplyContent(len(content), fill)
+
+    async def _find_messages(self, source: str, options: dict[str, str]) -> ReplyContent:
+        """Return messages of the history. Those that the peer asks for go to everybody, so one at a time."""
+        key = options.pop("key")
+        if self._is_refilling:
+            text = "messages are being sent again for another subscriber; try again"
+            raise QueryError(text, code="busy")
+        component, separator, tool = key.partition("/")
+        names = (component, tool) if separator else (component,)
+        path = (component, escape_key_chunk(tool)) if separator else names
+        answer = await self._service.answer(source, path, options)
+        if not answer.encoding.startswith(LCM_MESSAGES):
+            raise QueryError(f"{HISTORY} with key= needs one of from=, last_s=, since_utime=")
+        channel = refill_channel(lcm_channel(self._prefix, source, *names))
+        facts = json_bytes({"key": key, "channel": channel, **answer.attachment}).decode()
+
+        def fill(reply: Any) -> None:
+            reply.content = facts
+
+        return ReplyContent(answer.num_bytes, fill, (channel, unpack_messages(answer.payload)))
+
+    # In the thread that sends what is long.
+
+    def _refill(self, source: str, reply: Callable[[], None], channel: str, messages: list[bytes]) -> None:
+        """Send a reply, and then messages again, no faster than replies may be."""
+        try:
+            reply()
+            pace_s = time.monotonic()
+            for message in messages:
+                self._sender.send(channel, message)
+                pace_s += len(message) / self._refill_bytes_per_s
+                if (wait_s := pace_s - time.monotonic()) > _REFILL_BURST_S:
+                    time.sleep(wait_s)
+        except OutputError as error:
+            self._losses[source].lost(error.cause, str(error), frames=0)
+        finally:
+            self._is_refilling = False
 
     # In the event loop, or in the thread that sends what is long.
 
@@ -280,6 +342,11 @@ class LcmRequests:
             self._sender.send(lcm_channel(self._prefix, source, f"{kind.name}_REPLY"), reply.encode())
         except OutputError as error:
             self._losses[source].lost(error.cause, str(error), frames=0)
+
+
+def refill_channel(channel: str) -> str:
+    """Return the channel on which messages of ``channel`` are sent again, on the URL of requests."""
+    return channel[: MAX_CHANNEL_LENGTH - len(_REFILL)] + _REFILL
 
 
 def _decoded(kind: RequestKind, data: bytes) -> Any | None:

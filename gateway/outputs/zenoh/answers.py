@@ -18,7 +18,7 @@ import logging
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final, NamedTuple
 
 import zenoh
@@ -27,7 +27,7 @@ from gateway.errors import QueryError
 from gateway.logs.failures import log_fields
 from gateway.logs.losses import Losses
 from gateway.logs.safe_text import safe_text
-from gateway.messages.decode import TEXT, json_bytes
+from gateway.messages.decode import LCM_MESSAGES, TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, KeyPath, QueryService
 from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, QueryLimits, Refusal
@@ -49,7 +49,10 @@ MAX_PART_WILDCARDS: Final = 2
 """How many ``$*`` a selector may have: Zenoh's time to match grows with its power."""
 
 LONG_ANSWER_BYTES: Final = 512 * 1024
-"""A second thread sends longer answers (C3D files, takes), so that other answers need not wait."""
+"""A second thread sends longer answers (C3D files, takes), so that other answers need not wait.
+
+It also sends messages of the history.
+"""
 
 _REST: Final = 3.0
 """How long the threads rest after they have made a payload, as a multiple of the time that this took.
@@ -251,7 +254,7 @@ class ZenohAnswers:
     ) -> None:
         answers = () if isinstance(outcome, QueryError) else outcome.values()
         num_bytes = sum(answer.num_bytes for answer in answers)
-        sender = self._long_sender if num_bytes > LONG_ANSWER_BYTES else self._sender
+        sender = self._long_sender if _is_long(answers) else self._sender
         for query in queries:
             reply = functools.partial(self._reply, query, source, outcome)
             if not sender.offer(reply, num_bytes // len(queries)):
@@ -297,7 +300,7 @@ class ZenohAnswers:
     def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
         """Reply with each of the answers. Raises QueryError if there is none, or too many bytes."""
         num_bytes = sum(answer.num_bytes for answer in answers.values())
-        self.admission.check_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
+        self.admission.check_reply(num_bytes, is_long=_is_long(answers.values()))
         num_replies, error = 0, None
         for key, answer in answers.items():
             try:
@@ -324,6 +327,16 @@ class ZenohAnswers:
             return answer.payload
         finally:
             self._rest_until_s = time.monotonic() + _REST * (time.thread_time() - begun_s)
+
+
+def _is_of_history(answer: Answer) -> bool:
+    return answer.encoding.startswith(LCM_MESSAGES)
+
+
+def _is_long(answers: Collection[Answer]) -> bool:
+    """Return whether other answers need not wait for these: they are long, or parts of something long."""
+    num_bytes = sum(answer.num_bytes for answer in answers)
+    return num_bytes > LONG_ANSWER_BYTES or any(map(_is_of_history, answers))
 
 
 def _reply_error(query: zenoh.Query, error: QueryError) -> None:

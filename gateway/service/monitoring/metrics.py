@@ -61,6 +61,7 @@ _HELP: Final = {
     "source_subscribed": (
         "1 if somebody may subscribe to the source's data, else 0; always 1 with LCM, which cannot know."
     ),
+    "history_bytes": "Memory for the newest messages, which subscribers can ask for.",
     "messages": "Messages passed to the output; 6d/tool, status and clock count as separate components.",
     "message_bytes": "Bytes of these messages, without the overhead of Zenoh, LCM and the network.",
     "output_drops": "Messages that the output did not accept, and queries that it did not answer, by cause.",
@@ -184,6 +185,8 @@ class GatewayMetrics(Collector):
             ((source.name,), source.fan_out.has_subscribers(source.queries.components)) for source in sources
         ]
         yield _gauge("source_subscribed", ("source",), subscribed)
+        kept = [((source.name,), source.fan_out.history.num_bytes) for source in sources]
+        yield _gauge("history_bytes", ("source",), kept)
         labels = ("source", "output")
         routes = [
             ((source.name, output.name), source, output, status)

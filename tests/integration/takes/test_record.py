@@ -125,7 +125,15 @@ class Lab(NamedTuple):
 
 
 @contextmanager
-def lab(folder: Path, side: str = "zenoh", *scene: str, **source: Any) -> Iterator[Lab]:
+def lab(
+    folder: Path,
+    side: str = "zenoh",
+    *scene: str,
+    router: str | None = None,
+    history_s: float = 60.0,
+    **source: Any,
+) -> Iterator[Lab]:
+    """Run a gateway, which also connects to a ``router`` on Zenoh if there is one."""
     endpoint, url = free_endpoint(), lcm_url()
     published: defaultdict[str, list[bytes]] = defaultdict(list)
 
@@ -137,12 +145,13 @@ def lab(folder: Path, side: str = "zenoh", *scene: str, **source: Any) -> Iterat
 
     with ExitStack() as stack:
         port, _ = stack.enter_context(simulator(*SCENE, *scene))
-        keys = zenoh_keys("peer", listen=endpoint)
+        keys = zenoh_keys("peer", listen=endpoint, connect=router)
         configuration = {
             "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port, **source}],
             "zenoh": {"enabled": side == "zenoh", "tool_poses": True, "config": keys},
             "lcm": {"enabled": side == "lcm", "tool_poses": True, "url": url},
             "metrics": {"enabled": False},
+            "history": {"seconds": history_s},
         }
         (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
         gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
@@ -186,7 +195,7 @@ def test_a_recording_has_what_was_published_with_parameters_first(tmp_path: Path
     assert f"{path}: " in ended.stdout
     assert ended.stdout.endswith("complete: no gaps\n")
     for row in (*COMPONENTS, r"6d/\*", "status", "clock"):
-        assert re.search(rf"^Lab-1 +{row} +\d+ .* Hz +- +- +-$", ended.stdout, re.MULTILINE), row
+        assert re.search(rf"^Lab-1 +{row} +\d+ .* Hz +- +- +- +-$", ended.stdout, re.MULTILINE), row
     found = events(path)
     assert [channel for channel, _ in found[:2]] == ["MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_PARAMETERS"]
     take = decode(found[0][1])
@@ -240,7 +249,7 @@ def test_a_full_disk_costs_nothing_if_it_has_room_again_and_is_counted_otherwise
     assert ended.status == 1
     assert take_statistics(path).sources["Lab-1"].is_cut_off
     assert re.search(r"^\d+ messages were not written: .*: File too large$", ended.stdout, re.MULTILINE)
-    assert re.search(r"^Lab-1 +3d .* Hz +- +- +[1-9]\d*$", ended.stdout, re.MULTILINE)
+    assert re.search(r"^Lab-1 +3d .* Hz +- +- +- +[1-9]\d*$", ended.stdout, re.MULTILINE)
 
 
 def test_the_first_messages_are_recorded_with_the_seconds_given(tmp_path: Path) -> None:

@@ -62,7 +62,8 @@ def test_gateway_yaml_has_every_key_with_its_default() -> None:
     keys = comments.partition("\n\n")[0].replace("    # ", "    ")
     stream = StreamSettings.model_validate(yaml.safe_load(keys)[0])
     sections: list[Section] = [settings, source, stream, source.reconnect]
-    for section in [*sections, settings.spool, settings.zenoh, settings.lcm, settings.metrics]:
+    sections += [settings.spool, settings.history, settings.zenoh, settings.lcm, settings.metrics]
+    for section in sections:
         fields = type(section).model_fields
         assert section.model_fields_set == set(fields), f"{type(section).__name__} lacks keys"
         for key, field in fields.items():

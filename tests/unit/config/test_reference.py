@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from gateway.config.loading import schema_text
 from gateway.config.section import Section
 from gateway.config.settings import (
+    HistorySettings,
     MetricsSettings,
     ReconnectSettings,
     Settings,
@@ -51,6 +52,7 @@ SECTIONS: dict[str, type[Section]] = {
     "lsl": LslSettings,
     "foxglove": FoxgloveSettings,
     "spool": SpoolSettings,
+    "history": HistorySettings,
     "metrics": MetricsSettings,
 }
 

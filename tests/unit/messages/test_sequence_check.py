@@ -46,6 +46,7 @@ def counts(check: SequenceCheck) -> tuple[int, int, int, int, int, int]:
         ((0, 1, 2**62, 3), (1, 1, 0, 0, 0, 1)),  # the message beside the damaged one is missing
         ((2000, 500, 2001), (0, 0, 0, 0, 0, 1)),
         ((2000, 500, 501), (0, 0, 0, 0, 1, 0)),
+        ((2000, 500, 500), (0, 0, 0, 1, 1, 0)),
         ((*range(7, 200), *range(300, 400)), (100, 1, 0, 0, 0, 0)),
         ((*range(200), 300, *range(200, 300)), (0, 0, 100, 0, 0, 0)),
     ],
@@ -151,3 +152,9 @@ def test_any_numbers_are_taken() -> None:
     choice = random.Random(0)
     numbers = [0, -5, 2**63 - 1, -(2**63)]
     check_of(*(choice.choice([*numbers, choice.getrandbits(60)]) for _ in range(1000)), utimes=[0] * 1000)
+
+
+def test_two_runs_of_one_message_each_are_told_apart() -> None:
+    """Events are rare: a gateway may restart after its first one."""
+    check = check_of(0, 0, 2, utimes=(1, 2, 3))
+    assert (check.num_restarts, check.num_lost) == (1, 1)

@@ -134,7 +134,7 @@ def test_an_output_failure_is_logged_once_and_its_end_with_the_total(
     fan_out = FanOut("lab", [output])
     for output.error in (None, NO_ROUTER, None):
         publish_full(fan_out)
-    fan_out.check_losses()
+    fan_out.maintain()
     fan_out.close()
     assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
         (logging.WARNING, f"lab to toy: {NO_ROUTER}"),

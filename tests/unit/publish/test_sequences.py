@@ -5,6 +5,7 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.decode import decode
 from gateway.messages.encode import encode_message
+from gateway.messages.history import WantedMessages, sequence_of
 from gateway.publish.fan_out import FanOut
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
@@ -89,6 +90,25 @@ def test_what_pacing_leaves_out_is_no_gap_and_what_is_skipped_beyond_that_is_one
     publish(fan_out, *range(20, 24))
     expected = [(0, 0), (1, 2), (2, 4), (3, 6), (4, 8), (10, 20), (11, 22)]
     assert numbered(paced, "3d") == numbered(paced, "6d") == expected
+
+
+def test_the_history_has_the_numbers_of_the_output_that_asks() -> None:
+    """Also those of messages that were skipped, so that a subscriber can fill the gap that they leave."""
+    paced, unpaced = ToyOutput("paced"), ToyOutput("unpaced")
+    paced.max_rate_hz = {MARKERS: 50.0}
+    fan_out = FanOut("lab", [paced, unpaced])
+    fan_out.history.set_limits(60, 1 << 20)
+    publish(fan_out, *range(6))
+    skip(fan_out, 6, 7)
+    publish(fan_out, *range(8, 10))
+    for output, number in ((paced, 5), (unpaced, 10)):
+        found = fan_out.find("3d", output.name, WantedMessages(0))
+        assert found is not None
+        assert [sequence_of(message) for message in found.messages] == list(range(number))
+        assert set(found.messages) >= {message for topic, message in output.messages if topic.path == ("3d",)}
+    fan_out.publish_status(b"s" * 48)
+    fan_out.publish_clock(b"c" * 48)
+    assert fan_out.history.overview["keys"].keys() == {"3d", "6d", "3d on paced", "status", "clock"}
 
 
 def test_a_skipped_message_is_lost_if_one_output_would_have_got_it() -> None:

@@ -6,6 +6,7 @@ from itertools import chain
 import pytest
 
 from gateway.messages.encode import Stamp
+from gateway.messages.history import WantedMessages
 from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.frames import Frame, split_frame
@@ -52,6 +53,19 @@ def test_tools_have_topics_only_where_switched_on() -> None:
     [(topic, _)] = [each for each in with_tools.messages if len(each[0].path) == 2]
     assert topic == Topic("lab", ("6d", "Probe"), "rtc3d.tool_pose_t")
     assert without.tool_names() == []
+
+
+def test_the_history_has_the_poses_of_tools_that_were_published() -> None:
+    output, fan_out = lab("Probe", "Head", wanted=("Probe",))
+    fan_out.history.set_limits(60, 1 << 20)
+    publish_tools(fan_out, 2)
+    publish_tools(fan_out, 2)
+    assert fan_out.find("6d/Head", "toy", WantedMessages(0)) is None
+    found = fan_out.find("6d/Probe", "toy", WantedMessages(0))
+    assert found is not None
+    published = [message for topic, message in output.messages if topic.path == ("6d", "Probe")]
+    assert list(found.messages) == published
+    assert len(published) == 2
 
 
 def test_a_pose_is_published_while_it_has_a_subscriber() -> None:

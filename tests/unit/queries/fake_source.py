@@ -9,6 +9,7 @@ import rtc3d
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
+from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages
 from gateway.outputs.contract import Answer
 from gateway.queries.answers import QueryHistory, ServerAnswer
 from gateway.queries.questions import Question
@@ -86,6 +87,8 @@ class FakeSource:
         self.status = StreamStatus("3d 6d", sessions=sessions)
         self.second_status = StreamStatus("analog", sessions=sessions)
         self.newest_messages: dict[ComponentType, bytes] = {}
+        self.history = MessageHistory()
+        """What the source has published."""
         self.announced: list[tuple[bytes | None, int]] = []
         """The XML of all announced parameters, None if they are void, with their version."""
         self.num_file_reads = 0
@@ -101,18 +104,24 @@ class FakeSource:
         self.connection = FakeConnection(self.server)
         self.second_connection: FakeConnection | None = None
         self._has_two_streams = two_streams
-        self.history = QueryHistory("lab")
+        self.query_history = QueryHistory("lab")
         self.queries = SourceQueries(
             source_settings,
             lambda: self.streams,
-            lambda component, _output: self.newest_messages.get(component),
+            self,
             rtc3d.status_t().encode,
             self._last_c3d,
             RecordingAccess(self._record, self._follow_recording),
             self._announce,
-            self.history,
+            self.query_history,
         )
         self.status.connected("the server")
+
+    def newest(self, component: ComponentType, _output: str) -> bytes | None:
+        return self.newest_messages.get(component)
+
+    def find(self, key: str, _output: str, wanted: WantedMessages) -> FoundMessages | None:
+        return self.history.find(key, wanted)
 
     @property
     def streams(self) -> list[StreamAccess]:

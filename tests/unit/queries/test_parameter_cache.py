@@ -98,7 +98,7 @@ async def test_a_reload_continues_the_version(source: FakeSource) -> None:
     await source.connect(CM)
     after = FakeSource()
     after.queries.parameters = ParameterCache(
-        after.queries.settings, after.queries._requests, after._announce, source.history
+        after.queries.settings, after.queries._requests, after._announce, source.query_history
     )
     await after.store_parameters(CM)
     await after.connect(MM)

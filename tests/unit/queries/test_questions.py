@@ -1,6 +1,8 @@
 import pytest
 
 from gateway.errors import QueryError
+from gateway.messages.history import WantedMessages
+from gateway.messages.host_time import now_utime
 from gateway.queries.questions import Question, accepted_keys, known_keys, parse_question, parse_questions
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 
@@ -30,6 +32,15 @@ MARKERS_ONLY = frozenset({ComponentType.MARKERS})
             Question("recording", set="start", options=",duration=5"),
         ),
         ("recording", {}, Question("recording")),
+        ("history", {}, Question("history")),
+        ("3d", {"from": "7"}, Question("messages", "3d", wanted=WantedMessages(7))),
+        ("clock", {"from": "0", "to": "9"}, Question("messages", "clock", wanted=WantedMessages(0, None, 9))),
+        ("3d", {"from": "0&to=9"}, Question("messages", "3d", wanted=WantedMessages(0, None, 9))),
+        (
+            *("status", {"since_utime": "12", "to": "3"}),
+            Question("messages", "status", wanted=WantedMessages(None, 12, 3)),
+        ),
+        ("6d/Tool%201", {"from": "1"}, Question("messages", "6d/Tool 1", wanted=WantedMessages(1))),
     ],
 )
 def test_a_key_and_its_options_are_parsed(key: str, options: dict[str, str], question: Question) -> None:
@@ -62,6 +73,40 @@ def test_the_name_of_a_recording_is_checked(options: dict[str, str], text: str) 
     with pytest.raises(QueryError, match=text) as refused:
         parse_question(("recording",), options, ALL)
     assert len(str(refused.value)) < 400
+
+
+def test_the_last_seconds_count_from_now() -> None:
+    before = now_utime()
+    wanted = parse_question(("3d",), {"last_s": "2.5"}, ALL).wanted
+    assert wanted is not None
+    assert wanted.since_utime is not None
+    assert before - 2_500_000 <= wanted.since_utime <= now_utime() - 2_500_000
+    assert parse_question(("3d",), {"last_s": "1e12"}, ALL).wanted == WantedMessages(None, 0)
+
+
+@pytest.mark.parametrize(
+    ("key", "options"),
+    [
+        ("3d", {"to": "5"}),
+        ("3d", {"from": "5", "last_s": "1"}),
+        ("3d", {"from": "-1"}),
+        ("3d", {"from": "1.5"}),
+        ("3d", {"from": "²"}),
+        ("3d", {"from": "9" * 19}),
+        ("3d", {"from": "1", "to": ""}),
+        ("3d", {"last_s": "nan"}),
+        ("3d", {"last_s": "inf"}),
+        ("3d", {"last_s": "-1"}),
+        ("3d", {"from": "1", "format": "json"}),
+        ("6d/Tool", {}),
+        ("parameters", {"from": "1"}),
+        ("history", {"from": "1"}),
+    ],
+)
+def test_a_query_for_messages_with_other_options_is_refused(key: str, options: dict[str, str]) -> None:
+    with pytest.raises(QueryError) as refused:
+        parse_question(tuple(key.split("/")), options, ALL)
+    assert refused.value.code == "bad-request"
 
 
 def test_every_known_key_is_parsed_and_listed_as_accepted() -> None:

@@ -67,7 +67,7 @@ def let_outputs_fail(monkeypatch: pytest.MonkeyPatch, method: str) -> list[str]:
 DEFECTS = [
     *((StreamStatus, name) for name in ("disconnected", "connecting", "check")),
     *((Source, name) for name in ("publish_status", "_status_message", "_read_parameters", "_on_state")),
-    *((FanOut, name) for name in ("publish", "publish_clock", "check_losses")),
+    *((FanOut, name) for name in ("publish", "publish_clock", "maintain")),
     *((Session, name) for name in ("_on_event", "_report_change", "close")),
     *((AutomaticStreams, "check"), (Supervisor, "check_rate"), (ParameterRefresh, "_due_s")),
     *((Ingest, "receive"), (ClientProtocol, "receive")),

@@ -223,7 +223,10 @@ ON_ZENOH = "ask on Zenoh (a take: rtc3d-gateway take fetch, without --lcm)"
 @pytest.mark.parametrize(
     ("command", "text"),
     [
-        *(((name,), "accepted on LCM: recording, take") for name in ("c3d", "", "take/", "x" * 3000)),
+        *(
+            ((name,), "accepted on LCM: history, recording, take")
+            for name in ("c3d", "", "take/", "x" * 3000)
+        ),
         *((("take", option), "accepted: NAME=VALUE") for option in ("start", "", "ä")),
         (("take", "read=walk-1", "offset=0"), ON_ZENOH),
     ],

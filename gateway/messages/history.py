@@ -1,0 +1,231 @@
+"""The newest messages of one source, kept so that subscribers can ask for those they have missed.
+
+It holds the very objects that the outputs got, so it costs a reference per message, and no copy.
+"""
+
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+from gateway.errors import ProtocolError
+from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
+
+MAX_ANSWER_BYTES: Final = 200_000
+"""How long the messages of one answer may be together, unless a single one is longer."""
+
+MESSAGE_OVERHEAD_BYTES: Final = 48
+"""What a message needs in memory besides its bytes: the head of the object, and a reference."""
+
+_BLOCKS: Final = 32
+"""A block has at most this part of the memory, so that whole blocks can be dropped."""
+
+_BLOCK_S: Final = 1.0
+
+_LENGTH_BYTES: Final = 4
+
+_CAPTURE_OFFSET: Final = FINGERPRINT_BYTES + 8
+_SEQUENCE_OFFSET: Final = FINGERPRINT_BYTES + 16
+_SESSION_OFFSET: Final = FINGERPRINT_BYTES + 24
+
+
+class WantedMessages(NamedTuple):
+    """Which messages of a key are wanted: from number ``first``, or since ``since_utime``, up to ``last``.
+
+    One of the first two is None. ``since_utime`` is in µs since the Unix epoch; ``last`` is included, and
+    None means the newest message.
+    """
+
+    first: int | None
+    since_utime: int | None = None
+    last: int | None = None
+
+
+class FoundMessages(NamedTuple):
+    """The messages with the numbers ``first`` to ``last`` that still exist, in order.
+
+    ``oldest`` and ``newest`` are the numbers of the oldest and the newest message of the key that exist.
+    """
+
+    messages: Sequence[bytes]
+    first: int
+    last: int
+    oldest: int
+    newest: int
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a peer is told about them."""
+        return {
+            "from": self.first,
+            "to": self.last,
+            "oldest": self.oldest,
+            "newest": self.newest,
+            "num_messages": len(self.messages),
+        }
+
+
+class MessageHistory:
+    """The messages of one source by key, for ``seconds`` and in at most ``max_bytes``; 0 keeps nothing.
+
+    The numbers of a key grow, and some may be missing. ``begin_block`` must be called once a second.
+    """
+
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._monotonic = monotonic
+        self._seconds = 0.0
+        self._max_bytes = 0
+        self._blocks: deque[_Block] = deque([_Block(monotonic())])
+        self._newest = self._blocks[-1]
+
+    def set_limits(self, seconds: float, max_bytes: int) -> None:
+        """Keep messages within these limits from now on."""
+        self._seconds, self._max_bytes = seconds, max_bytes if seconds else 0
+        self.begin_block()
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether anything is kept."""
+        return self._max_bytes > 0
+
+    @property
+    def num_bytes(self) -> int:
+        """How much memory the messages need."""
+        return sum(block.num_bytes for block in self._blocks)
+
+    @property
+    def overview(self) -> dict[str, Any]:
+        """The limits, and what there is of each key."""
+        keys = sorted({key for block in self._blocks for key in block.messages})
+        found = {key: [messages for _, messages in self._runs(key)] for key in keys}
+        return {
+            "seconds": self._seconds,
+            "max_bytes": self._max_bytes,
+            "num_bytes": self.num_bytes,
+            "keys": {
+                key: {
+                    "oldest": sequence_of(runs[0][0]),
+                    "newest": sequence_of(runs[-1][-1]),
+                    "oldest_utime": utime_of(runs[0][0]),
+                    "newest_utime": utime_of(runs[-1][-1]),
+                }
+                for key, runs in found.items()
+            },
+        }
+
+    def add(self, key: str, message: bytes) -> None:
+        """Keep a message."""
+        if self._max_bytes:
+            block = self._newest
+            messages = block.messages.get(key)
+            if messages is None:
+                messages = block.messages[key] = []
+            messages.append(message)
+            block.num_bytes += len(message) + MESSAGE_OVERHEAD_BYTES
+            if block.num_bytes * _BLOCKS > self._max_bytes:
+                self.begin_block()
+
+    def begin_block(self) -> None:
+        """Drop the blocks that are too old or too much, and begin a new one if it is time."""
+        now_s = self._monotonic()
+        num_bytes = self.num_bytes
+        blocks = self._blocks
+        while blocks and (num_bytes > self._max_bytes or blocks[0].end_s < now_s - self._seconds):
+            num_bytes -= blocks.popleft().num_bytes
+        newest = blocks[-1] if blocks else None
+        if newest is None or newest.num_bytes * _BLOCKS > self._max_bytes or now_s >= newest.end_s:
+            blocks.append(_Block(now_s))
+        self._newest = blocks[-1]
+
+    def forget(self, key: str) -> None:
+        """Forget the messages of a key, because its numbers begin again."""
+        for block in self._blocks:
+            messages = block.messages.pop(key, ())
+            block.num_bytes -= sum(len(message) + MESSAGE_OVERHEAD_BYTES for message in messages)
+
+    def find(self, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return the first of the wanted messages, MAX_ANSWER_BYTES at most; None if the key has none.
+
+        Numbers up to ``last`` of what is returned that are not among its messages exist no more.
+        """
+        runs = [messages for _, messages in self._runs(key)]
+        if not runs:
+            return None
+        oldest, newest = sequence_of(runs[0][0]), sequence_of(runs[-1][-1])
+        first = wanted.first
+        if first is None:
+            since_utime = 0 if wanted.since_utime is None else wanted.since_utime
+            first = _first_since(runs, since_utime, newest + 1)
+        last = newest if wanted.last is None else min(wanted.last, newest)
+        messages: list[bytes] = []
+        num_bytes = 0
+        for message in _messages_from(runs, first):
+            if sequence_of(message) > last:
+                break
+            num_bytes += len(message)
+            if messages and num_bytes > MAX_ANSWER_BYTES:
+                last = sequence_of(messages[-1])
+                break
+            messages.append(message)
+        return FoundMessages(messages, first, last, oldest, newest)
+
+    def _runs(self, key: str) -> Iterator[tuple["_Block", list[bytes]]]:
+        for block in self._blocks:
+            messages = block.messages.get(key)
+            if messages:
+                yield block, messages
+
+
+class _Block:
+    """The messages of about a second."""
+
+    def __init__(self, begin_s: float) -> None:
+        self.end_s = begin_s + _BLOCK_S
+        self.messages: dict[str, list[bytes]] = {}
+        self.num_bytes = 0
+
+
+def sequence_of(message: bytes) -> int:
+    """Return the sequence number of an encoded message."""
+    return int.from_bytes(message[_SEQUENCE_OFFSET:_SESSION_OFFSET], "big", signed=True)
+
+
+def utime_of(message: bytes) -> int:
+    """Return when an encoded message was published, in µs since the Unix epoch."""
+    return int.from_bytes(message[FINGERPRINT_BYTES:_CAPTURE_OFFSET], "big", signed=True)
+
+
+def _first_since(runs: Sequence[list[bytes]], since_utime: int, otherwise: int) -> int:
+    """Return the number of the first message that was published at ``since_utime`` or later."""
+    for messages in runs:
+        if utime_of(messages[-1]) >= since_utime:
+            return next(sequence_of(each) for each in messages if utime_of(each) >= since_utime)
+    return otherwise
+
+
+def _messages_from(runs: Sequence[list[bytes]], first: int) -> Iterator[bytes]:
+    for messages in runs:
+        if sequence_of(messages[-1]) >= first:
+            for index in range(bisect_left(messages, first, key=sequence_of), len(messages)):
+                yield messages[index]
+
+
+def pack_messages(messages: Sequence[bytes]) -> bytes:
+    """Return messages as the payload of an answer: before each, its length as 4 bytes, big-endian."""
+    return b"".join(
+        part for message in messages for part in (len(message).to_bytes(_LENGTH_BYTES, "big"), message)
+    )
+
+
+def unpack_messages(payload: bytes) -> list[bytes]:
+    """Return the messages in the payload of an answer. Raises ProtocolError if it is cut off."""
+    messages = []
+    offset = 0
+    while offset < len(payload):
+        begin = offset + _LENGTH_BYTES
+        offset = begin + int.from_bytes(payload[offset:begin], "big")
+        if offset > len(payload) or begin + PREFIX.size + FINGERPRINT_BYTES > offset:
+            raise ProtocolError("an answer with messages from the history is cut off or malformed")
+        messages.append(payload[begin:offset])
+    return messages

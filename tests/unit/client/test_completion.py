@@ -1,0 +1,350 @@
+"""Filling gaps from the gateway's history, against a model of the gateway and of the network between."""
+
+import math
+from typing import Final
+
+import pytest
+from hypothesis import given, note, settings
+from hypothesis import strategies as st
+
+from gateway.client.completion import (
+    GRACE_S,
+    NOBODY_S,
+    PATIENCE_S,
+    Completion,
+    HeldBytes,
+    HistoryAnswer,
+    HistoryRequest,
+)
+from gateway.messages.encode import PREFIX
+from gateway.messages.sequence_check import SequenceCheck
+
+SIZE: Final = len(bytes(8) + PREFIX.pack(0, 0, 0, 0, 0))
+ENTRY: Final = SIZE + 128
+"""What a held message takes."""
+
+
+class Network:
+    """A gateway with the newest ``window`` messages, and the Completion of a subscriber.
+
+    ``handed_on`` has the run of the gateway and the number of each message.
+    """
+
+    def __init__(self, window: int = 10**9, limit: int = 10**9, last_s: float | None = None) -> None:
+        self.room = HeldBytes(limit)
+        self.check = SequenceCheck(counts_first=True, max_listed=100)
+        self.completion = Completion(self._hand_on, self.check.end, self.room, last_s)
+        self.handed_on: list[tuple[int, int]] = []
+        self.history: list[bytes] = []
+        self.published: list[tuple[int, int]] = []
+        self.run = 0
+        self.now_s = 100.0
+        self._window = window
+        self.newest = 0
+        """The largest number of this run that has arrived."""
+        self._number = 0
+        self._utime = 0
+        self._runs: dict[int, int] = {}  # by utime
+
+    def _hand_on(self, message: bytes) -> None:
+        utime, _, number, session, _ = PREFIX.unpack_from(message, 8)
+        self.check.add(number, utime, session)
+        self.handed_on.append((self._runs[utime], number))
+
+    def publish(self) -> bytes:
+        self._utime += 1
+        self._runs[self._utime] = self.run
+        message = bytes(8) + PREFIX.pack(self._utime, 0, self._number, 1, 0)
+        self.published.append((self.run, self._number))
+        self._number += 1
+        self.history = [*self.history, message][-self._window :]
+        return message
+
+    def arrive(self, *messages: bytes) -> None:
+        for message in messages:
+            utime, _, number, session, _ = PREFIX.unpack_from(message, 8)
+            self.newest = max(self.newest, number)
+            self.completion.receive(message, number, utime, session, self.now_s)
+
+    def arrives(self, number: int) -> None:
+        """Publish up to a number, of which only the last one arrives."""
+        while self._number < number:
+            self.publish()
+        self.arrive(self.publish())
+
+    def restart(self) -> None:
+        self.run += 1
+        self._number = self.newest = 0
+        self.history = []
+
+    def find(self, request: HistoryRequest, max_messages: int = 10**9) -> HistoryAnswer | None:
+        """Answer as a gateway does; None if it has nothing."""
+        if not self.history:
+            return None
+        options = request.options
+        numbers = [PREFIX.unpack_from(message, 8)[2] for message in self.history]
+        first = int(options["from"]) if "from" in options else max(numbers[0], numbers[-1] - 5)
+        last = min(int(options.get("to", numbers[-1])), numbers[-1])
+        found = [
+            (number, message)
+            for number, message in zip(numbers, self.history, strict=True)
+            if first <= number <= last
+        ]
+        if len(found) > max_messages:
+            last = found[max_messages - 1][0]
+        messages = [message for _, message in found[:max_messages]]
+        return HistoryAnswer(messages, first, last, numbers[-1])
+
+    def ask(self, max_messages: int = 10**9) -> None:
+        """Request what is due, and answer."""
+        self.now_s = max(self.now_s, self.completion.due_s)
+        request = self.completion.request()
+        answer = self.find(request, max_messages)
+        if answer is None:
+            self.completion.fail(request, "nothing-yet", "", self.now_s)
+        else:
+            self.completion.answer(request, answer, self.now_s)
+
+    def ask_all(self) -> None:
+        for _ in range(10_000):
+            if self.completion.due_s == math.inf:
+                return
+            self.ask(3)
+        pytest.fail("it never ends")
+
+    @property
+    def numbers(self) -> list[int]:
+        return [number for _, number in self.handed_on]
+
+
+EVENTS: Final = st.sampled_from(
+    ["arrives"] * 6 + ["lost"] * 3 + ["many lost", "late", "twice", "late ones arrive", "ask", "ask", "busy"]
+    + ["partly lost", "begin to ask", "answer", "restart", "pass by"]
+)  # fmt: skip
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(EVENTS, max_size=60),
+    st.sampled_from([10**9, 10**9, 4, 15]),
+    st.sampled_from([10**9, 5 * ENTRY]),
+    st.sampled_from([None, 1.0]),
+)
+def test_everything_that_still_exists_comes_once_and_in_order(  # noqa: C901, PLR0912, PLR0915 - one model
+    events: list[str], window: int, limit: int, last_s: float | None
+) -> None:
+    """Whatever the network does: the numbers of each run grow, and what is missing is counted."""
+    network = Network(window, limit, last_s)
+    late: list[bytes] = []
+    came_late: set[tuple[int, int]] = set()
+    asked: tuple[HistoryRequest, HistoryAnswer | None] | None = None
+    on_time: set[tuple[int, int]] = set()
+    completion = network.completion
+    if last_s is not None:
+        network.arrives(9)
+        network.arrives(12)
+        network.ask(7)
+    for event in [*events, "late ones arrive", "arrives"]:
+        network.now_s += 0.02
+        is_due = completion.due_s <= network.now_s
+        match event:
+            case "arrives" | "twice":
+                message = network.publish()
+                on_time.add(network.published[-1])
+                network.arrive(*[message] * (1 + (event == "twice")))
+            case "lost":
+                network.publish()
+            case "many lost":
+                for _ in range(20):
+                    network.publish()
+            case "late":
+                late.append(network.publish())
+                came_late.add(network.published[-1])
+            case "late ones arrive":
+                network.arrive(*reversed(late))
+                late = []
+            case "restart" | "pass by":
+                network.arrive(*late)
+                late = []
+                # A restart shows if the numbers go back, or if something is missing.
+                num_lost = len(network.published) + 3 if event == "pass by" else min(3, network.newest)
+                network.restart()
+                for _ in range(num_lost):
+                    network.publish()
+                if event == "restart":
+                    network.arrive(network.publish())
+            case "ask" if is_due:
+                network.ask(7)
+            case "busy" if is_due:
+                completion.fail(completion.request(), "busy", "", network.now_s)
+            case "partly lost" if is_due:
+                request = completion.request()
+                answer = network.find(request, 7)
+                if answer is not None:
+                    part = answer._replace(messages=answer.messages[1::2], is_whole=len(answer.messages) == 0)
+                    completion.answer(request, part, network.now_s)
+            case "begin to ask" if is_due:
+                request = completion.request()
+                asked = request, network.find(request, 7)
+            case "answer" if asked is not None and asked[1] is not None:
+                completion.answer(*asked, network.now_s)  # type: ignore[arg-type]
+                asked = None
+        assert network.room.used <= limit + ENTRY
+    network.ask_all()
+    assert network.room.used == 0
+    handed_on = network.handed_on
+    note(f"published {network.published}, handed on {handed_on}")
+    assert handed_on == sorted(set(handed_on))
+    assert not completion.problem
+    if limit > 10 * ENTRY:
+        first = handed_on[0]
+        assert {each for each in on_time - came_late if each >= first} <= set(handed_on)
+    if window > 100:
+        run, number = handed_on[0]
+        expected = [
+            each
+            for each in network.published
+            if each[0] == network.run and (each[0] > run or each[1] >= number)
+        ]
+        assert [each for each in handed_on if each[0] == network.run] == expected
+    last = [number for run, number in handed_on if run == network.run]
+    assert last[-1] == network.published[-1][1]
+
+
+def test_a_late_message_is_not_requested() -> None:
+    """LCM may deliver in another order; a request for each such message would cost more than the messages."""
+    network = Network()
+    first, late, newer = (network.publish() for _ in range(3))
+    network.arrive(first, newer)
+    assert network.completion.due_s == network.now_s + GRACE_S
+    assert network.numbers == [0]
+    network.arrive(late)
+    assert network.completion.due_s == math.inf
+    assert network.numbers == [0, 1, 2]
+    assert network.completion.num_refilled == 0
+
+
+def test_what_exists_no_more_is_named() -> None:
+    """The numbers tell a colleague which frames of the take to look for elsewhere."""
+    network = Network(window=5)
+    network.arrives(0)
+    network.arrives(20)
+    network.ask_all()
+    assert network.numbers == [0, *range(16, 21)]
+    assert network.completion.num_refilled == 4
+    [gap] = network.check.gaps
+    assert (gap.stop - gap.missing, gap.stop) == (1, 16)
+
+
+@pytest.mark.parametrize(
+    ("code", "patience_s"), [("timeout", PATIENCE_S), ("busy", PATIENCE_S), ("no-gateway", NOBODY_S)]
+)
+def test_requests_that_bring_nothing_are_repeated_for_a_bounded_time(code: str, patience_s: float) -> None:
+    """Zenoh needs a while to connect again; a program must not wait forever for an earlier version."""
+    network = Network()
+    network.arrives(0)
+    network.arrives(9)
+    start_s = network.completion.due_s
+    while network.completion.due_s < math.inf:
+        network.now_s = network.completion.due_s
+        network.completion.fail(network.completion.request(), code, "", network.now_s)
+    assert network.now_s == pytest.approx(start_s + patience_s, abs=0.2)
+    assert network.numbers == [0, 9]
+    assert network.check.num_lost == 8
+    # The next gap: nobody was there the last time, so one request is enough until there is an answer.
+    network.arrives(19)
+    network.now_s = network.completion.due_s
+    network.completion.fail(network.completion.request(), code, "", network.now_s)
+    assert (network.completion.due_s == math.inf) == (code == "no-gateway")
+
+
+def test_patience_begins_again_after_a_time_without_connection() -> None:
+    """While nothing arrives, no request can be answered: that says nothing about the history."""
+    network = Network()
+    network.arrives(0)
+    network.arrives(9)
+    for _ in range(2):
+        network.now_s += 0.7 * PATIENCE_S
+        network.completion.fail(network.completion.request(), "timeout", "", network.now_s)
+        network.arrive(network.publish())
+    network.ask_all()
+    assert network.numbers == [*range(12)]
+
+
+def test_a_gateway_that_keeps_nothing_delays_nothing_until_it_restarts() -> None:
+    network = Network()
+    network.arrives(0)
+    network.arrives(9)
+    network.completion.fail(network.completion.request(), "disabled", "not kept", network.now_s)
+    network.arrives(12)
+    assert network.numbers == [0, 9, 12]
+    assert network.completion.problem == "not kept"
+    assert network.completion.due_s == math.inf
+    network.restart()
+    network.arrives(2)
+    network.ask_all()
+    assert network.handed_on[3:] == [(1, 0), (1, 1), (1, 2)]
+    assert not network.completion.problem
+
+
+def test_of_two_gateways_everything_is_passed_on() -> None:
+    """Their numbers do not say what is missing: requests would never end."""
+    network, other = Network(), Network()
+    other._number, other._utime = 5000, 10**6
+    other.completion = network.completion
+    network._runs = other._runs
+    for _ in range(20):
+        network._utime = other._utime
+        network.arrive(network.publish())
+        other._utime = network._utime
+        other.arrive(other.publish())
+    assert network.completion.problem
+    assert network.completion.due_s == math.inf
+    assert sorted(network.numbers) == [*range(20), *range(5000, 5020)]
+    assert network.room.used == 0
+
+
+def test_at_the_end_everything_until_then_is_requested_and_nothing_later() -> None:
+    """What was lost last, no later message shows."""
+    network = Network()
+    network.arrives(0)
+    lost = [network.publish() for _ in range(5)]
+    network.completion.end(network.now_s)
+    network.arrive(lost[4])
+    network.ask(2)
+    later = network.publish()
+    network.ask_all()
+    network.arrive(later)
+    assert network.numbers == [*range(6)]
+
+
+@pytest.mark.parametrize("code", ["no-gateway", "timeout", "nothing-yet"])
+def test_the_end_does_not_wait_for_a_gateway_that_has_ended(code: str) -> None:
+    network = Network()
+    network.arrives(0)
+    network.completion.end(network.now_s)
+    network.completion.fail(network.completion.request(), code, "", network.now_s)
+    assert network.completion.due_s == math.inf
+
+
+def test_what_is_missing_at_the_end_is_counted() -> None:
+    """Also what was let go, of which nothing later is there to show it."""
+    network = Network(limit=3 * ENTRY)
+    network.arrives(0)
+    network.arrives(4)
+    network.arrive(*(network.publish() for _ in range(5)))
+    network.completion.abandon()
+    assert network.numbers == [0, 4, 5, 6]
+    assert [(gap.stop - gap.missing, gap.stop) for gap in network.check.gaps] == [(1, 4), (7, 10)]
+    assert network.check.num_lost == 6
+
+
+def test_the_last_seconds_come_before_the_first_message() -> None:
+    network = Network(last_s=1.0)
+    for _ in range(20):
+        network.publish()
+    network.arrives(20)
+    assert network.completion.due_s == network.now_s
+    assert network.completion.request().options == {"last_s": "1.000"}
+    network.ask_all()
+    assert network.numbers == [*range(15, 21)]
