@@ -39,7 +39,7 @@ _CLOSE_S: Final = 0.5
 _COLLECT_S: Final = 0.05
 """How often ``collect`` takes what has arrived."""
 
-_MIN_STEP_S: Final = 0.004
+_MIN_STEP_S: Final = 0.005
 """How long after one decoding the next one begins: it saves a third of the CPU at 2200 messages a second."""
 
 _BATCH: Final = 256
