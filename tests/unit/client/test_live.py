@@ -213,6 +213,13 @@ def test_a_frame_waits_for_its_parameters() -> None:
     assert found.markers.labels == ("head", "hand")
 
 
+def test_a_version_that_a_gateway_uses_again_means_the_parameters_of_its_time() -> None:
+    data = Fed()
+    data.feed([parameters(xml("old"), 1), parameters(xml("new"), 1, utime=START_UTIME + 1_000_000)])
+    data.feed([ones(MARKERS, 0, 1), ones(MARKERS, 200, 1)])
+    assert [each.markers.labels for each in data.frames(2)] == [("old",), ("new",)]
+
+
 @pytest.mark.parametrize("ahead", [MARKERS, ANALOG])
 def test_components_are_joined_by_the_time_stamps_whichever_comes_first(ahead: ComponentType) -> None:
     """5 analog samples belong to each frame of markers: those after the frame before, up to its own time."""
