@@ -1,6 +1,13 @@
 """A client of running gateways, on Zenoh or LCM, for commands and for other programs.
 
-::
+Live data::
+
+    from gateway.client import live
+
+    for frame in live("lab", components=["3d"]):
+        print(frame.markers["head"], frame.capture_time)
+
+Everything else that gateways answer::
 
     from gateway.client import GatewayAddress, GatewayClient, Messages
 
@@ -16,7 +23,8 @@
 - ``transport`` is what ``zenoh_transport`` and ``lcm_transport`` have in common: they find sources, with what
   gateways report about them, ask until there is a reply, and subscribe.
 - A subscriber sorts what arrives by source and key, for a ``reception``, which keeps it in bounds, and counts
-  it, and what is missing.
+  it, and what is missing. ``queued_reception`` keeps messages until they are decoded, for displays and for
+  ``live``, whose beginning is ``live_stream``: ``live_frames`` decodes, ``live_join`` joins components.
 - With ``complete``, each series has a ``completion``, which puts its messages in order and decides what to
   request; the threads of ``refill`` request it, on LCM with ``lcm_refill``.
 """
@@ -25,15 +33,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.client.live_frames import Frame
+    from gateway.client.live_stream import Live, live
     from gateway.client.reception import Messages
 
-__all__ = ["GatewayAddress", "GatewayClient", "Messages"]
+__all__ = ["Frame", "GatewayAddress", "GatewayClient", "Live", "Messages", "live"]
 
 
 def __getattr__(name: str) -> Any:
     """Import the client when it is used: what reads takes does not need Zenoh and LCM."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from gateway.client import client, reception  # noqa: PLC0415 - see above
+    from gateway.client import client, live_frames, live_stream, reception  # noqa: PLC0415 - see above
 
-    return getattr(client, name, None) or getattr(reception, name)
+    modules = (client, live_frames, live_stream, reception)
+    return next(getattr(module, name) for module in modules if hasattr(module, name))

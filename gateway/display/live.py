@@ -10,17 +10,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.client.reception import Reception, Series, Source
+from gateway.client.queued_reception import DescribedSource, QueuedReception, QueuedSeries
 from gateway.descriptions.labels import Description, EventText, describe, event_text
-from gateway.errors import ParametersError, ProtocolError
+from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import SourceReport, source_report
-from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array, decode_rows
 
 logger = logging.getLogger(__name__)
@@ -120,11 +118,6 @@ class Latency:
         return Percentiles.of(self._samples[: self._num_added, 1])
 
 
-MAX_WAITING: Final = 20_000
-"""How many messages of one component may wait for ``update``; older ones are skipped."""
-
-_MAX_WAITING_BYTES: Final = 32 * 1024 * 1024
-
 _RATE_WINDOW_S: Final = 2.0
 
 _STOPPED_S: Final = 0.5
@@ -136,10 +129,7 @@ SLOW_SHARE: Final = 0.95
 
 
 class LiveComponent:
-    """The newest messages of one component.
-
-    ``receive`` is called in the threads of Zenoh or LCM, everything else in the thread that reads.
-    """
+    """The newest messages of one component."""
 
     def __init__(self, component: ComponentType) -> None:
         self.type = component
@@ -163,26 +153,7 @@ class LiveComponent:
         self._updated_s = self._now_s
         self._arrived_s: float | None = None
         self._arrived_utime = 0  # of the newest message, before it waited for ``update``
-        self._waiting: deque[tuple[bytes, int]] = deque()  # messages, and when they arrived
-        self._waiting_bytes = 0
         self._described: tuple[Parameters | None, int] = (None, 0)
-
-    # In the threads that receive, one at a time.
-
-    def receive(self, message: bytes) -> None:
-        """Take a message."""
-        self._waiting.append((message, now_utime()))
-        self._waiting_bytes += len(message)
-        while len(self._waiting) > MAX_WAITING or self._waiting_bytes > _MAX_WAITING_BYTES:
-            self._waiting_bytes -= len(self._waiting.popleft()[0])
-            self.num_skipped += 1
-
-    def take_waiting(self) -> list[tuple[bytes, int]]:
-        """Return the messages that wait, each with its time of arrival, and remove them."""
-        waiting, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
-        return [*waiting]
-
-    # In the thread that reads.
 
     def hold(self) -> None:
         """Count no time since the last ``update``."""
@@ -287,6 +258,8 @@ def _is_visible(items: Array) -> Array:
 NUM_EVENTS: Final = 20
 """How many of the newest events of a source are kept."""
 
+_NO_PARAMETERS: Final = Parameters()
+
 _NO_STATUS_S: Final = 3.0
 """A gateway that runs sends a status every second."""
 
@@ -298,7 +271,7 @@ class LiveEvent(NamedTuple):
     text: EventText
 
 
-class LiveSource(Source):
+class LiveSource(DescribedSource):
     """What a source publishes now."""
 
     def __init__(self, name: str, channels: str) -> None:
@@ -307,18 +280,22 @@ class LiveSource(Source):
         """The components that have come so far, by key. The threads that receive add to it."""
         self.events: deque[LiveEvent] = deque(maxlen=NUM_EVENTS)
         """The newest events, the newest one last."""
-        self.newest_parameters = Parameters()
-        """The server's parameters; without any section until they come."""
-        self.parameters_version = 0
         self.report: SourceReport | None = None
         """What the newest status says; None before the first."""
         self.first_report: SourceReport | None = None
         """What the first status since the gateway's start says that came here."""
-        self.num_unreadable = 0
-        """How many parameters and statuses could not be read."""
-        self._read_parameters: bytes | None = None
         self._read_status: bytes | None = None
         self._status_s = 0.0
+
+    @property
+    def newest_parameters(self) -> Parameters:
+        """The server's parameters; without any section until they come."""
+        return _NO_PARAMETERS if self.newest_entry is None else self.newest_entry.parameters
+
+    @property
+    def parameters_version(self) -> int:
+        """The version of ``newest_parameters``; 0 until they come."""
+        return 0 if self.newest_entry is None else self.newest_entry.version
 
     @property
     def num_skipped(self) -> int:
@@ -349,9 +326,7 @@ class LiveSource(Source):
 
     def update(self, arrived: dict[str, list[tuple[bytes, int]]]) -> None:
         """Decode what has arrived since the last call, by the key of the component."""
-        if self.parameters is not self._read_parameters:
-            self._read_parameters = self.parameters
-            self._decode_parameters(self.parameters or b"")
+        self.update_parameters()
         if self.status is not self._read_status:
             self._read_status = self.status
             self._decode_status(self.status or b"")
@@ -367,16 +342,6 @@ class LiveSource(Source):
                 for item in row[-NUM_EVENTS:]:
                     self.events.append(LiveEvent(int(utime), event_text(self.newest_parameters, item)))
 
-    def _decode_parameters(self, message: bytes) -> None:
-        try:
-            decoded = decode(message)
-            xml = xml_bytes(decoded.xml)
-            self.newest_parameters = parse_parameters(xml).parameters if xml else Parameters()
-            self.parameters_version = decoded.parameters_version
-        except (ParametersError, ProtocolError) as error:
-            self.num_unreadable += 1
-            logger.debug("%s: parameters: %s", self.name, error)
-
     def _decode_status(self, message: bytes) -> None:
         try:
             former, self.report = self.report, source_report(decode(message))
@@ -388,7 +353,7 @@ class LiveSource(Source):
             logger.debug("%s: status: %s", self.name, error)
 
 
-class LiveData(Reception[LiveSource, Series]):
+class LiveData(QueuedReception[LiveSource]):
     """The newest data of all sources.
 
     Messages are received in the threads of Zenoh or LCM. ``update`` decodes them; it and everything that it
@@ -397,14 +362,16 @@ class LiveData(Reception[LiveSource, Series]):
 
     def update(self) -> list[LiveSource]:
         """Decode what has arrived; return the sources, sorted by name. Call it at least 10 times a second."""
-        with self._lock:
-            sources = [*self.sources.values()]
-            arrived = [
-                {key: component.take_waiting() for key, component in source.components.items()}
-                for source in sources
-            ]
-        for source, messages in zip(sources, arrived, strict=True):
-            source.update(messages)
+        arrived: dict[QueuedSeries, list[tuple[bytes, int]]] = {}
+        for series, message, arrived_utime, _ in self.take_waiting():
+            arrived.setdefault(series, []).append((message, arrived_utime))
+        sources = self.sources_now
+        for source in sources:
+            all_series = source.series
+            for series in all_series:
+                if series.key in source.components:
+                    source.components[series.key].num_skipped = series.num_dropped
+            source.update({series.key: arrived[series] for series in all_series if series in arrived})
         return sorted(sources, key=lambda source: source.name)
 
     def publish(self, source: str, key: str, message: bytes) -> None:
@@ -429,17 +396,12 @@ class LiveData(Reception[LiveSource, Series]):
         with self._lock:
             self.sources.clear()
             self._num_series = 0
+        self.clear_waiting()
 
     def _new_source(self, name: str, channels: str) -> LiveSource:
         return LiveSource(name, channels)
 
-    def _new_series(self, source: LiveSource, key: str, channel: str) -> Series:
+    def _new_series(self, source: LiveSource, key: str, channel: str) -> QueuedSeries:
         if key in COMPONENTS_BY_KEY:
             source.components[key] = LiveComponent(COMPONENTS_BY_KEY[key])
-        return Series(source, key, channel)
-
-    def _take(self, series: Series, message: bytes) -> None:
-        source: Any = series.source
-        component = source.components.get(series.key)
-        if component is not None:
-            component.receive(message)
+        return super()._new_series(source, key, channel)

@@ -22,6 +22,7 @@ from gateway.takes.files.component_rows import (
     Rows,
     find_restarts,
 )
+from gateway.takes.files.row import ItemValues
 
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
 
@@ -67,7 +68,7 @@ class ParametersHistory:
         return self.newest
 
 
-class Series:
+class Series(ItemValues):
     """A component of one source: arrays with one row per frame; of events, with one row per event.
 
     ``key`` is "3d", "6d", "analog", "force" or "event". The arrays have the shape (frames,):
@@ -153,11 +154,6 @@ class Series:
         return tuple(common(units) or "" for units in found.values())
 
     @property
-    def unit(self) -> str:
-        """The unit of all columns; "" if they differ, or if it changes within the take."""
-        return common(self.units) or ""
-
-    @property
     def moment_unit(self) -> str:
         """The unit of the plates' moments; "" if it is not known, or changes."""
         return common(layout.moment_unit for layout in self._layouts.values()) or ""
@@ -214,39 +210,6 @@ class Series:
             places = np.array([columns[label] for label in layout.labels], np.intp)
             items[rows[chosen][:, None], places] = self._recorded[num_items][chosen]
         return items
-
-    @property
-    def values(self) -> Array:
-        """``items`` as plain numbers, float32: shape (frames, items, fields), of analog (frames, items).
-
-        It is a view. Events have integers of different sizes; use ``items``.
-        """
-        if self.component is ComponentType.EVENT:
-            raise TakeError("events have integers of different sizes; use items instead of values")
-        items = self.items
-        if not items.dtype.names:
-            return items
-        num_fields = len(items.dtype.names)
-        return items.view(np.float32).reshape(*items.shape, num_fields)
-
-    @property
-    def positions(self) -> Array:
-        """The positions of markers or tools, float32, shape (frames, items, 3), in ``unit``; NaN is missing.
-
-        It is a view of ``items``.
-        """
-        return self.values[..., self._field("x") : self._field("z") + 1]
-
-    @property
-    def quaternions(self) -> Array:
-        """The orientations of tools, float32, shape (frames, tools, 4), scalar first; NaN is missing."""
-        return self.values[..., self._field("q0") : self._field("qz") + 1]
-
-    @property
-    def is_visible(self) -> Array:
-        """Whether each marker or tool is visible in each frame, bool, shape (frames, items)."""
-        values = self.values if self.component is ComponentType.TOOLS else self.positions
-        return ~np.asarray(np.isnan(values).any(axis=2))
 
     @property
     def event_labels(self) -> tuple[str, ...]:
@@ -313,12 +276,6 @@ class Series:
             if number:
                 result[(self._entries == entry) & (self._num_items == num_items)] = number
         return result
-
-    def _field(self, name: str) -> int:
-        names = NATIVE_ITEM_DTYPES[self.component].names or ()
-        if name not in names:
-            raise TakeError(f"{self.key} has no {name}; its fields are {', '.join(names) or 'plain numbers'}")
-        return names.index(name)
 
 
 class SeriesBuilder:

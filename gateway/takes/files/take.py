@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -63,10 +63,11 @@ class Take:
 
     ``start_utime`` is the time of the first event, in µs since 1970; all seconds count from it.
     ``num_damaged`` places of the files, with ``damaged_bytes`` in all, could not be read. ``unknown`` is how
-    many messages have a type that is none of a gateway's, by channel.
+    many messages have a type that is none of a gateway's, by channel. ``path`` is None if it was collected
+    live.
     """
 
-    path: Path
+    path: Path | None
     start_utime: int
     sources: dict[str, TakeSource]
     num_damaged: int = 0
@@ -107,7 +108,7 @@ def open_take(
     reader = TakeReader(Path(path))
     first_utime = -math.inf if from_s is None else reader.start_utime + from_s * 1e6
     end_utime = math.inf if to_s is None else reader.start_utime + to_s * 1e6
-    loader = _Loader(sources, COMPONENTS_BY_KEY.keys() if components is None else components)
+    loader = TakeLoader(sources, COMPONENTS_BY_KEY.keys() if components is None else components)
     for batches in reader.batches():
         for batch in batches:
             loader.add(batch, first_utime, end_utime)
@@ -125,7 +126,7 @@ def open_take(
     return take
 
 
-class _Loader:
+class TakeLoader:
     """Collects the messages of a take."""
 
     def __init__(self, sources: Collection[str] | None, components: Collection[str]) -> None:
@@ -134,7 +135,7 @@ class _Loader:
         self._histories: dict[str, ParametersHistory] = {}  # by source
         self._builders: dict[tuple[str, str], SeriesBuilder] = {}
 
-    def add(self, batch: MessageBatch, first_utime: float, end_utime: float) -> None:
+    def add(self, batch: MessageBatch, first_utime: float = -math.inf, end_utime: float = math.inf) -> None:
         """Take messages in a range of time; parameters are taken from the whole take."""
         if self._wanted is not None and batch.source not in self._wanted:
             return
@@ -156,6 +157,14 @@ class _Loader:
             for message in batch.messages:
                 if batch.key in ("details", "parameters") or not source.server:
                     self._describe(source, batch.key, message)
+
+    def describe(self, name: str, status: bytes | None, entries: Sequence[ParametersEntry]) -> None:
+        """Take what is known about a source of which something was added: its status, its parameters."""
+        source = self._sources.get(name)
+        if source is not None:
+            source.parameters = [*entries]
+            if status is not None:
+                self._describe(source, "status", status)
 
     def finish(self, start_utime: int) -> dict[str, TakeSource]:
         """Return the sources with their arrays."""

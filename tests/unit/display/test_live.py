@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.display import live as live_data
+from gateway.client import queued_reception
 from gateway.display.live import NUM_EVENTS, LiveComponent, LiveData
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
@@ -96,7 +96,7 @@ def test_data_that_come_no_more_have_stopped(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_messages_that_nobody_decodes_are_skipped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_data, "MAX_WAITING", 5)
+    monkeypatch.setattr(queued_reception, "MAX_WAITING", 5)
     lab = Lab()
     for _ in range(8):
         lab.send(MARKERS, [ONE])
