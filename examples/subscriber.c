@@ -18,6 +18,8 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
+#include <unistd.h>
 #include <wchar.h>
 
 #include "rtc3d_analog_t.h"
@@ -145,16 +147,15 @@ static bool decode(const lcm_type_info_t *info, const void *bytes, size_t size, 
     return walk_struct(info, &data, end) && data == end && info->decode(bytes, 0, (int)size, message) >= 0;
 }
 
-static long frames_left;
+static long frames_left = LONG_MAX;
+static int64_t newest = -1; /* the number of the newest frame; -1 before the first */
 
-static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, void *user)
+static void show(const rtc3d_markers_t *markers)
 {
-    (void)user;
-    rtc3d_markers_t message;
-    if (!decode(rtc3d_markers_t_get_type_info(), buffer->data, buffer->data_size, &message)) {
-        fprintf(stderr, "ignored a malformed message on %s\n", channel);
+    const rtc3d_markers_t message = *markers;
+    newest = message.sequence;
+    if (frames_left-- <= 0)
         return;
-    }
     const rtc3d_marker_t *first = NULL;
     int visible = 0;
     for (int i = message.num_markers - 1; i >= 0; i--) {
@@ -170,8 +171,55 @@ static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, void *
         printf(", the first at %.3f, %.3f, %.3f mm", first->x, first->y, first->z);
     printf("\n");
     fflush(stdout);
+}
+
+static lcm_t *queries; /* requests to the gateway, and what it sends again */
+static const char *source_name;
+
+static void on_refill(const lcm_recv_buf_t *buffer, const char *channel, void *user)
+{
+    (void)channel, (void)user;
+    rtc3d_markers_t message;
+    if (!decode(rtc3d_markers_t_get_type_info(), buffer->data, buffer->data_size, &message))
+        return;
+    if (message.sequence == newest + 1)
+        show(&message);
     rtc3d_markers_t_decode_cleanup(&message);
-    frames_left--;
+}
+
+/* Ask the gateway for the frames after the newest one, up to `last`, as long as any come. */
+static void refill(int64_t last)
+{
+    static int64_t request_id;
+    char requester[64], channel[64], from[32], to[32];
+    snprintf(requester, sizeof requester, "subscriber.c %ld at %ld", (long)getpid(), (long)time(NULL));
+    snprintf(channel, sizeof channel, "MOCAP_%s_COMMAND_REQUEST", source_name);
+    for (int tries_left = 5; newest < last && tries_left > 0; tries_left--) {
+        const int64_t before = newest;
+        snprintf(from, sizeof from, "from=%" PRId64, newest + 1);
+        snprintf(to, sizeof to, "to=%" PRId64, last);
+        char *options[] = {"key=3d", from, to};
+        const rtc3d_command_request_t request = {++request_id, requester, "history", 3, options};
+        rtc3d_command_request_t_publish(queries, channel, &request);
+        while (newest < last && lcm_handle_timeout(queries, 200) > 0)
+            ;
+        if (newest > before)
+            tries_left = 6;
+    }
+}
+
+static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, void *user)
+{
+    (void)user;
+    rtc3d_markers_t message;
+    if (!decode(rtc3d_markers_t_get_type_info(), buffer->data, buffer->data_size, &message)) {
+        fprintf(stderr, "ignored a malformed message on %s\n", channel);
+        return;
+    }
+    if (newest >= 0)
+        refill(message.sequence - 1);
+    show(&message);
+    rtc3d_markers_t_decode_cleanup(&message);
 }
 
 static void on_events(const lcm_recv_buf_t *buffer, const char *channel, void *user)
@@ -193,8 +241,17 @@ static void on_events(const lcm_recv_buf_t *buffer, const char *channel, void *u
 
 static int subscribe(const char *source, long count)
 {
-    lcm_t *lcm = lcm_create(NULL);
-    if (!lcm) {
+    const char *url = getenv("LCM_DEFAULT_URL"), *colon, *rest = "";
+    if (!url || !*url)
+        url = "udpm://239.255.76.67:7667";
+    /* Requests go to the next port. */
+    char queries_url[256];
+    colon = strrchr(url, ':');
+    const long port = colon ? strtol(colon + 1, (char **)&rest, 10) : 0;
+    snprintf(queries_url, sizeof queries_url, "%.*s:%ld%s", colon ? (int)(colon - url) : 0, url, port + 1, rest);
+    lcm_t *lcm = lcm_create(url);
+    queries = lcm ? lcm_create(queries_url) : NULL;
+    if (!queries) {
         fprintf(stderr, "Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route\n");
         return 1;
     }
@@ -202,13 +259,18 @@ static int subscribe(const char *source, long count)
     snprintf(channel, sizeof channel, "MOCAP_%s_3D", source);
     /* The default of 30 messages loses frames whenever this program pauses. */
     lcm_subscription_set_queue_capacity(lcm_subscribe(lcm, channel, on_markers, NULL), 1000);
+    source_name = source;
+    snprintf(channel, sizeof channel, "MOCAP_%s_3D_REFILL", source);
+    lcm_subscription_set_queue_capacity(lcm_subscribe(queries, channel, on_refill, NULL), 5000);
     snprintf(channel, sizeof channel, "MOCAP_%s_EVENT", source);
     lcm_subscription_set_queue_capacity(lcm_subscribe(lcm, channel, on_events, NULL), 1000);
     printf("listening\n");
     fflush(stdout);
-    frames_left = count;
-    while ((count == 0 || frames_left > 0) && lcm_handle(lcm) == 0)
+    if (count > 0)
+        frames_left = count;
+    while (frames_left > 0 && lcm_handle(lcm) == 0)
         ;
+    lcm_destroy(queries);
     lcm_destroy(lcm);
     return 0;
 }

@@ -160,38 +160,129 @@ function cutChannel(data) {
 
 // The subscriber.
 
+/** Passes frames on in order. The gateway sends those again that are lost, as long as it has them. */
+class GapFiller {
+  newest = undefined; // the number of the newest frame that was passed on
+  held = []; // frames that wait for the missing ones before them
+
+  /** `ask` requests the frames from one number to another again, and `show` takes a frame. */
+  constructor(ask, show) {
+    Object.assign(this, { ask, show });
+  }
+
+  add(message) {
+    this.held.push(message);
+    if (this.held.length === 1) this.proceed();
+  }
+
+  addAgain(message) {
+    if (this.held.length === 0 || message.sequence !== this.newest + 1n) return;
+    this.pass(message);
+    if (this.held[0]?.sequence <= this.newest + 1n) this.proceed();
+  }
+
+  pass(message) {
+    this.newest = message.sequence;
+    this.show(message);
+  }
+
+  proceed() {
+    clearTimeout(this.timer);
+    while (this.held.length > 0 && this.held[0].sequence <= (this.newest ?? this.held[0].sequence) + 1n) {
+      this.pass(this.held.shift());
+    }
+    if (this.held.length > 0) this.request(5);
+  }
+
+  /** Ask as long as any frames come; after five times in vain, they exist no more. */
+  request(triesLeft) {
+    if (triesLeft === 0) {
+      this.pass(this.held.shift());
+      this.proceed();
+      return;
+    }
+    const before = this.newest;
+    this.ask(this.newest + 1n, this.held[0].sequence - 1n);
+    this.timer = setTimeout(() => this.request(this.newest > before ? 5 : triesLeft - 1), 200);
+  }
+}
+
+let numRequests = 0;
+
+/** Return LCM's packet with a command_request_t for frames of the history. */
+function historyRequest(source, first, last) {
+  const integer = (value, bytes) => Buffer.from(value.toString(16).padStart(2 * bytes, '0'), 'hex');
+  const text = (value) => Buffer.concat([integer(Buffer.byteLength(value) + 1, 4), Buffer.from(`${value}\0`)]);
+  numRequests += 1;
+  return Buffer.concat([
+    Buffer.from('LC02'),
+    integer(numRequests, 4),
+    Buffer.from(`MOCAP_${source}_COMMAND_REQUEST\0`),
+    integer(0x4514334e0ab92347n, 8), // the fingerprint of command_request_t
+    integer(numRequests, 8),
+    text(`subscriber.js ${process.pid} ${performance.timeOrigin}`), // the requester
+    text('history'),
+    integer(3, 4), // options
+    ...['key=3d', `from=${first}`, `to=${last}`].map(text),
+  ]);
+}
+
 function subscribe(source, count) {
   const url = process.env.LCM_DEFAULT_URL || 'udpm://239.255.76.67:7667';
   const [, group, port] = /^udpm:\/\/([\d.]+):(\d+)/.exec(url) ?? [];
   if (!group || port > 65535) return cannotReceive(`${url} is not a URL such as udpm://239.255.76.67:7667?ttl=1`);
 
-  const assembler = new Assembler();
-  const socket = dgram.createSocket({ type: 'udp4', reuseAddr: true, recvBufferSize: 2_000_000 });
+  const ttl = Number(/[?&]ttl=(\d+)/.exec(url)?.[1] ?? 0);
+  const queriesPort = Number(port) + 1; // requests, and what the gateway sends again, go to the next port
+  const sockets = [];
   let received = 0;
-  socket.on('message', (packet, sender) => {
-    const [channel, data] = assembler.add(`${sender.address}:${sender.port}`, packet) ?? [];
-    if (channel !== `MOCAP_${source}_3D` || received === count) return;
-    let message;
-    try {
-      message = decode('markers_t', data);
-    } catch (error) {
-      console.error(`ignored a malformed message on ${channel}: ${error.message}`);
-      return;
-    }
-    printMarkers(message);
-    received += 1;
-    if (received === count) socket.close();
-  });
-  socket.on('error', (error) => cannotReceive(error.message));
-  socket.bind(Number(port), () => {
-    try {
-      socket.addMembership(group);
-    } catch (error) {
-      cannotReceive(error.message);
-      socket.close();
-      return;
-    }
-    console.log('listening');
+  const close = () => {
+    sockets.splice(0).forEach((socket) => socket.close());
+    filler.held.length = 0;
+    clearTimeout(filler.timer);
+  };
+  const filler = new GapFiller(
+    (first, last) => sockets[1]?.send(historyRequest(source, first, last), queriesPort, group),
+    (message) => {
+      if (received === count) return;
+      printMarkers(message);
+      received += 1;
+      if (received === count) close();
+    },
+  );
+
+  const listen = (listenPort, wanted, onMarkers, onListening) => {
+    const assembler = new Assembler();
+    const socket = dgram.createSocket({ type: 'udp4', reuseAddr: true, recvBufferSize: 2_000_000 });
+    sockets.push(socket);
+    socket.on('message', (packet, sender) => {
+      const [channel, data] = assembler.add(`${sender.address}:${sender.port}`, packet) ?? [];
+      if (channel !== wanted || received === count) return;
+      let message;
+      try {
+        message = decode('markers_t', data);
+      } catch (error) {
+        console.error(`ignored a malformed message on ${channel}: ${error.message}`);
+        return;
+      }
+      onMarkers(message);
+    });
+    socket.on('error', (error) => cannotReceive(error.message));
+    socket.bind(listenPort, () => {
+      try {
+        socket.addMembership(group);
+        socket.setMulticastTTL(ttl);
+      } catch (error) {
+        cannotReceive(error.message);
+        close();
+        return;
+      }
+      onListening();
+    });
+  };
+  listen(Number(port), `MOCAP_${source}_3D`, (message) => filler.add(message), () => {
+    const again = (message) => filler.addAgain(message);
+    listen(queriesPort, `MOCAP_${source}_3D_REFILL`, again, () => console.log('listening'));
   });
 }
 

@@ -8,12 +8,16 @@ decodes messages from standard input instead (lcm_types/vectors/README.md).
 """
 
 import argparse
+import contextlib
 import io
 import json
 import math
+import os
+import re
 import signal
 import struct
 import sys
+import uuid
 
 import lcm
 import rtc3d
@@ -46,28 +50,68 @@ def print_markers(message) -> None:
     )
 
 
-def subscribe(source: str, count: float) -> None:
-    frames_left = count
+class Subscriber:
+    """Prints ``count`` frames in order. Those that are lost, the gateway sends again while it has them."""
 
-    def on_markers(_channel: str, data: bytes) -> None:
-        nonlocal frames_left
+    def __init__(self, source: str, count: float) -> None:
+        url = os.environ.get("LCM_DEFAULT_URL") or "udpm://239.255.76.67:7667"
+        self.connection = lcm.LCM(url)
+        # Requests, and what the gateway sends again, go to the next port.
+        self.queries = lcm.LCM(re.sub(r":(\d+)", lambda port: f":{int(port[1]) + 1}", url, count=1))
+        self.channel = f"MOCAP_{source}"
+        self.request = rtc3d.command_request_t()
+        self.request.requester, self.request.command = f"subscriber {uuid.uuid4()}", "history"
+        self.frames_left = count
+        self.newest = -1  # the number of the newest frame; -1 before the first
+        # The default of 30 loses frames whenever this program pauses.
+        self.connection.subscribe(f"{self.channel}_3D", self.on_markers).set_queue_capacity(1000)
+        self.queries.subscribe(f"{self.channel}_3D_REFILL", self.on_refill).set_queue_capacity(5000)
+
+    def on_markers(self, _channel: str, data: bytes) -> None:
         try:
-            print_markers(decode(rtc3d.markers_t, data))
+            message = decode(rtc3d.markers_t, data)
         except ValueError as error:
             print(f"ignored a malformed message: {error}", file=sys.stderr)
             return
-        frames_left -= 1
+        if self.newest >= 0:
+            self.refill(message.sequence - 1)
+        self.show(message)
 
+    def refill(self, last: int) -> None:
+        """Ask for the frames after the newest one, up to ``last``, as long as any come."""
+        tries_left = 5
+        while self.newest < last and tries_left:
+            before = self.newest
+            self.request.request_id += 1
+            self.request.options = ["key=3d", f"from={self.newest + 1}", f"to={last}"]
+            self.request.num_options = len(self.request.options)
+            self.queries.publish(f"{self.channel}_COMMAND_REQUEST", self.request.encode())
+            while self.newest < last and self.queries.handle_timeout(200):
+                pass
+            tries_left = tries_left - 1 if self.newest == before else 5
+
+    def on_refill(self, _channel: str, data: bytes) -> None:
+        with contextlib.suppress(ValueError):
+            message = decode(rtc3d.markers_t, data)
+            if message.sequence == self.newest + 1:
+                self.show(message)
+
+    def show(self, message) -> None:
+        self.newest = message.sequence
+        if self.frames_left > 0:
+            print_markers(message)
+        self.frames_left -= 1
+
+
+def subscribe(source: str, count: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # LCM's handle() would turn Ctrl-C into an OSError
     try:
-        connection = lcm.LCM()
+        subscriber = Subscriber(source, count)
     except RuntimeError:
         sys.exit("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route")
-    subscription = connection.subscribe(f"MOCAP_{source}_3D", on_markers)
-    subscription.set_queue_capacity(1000)  # the default of 30 loses frames whenever this program pauses
     print("listening", flush=True)
-    while frames_left > 0:
-        connection.handle()
+    while subscriber.frames_left > 0:
+        subscriber.connection.handle()
 
 
 def as_json(value):

@@ -11,11 +11,14 @@ With --vectors, the program decodes messages from standard input instead (lcm_ty
 
 import argparse
 import contextlib
+import itertools
 import json
 import math
 import queue
 import struct
 import sys
+import time
+from collections.abc import Iterator
 
 import numpy as np
 import zenoh
@@ -87,6 +90,43 @@ def print_markers(message: dict) -> None:
     )
 
 
+def refill(session: zenoh.Session, key: str, first: int, last: int) -> Iterator[bytes]:
+    """Yield the messages with the numbers ``first`` to ``last`` that the gateway still has."""
+    tries_left = 10
+    while first <= last and tries_left:
+        tries_left -= 1
+        for reply in session.get(f"{key}?from={first};to={last}", timeout=2.0):
+            if (
+                reply.ok and reply.ok.attachment
+            ):  # otherwise it is "rate" or "busy", or there is nothing any more
+                payload, offset = reply.ok.payload.to_bytes(), 0
+                while offset < len(payload):
+                    size = int.from_bytes(payload[offset : offset + 4], "big")
+                    yield payload[offset + 4 : offset + 4 + size]
+                    offset += 4 + size
+                first, tries_left = json.loads(reply.ok.attachment.to_bytes())["to"] + 1, 10
+                break
+        else:
+            time.sleep(0.1)
+
+
+def without_gaps(session: zenoh.Session, samples: "queue.Queue[tuple[str, bytes]]") -> Iterator[dict]:
+    """Yield the messages of markers that arrive, each after those that were lost before it."""
+    newest: dict[str, int] = {}  # by key
+    while True:
+        key, payload = samples.get()
+        try:
+            message = decode("markers_t", payload)
+            sequence = message["sequence"]
+            for missed in refill(session, key, newest.get(key, sequence) + 1, sequence - 1):
+                yield decode("markers_t", missed)
+        except ValueError as error:
+            print(f"ignored a malformed message: {error}", file=sys.stderr)
+            continue
+        newest[key] = sequence
+        yield message
+
+
 def subscribe(endpoint: str | None, source: str, count: int) -> None:
     config = zenoh.Config()
     if endpoint:
@@ -94,24 +134,19 @@ def subscribe(endpoint: str | None, source: str, count: int) -> None:
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     # Zenoh waits while the queue is full, so even a program that is too slow does not fill the memory.
-    samples: queue.Queue[bytes] = queue.Queue(maxsize=10_000)
+    samples: queue.Queue[tuple[str, bytes]] = queue.Queue(maxsize=10_000)
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
         sys.exit(f"Cannot open Zenoh; check that the gateway runs and --connect is its endpoint: {error}")
     with session:
         session.declare_subscriber(
-            f"mocap/{source}/3d", lambda sample: samples.put(sample.payload.to_bytes())
+            f"mocap/{source}/3d",
+            lambda sample: samples.put((str(sample.key_expr), sample.payload.to_bytes())),
         )
         print("listening", flush=True)
-        num_shown = 0
-        while not count or num_shown < count:
-            try:
-                print_markers(decode("markers_t", samples.get()))
-            except ValueError as error:
-                print(f"ignored a malformed message: {error}", file=sys.stderr)
-                continue
-            num_shown += 1
+        for message in itertools.islice(without_gaps(session, samples), count or None):
+            print_markers(message)
 
 
 def as_json(value):

@@ -13,6 +13,7 @@ use std::error::Error;
 use std::io::{self, BufRead, Write};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
 use std::os::unix::io::FromRawFd;
+use std::time::{Duration, SystemTime};
 use std::{env, process};
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
@@ -339,8 +340,8 @@ fn cut_channel(data: &[u8]) -> Result<(String, &[u8])> {
 
 // The subscriber.
 
-/// Join the multicast group of $LCM_DEFAULT_URL, such as udpm://239.255.76.67:7667?ttl=1.
-fn open_lcm() -> Result<UdpSocket> {
+/// Join the multicast group of $LCM_DEFAULT_URL, such as udpm://239.255.76.67:7667?ttl=1, on this or a following port.
+fn open_lcm(following: u16) -> Result<(UdpSocket, SocketAddrV4)> {
     let url = env::var("LCM_DEFAULT_URL").unwrap_or_default();
     let url = if url.is_empty() {
         "udpm://239.255.76.67:7667"
@@ -350,12 +351,15 @@ fn open_lcm() -> Result<UdpSocket> {
     let address = url
         .strip_prefix("udpm://")
         .and_then(|rest| rest.split('?').next());
-    let group: SocketAddrV4 = address.and_then(|text| text.parse().ok()).ok_or_else(|| {
+    let mut group: SocketAddrV4 = address.and_then(|text| text.parse().ok()).ok_or_else(|| {
         format!("{url}: this program needs a URL such as udpm://239.255.76.67:7667?ttl=1")
     })?;
+    group.set_port(group.port().wrapping_add(following));
     let socket = bind_shared(group.port())?;
     socket.join_multicast_v4(group.ip(), &Ipv4Addr::UNSPECIFIED)?;
-    Ok(socket)
+    let ttl = url.split("ttl=").nth(1).and_then(|ttl| ttl.parse().ok());
+    socket.set_multicast_ttl_v4(ttl.unwrap_or(0))?;
+    Ok((socket, group))
 }
 
 /// Bind a UDP socket to a port that other programs use, too. std cannot do that; the crate socket2 can on all systems.
@@ -412,9 +416,84 @@ fn bind_shared(port: u16) -> io::Result<UdpSocket> {
     }
 }
 
+/// Asks the gateway for frames that were lost. Requests, and what it sends again, go to the port behind LCM's.
+struct Refill<'a> {
+    source: &'a str,
+    socket: UdpSocket,
+    group: SocketAddrV4,
+    assembler: Assembler,
+    requester: String,
+    requests: u64,
+}
+
+impl Refill<'_> {
+    /// Return the frames with these numbers that the gateway still has: it asks as long as any come.
+    fn get(&mut self, first: i64, last: i64) -> Result<Vec<(Prefix, Vec<Marker>)>> {
+        let wanted = format!("MOCAP_{}_3D_REFILL", self.source);
+        let (mut found, mut next, mut tries_left) = (Vec::new(), first, 5);
+        let mut packet = [0; 65536];
+        while next <= last && tries_left > 0 {
+            tries_left -= 1;
+            let request = self.request(next, last);
+            self.socket.send_to(&request, self.group)?;
+            // Until nothing has come for the timeout of the socket.
+            while let (true, Ok((length, sender))) =
+                (next <= last, self.socket.recv_from(&mut packet))
+            {
+                let message = match self.assembler.add(sender, &packet[..length]) {
+                    Ok(Some((channel, message))) if channel == wanted => message,
+                    _ => continue,
+                };
+                if let Ok(frame) = decode::<Vec<Marker>>(&message) {
+                    if frame.0.sequence == next {
+                        (next, tries_left) = (next + 1, 5);
+                        found.push(frame);
+                    }
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Return LCM's packet with a command_request_t.
+    fn request(&mut self, first: i64, last: i64) -> Vec<u8> {
+        self.requests += 1;
+        let text = |value: String| {
+            let length = (value.len() as u32 + 1).to_be_bytes();
+            [&length[..], value.as_bytes(), b"\0"].concat()
+        };
+        let channel = format!("MOCAP_{}_COMMAND_REQUEST\0", self.source);
+        [
+            &MAGIC_MESSAGE.to_be_bytes()[..],
+            &(self.requests as u32).to_be_bytes(),
+            channel.as_bytes(),
+            &0x4514334e0ab92347_u64.to_be_bytes(), // the fingerprint
+            &self.requests.to_be_bytes(),
+            &text(self.requester.clone()),
+            &text("history".to_string()),
+            &3_i32.to_be_bytes(), // options
+            &text("key=3d".to_string()),
+            &text(format!("from={first}")),
+            &text(format!("to={last}")),
+        ]
+        .concat()
+    }
+}
+
 fn subscribe(source: &str, count: u64) -> Result<()> {
     let wanted = format!("MOCAP_{source}_3D");
-    let socket = open_lcm()?;
+    let (socket, _) = open_lcm(0)?;
+    let (queries, group) = open_lcm(1)?;
+    queries.set_read_timeout(Some(Duration::from_millis(200)))?;
+    let mut refill = Refill {
+        source,
+        socket: queries,
+        group,
+        assembler: Assembler::default(),
+        requester: format!("subscriber.rs {} at {:?}", process::id(), SystemTime::now()),
+        requests: 0,
+    };
+    let mut newest = None;
     println!("listening");
     let mut assembler = Assembler::default();
     let mut packet = [0; 65536];
@@ -426,13 +505,20 @@ fn subscribe(source: &str, count: u64) -> Result<()> {
             _ => continue, // another channel, an incomplete message, or no packet of LCM
         };
         match decode::<Vec<Marker>>(&message) {
-            Ok((prefix, markers)) => print_markers(&prefix, &markers)?,
-            Err(error) => {
-                eprintln!("ignored a malformed message on {wanted}: {error}");
-                continue;
+            Ok((prefix, markers)) => {
+                let first = newest.map_or(prefix.sequence, |number: i64| number + 1);
+                newest = Some(prefix.sequence);
+                let mut frames = refill.get(first, prefix.sequence - 1)?;
+                frames.push((prefix, markers));
+                for (prefix, markers) in &frames {
+                    if count == 0 || received < count {
+                        print_markers(prefix, markers)?;
+                        received += 1;
+                    }
+                }
             }
+            Err(error) => eprintln!("ignored a malformed message on {wanted}: {error}"),
         }
-        received += 1;
     }
     Ok(())
 }

@@ -18,6 +18,7 @@ import rtc3d
 from gateway.logs.losses import Loss, Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
+from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.texts import xml_text
 from gateway.messages.topics import Topic
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -366,6 +367,20 @@ class Output(ABC):
         Called before it starts and after it has stopped. Returns what to add to the reply to the peer.
         """
         return {}
+
+    # Messages that were published before.
+
+    async def recorded_messages(self, source: str, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages from the disk that the gateway has published since it was started.
+
+        ``key`` is that of a component, "status", "clock" or "6d/TOOL". The answer is like that of
+        MessageHistory.find; None if the output has none of this key. Raises QueryError: busy, or disk.
+        """
+        return None
+
+    def oldest_recorded(self, source: str, key: str) -> tuple[int, int] | None:
+        """Return number and time, in µs since the Unix epoch, of the oldest message on the disk."""
+        return None
 
     # Queries of peers.
 

@@ -5,8 +5,9 @@ from functools import partial
 from logging import getLogger
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from gateway.errors import OutputError
+from gateway.errors import OutputError, QueryError
 from gateway.logs.failures import DefectLog, defect_text
+from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Command, FramePublisher, Output, OutputHealth, Publisher
 from gateway.rtc3d.components import ComponentType
@@ -85,6 +86,7 @@ class GuardedOutput(Output):
     serve_queries = _guarded(Output.serve_queries, None)
     maintain = _guarded(Output.maintain, None, is_repeated=True)
     topic_names = _guarded(Output.topic_names, {}, is_repeated=True)
+    oldest_recorded = _guarded(Output.oldest_recorded, None, is_repeated=True)
 
     def publisher(self, topic: Topic) -> Publisher:
         """See Output. After a defect, the publisher accepts nothing, so that every message counts as lost."""
@@ -127,6 +129,16 @@ class GuardedOutput(Output):
         except Exception as defect:  # noqa: BLE001 - other outputs continue
             self.defects.log(defect)
             return {}
+
+    async def recorded_messages(self, source: str, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        """See Output."""
+        try:
+            return await self.output.recorded_messages(source, key, wanted)
+        except QueryError:
+            raise
+        except Exception as defect:  # noqa: BLE001 - there are the messages in memory
+            self.defects.log(defect)
+            return None
 
     async def stop_queries(self) -> None:
         """See Output."""

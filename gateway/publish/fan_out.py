@@ -5,8 +5,9 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
+from gateway.errors import QueryError
 from gateway.messages.encode import MESSAGE_TYPES, Stamp, encode_content, has_lcm_form, lcm_content
 from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages
 from gateway.outputs.contract import Output, OutputStatus, ServerParameters
@@ -215,14 +216,57 @@ class FanOut:
         paced = self._paced_route(component, output)
         return message if paced is None or message is None else paced.numbered(message)
 
-    def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
+    async def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
         """Return messages of a key from the history, as they are numbered on the output of this name.
 
-        ``key`` is that of a component, "status", "clock" or "6d/TOOL". None if it has no messages.
+        ``key`` is that of a component, "status", "clock" or "6d/TOOL". None if it has no messages. What
+        is too old for the memory comes from the disk, if an output has it there. Raises QueryError (busy).
         """
         component = COMPONENTS_BY_KEY.get(key)
         paced = None if component is None else self._paced_route(component, output)
-        return self.history.find(key if paced is None else paced.history_key, wanted)
+        if paced is not None:  # the disk has other numbers
+            return self.history.find(paced.history_key, wanted)
+        found = self.history.find(key, wanted)
+        on_disk = self._oldest_recorded(key) if self.history.is_kept else None
+        if on_disk is None or (found is not None and found.oldest <= on_disk[1]):
+            return found
+        disk, oldest, _ = on_disk
+        if found is None:
+            return await self._recorded(disk, key, wanted)
+        is_older = found.first < found.oldest if wanted.first is not None else found.first == found.oldest
+        if is_older:
+            last = found.oldest - 1 if wanted.last is None else min(wanted.last, found.oldest - 1)
+            recorded = await self._recorded(disk, key, wanted._replace(last=last))
+            if recorded is not None and recorded.messages:
+                return recorded._replace(newest=found.newest)
+        return found._replace(oldest=oldest)
+
+    async def _recorded(self, disk: Output, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages from the disk; None if it fails, which its output reports."""
+        try:
+            return await disk.recorded_messages(self._source, key, wanted)
+        except QueryError as error:
+            if error.code != "disk":
+                raise
+            return None
+
+    def _oldest_recorded(self, key: str) -> tuple[Output, int, int] | None:
+        """Return number and time of the oldest message of a key on the disk, and the output that has it."""
+        for route in self._routes:
+            oldest = route.output.oldest_recorded(self._source, key)
+            if oldest is not None:
+                return route.output, *oldest
+        return None
+
+    @property
+    def history_overview(self) -> dict[str, Any]:
+        """What there is of each key, in memory and on the disk."""
+        overview = self.history.overview
+        for key, facts in overview["keys"].items():
+            on_disk = self._oldest_recorded(key)
+            if on_disk is not None and on_disk[1] < facts["oldest"]:
+                _, facts["oldest"], facts["oldest_utime"] = on_disk
+        return overview
 
     def _paced_route(self, component: ComponentType, output: str) -> TopicRoute | None:
         """Return the route to the output of this name if it numbers a component itself."""

@@ -55,8 +55,12 @@ class PublishedMessages(Protocol):
     def newest(self, component: ComponentType, output: str) -> bytes | None:
         """Return the newest message of a component; None before the first."""
 
-    def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
-        """Return messages of a key from the history; None if it has none of this key."""
+    async def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages of a key from the history; None if it has none of this key. Raises QueryError."""
+
+    @property
+    def history_overview(self) -> dict[str, Any]:
+        """What the history has of each key."""
 
 
 class SourceQueries:
@@ -140,7 +144,7 @@ class SourceQueries:
             case "component":
                 return await self._component(question, output)
             case "messages" | "history" | "status":
-                return self._without_server(question, output)
+                return await self._without_server(question, output)
             case "schema":
                 return schema_answer(question.name)
             case "c3d":
@@ -197,10 +201,10 @@ class SourceQueries:
             )
         return self._message_answer(message, question, output)
 
-    def _without_server(self, question: Question, output: str) -> Answer:
+    async def _without_server(self, question: Question, output: str) -> Answer:
         """Return the status, or what the history has: all keys, or messages of MAX_ANSWER_BYTES at most."""
         if question.kind == "history":
-            return Answer(json_bytes(self._published.history.overview), JSON)
+            return Answer(json_bytes(self._published.history_overview), JSON)
         if question.wanted is None:
             return self._message_answer(self._status_message(), question, output)
         if not self._finds.try_take():
@@ -208,7 +212,7 @@ class SourceQueries:
                 f"the gateway finds messages of a source {_FINDS_PER_S:g} times a second; ask again",
                 code="rate",
             )
-        found = self._published.find(question.name, output, question.wanted)
+        found = await self._published.find(question.name, output, question.wanted)
         if found is None and not self._published.history.is_kept:
             raise QueryError(
                 "the gateway keeps no messages; to keep some, set history.seconds in its configuration",

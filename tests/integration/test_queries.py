@@ -17,6 +17,7 @@ from gateway.messages.decode import decode, to_json
 from gateway.messages.history import WantedMessages, sequence_of, unpack_messages
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
@@ -196,11 +197,36 @@ async def test_on_lcm_messages_are_sent_again_on_a_channel_of_their_own() -> Non
             await wait_until_async(lambda: len(again) == 3)
         facts = {"from": 3, "to": 5, "oldest": 0, "newest": 9, "num_messages": 3}
         assert json.loads(replies[0].content) == {"key": "3d", "channel": "MOCAP_LAB_3D_REFILL", **facts}
-        found = gateway.sources[0].fan_out.find("3d", "lcm", WantedMessages(3, None, 5))
+        found = await gateway.sources[0].fan_out.find("3d", "lcm", WantedMessages(3, None, 5))
         assert found is not None
         assert again == found.messages
         assert "key= needs one of from=" in replies[1].error
         assert json.loads(replies[2].content)["keys"]["3d"]["newest"] == 9
+
+
+async def test_what_is_too_old_for_the_memory_comes_from_the_last_seconds_on_the_disk(tmp_path: Path) -> None:
+    """A subscriber that was away for longer than the memory lasts misses nothing if takes keep the time."""
+    server = ParameterServer()
+    takes = TakesSettings(enabled=True, directory=str(tmp_path / "takes"), keep_last_s=600.0)
+    async with gateway_with_server(server, takes=takes) as (_, _, gateway, peer):
+        small = HistorySettings(max_bytes=2048)
+        await gateway.reload(gateway.settings.model_copy(update={"history": small}))
+        await publish_frames(server, gateway, 200)
+        [disk] = [output for output in gateway.outputs if output.name == "takes"]
+        await wait_until_async(lambda: disk.oldest_recorded("lab", "3d"))
+        assert gateway.sources[0].fan_out.history.overview["keys"]["3d"]["oldest"] > 100
+        found: list[bytes] = []
+        attachment: dict[str, Any] = {"to": -1, "newest": 199}
+        while attachment["to"] < attachment["newest"]:
+            reply = await query(peer, f"mocap/lab/3d?from={attachment['to'] + 1}")
+            attachment = reply.attachment
+            assert (attachment["oldest"], attachment["newest"]) == (0, 199)
+            found += unpack_messages(reply.payload)
+        assert [sequence_of(each) for each in found] == list(range(200))
+        assert [decode(each).markers[0].z for each in found[1:]] == list(range(1, 200))
+        assert (await query(peer, "mocap/lab/3d?last_s=1000")).attachment["from"] == 0
+        assert (await query(peer, "mocap/lab/3d?from=5;to=7")).attachment["num_messages"] == 3
+        assert (await query(peer, "mocap/lab/history")).json["keys"]["3d"]["oldest"] == 0
 
 
 async def test_a_reload_switches_the_history_off() -> None:

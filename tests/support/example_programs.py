@@ -15,7 +15,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -145,15 +145,17 @@ def output_until_the_end(process: "subprocess.Popen[str]") -> str:
 
 
 @contextlib.contextmanager
-def run_gateway(folder: Path, *simulated: str, ready: str) -> Iterator[str]:
+def run_gateway(
+    folder: Path, *simulated: str, ready: str, lcm: Mapping[str, str] | None = None
+) -> Iterator[str]:
     """Run a gateway with the source "lab", whose server is a simulator with these options.
 
-    Yields the gateway's Zenoh endpoint when it has logged ``ready``.
+    ``lcm`` replaces its settings of LCM. Yields the gateway's Zenoh endpoint when it has logged ``ready``.
     """
     endpoint, log = free_endpoint(), folder / "gateway.log"
     with simulator(*simulated) as (port, _), log.open("wb") as stderr:
         zenoh = {"config": zenoh_keys("peer", listen=endpoint)}
-        config = write_config(folder / "gateway.yaml", port, zenoh=zenoh, lcm={"url": LCM_URL})
+        config = write_config(folder / "gateway.yaml", port, zenoh=zenoh, lcm=lcm or {"url": LCM_URL})
         with program("run", "--config", str(config), "--log-level", "debug", stderr=stderr):
             wait_until(lambda: ready in log.read_text())
             yield endpoint

@@ -10,7 +10,7 @@ from collections.abc import Set as AbstractSet
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.logs.failures import HOLD_S, FailureLog
@@ -87,6 +87,12 @@ not wait: the former gateway with this folder may just be ending."""
 
 _DAY_S: Final = 86_400.0
 
+
+_HISTORY_REST: Final = 3
+"""After reading for a subscriber, the thread rests this many times as long: at most a quarter of a core."""
+
+MAX_HISTORY_READS: Final = 8
+"""How many subscribers may wait for messages on the disk: it may not respond."""
 
 _FRESH_S: Final = 5.0
 """A take that was written so recently is not deleted: it may have been started a moment ago."""
@@ -222,6 +228,8 @@ class Storage:
         """Returns HOST:PORT of a source's server."""
         self.copy_thread = host.thread("takes-copy")
         self._read_thread = host.thread("takes-read")
+        self._history_thread = host.thread("takes-history")
+        self._num_history_reads = 0
         self._max_queued_bytes = max_queued_bytes
 
     @property
@@ -260,9 +268,33 @@ class Storage:
         """Return the result of ``call``, which reads ``path`` in a thread. Raises QueryError."""
         return await disk_result(self._read_thread.submit(call), path)
 
+    async def read_history(self, call: Callable[[], _Result]) -> _Result:
+        """Return the result of ``call``, which reads rolling segments in a thread. Raises QueryError."""
+        if self._num_history_reads >= MAX_HISTORY_READS:
+            raise QueryError("too many subscribers ask for messages on the disk; try again", code="busy")
+        self._num_history_reads += 1
+        took_s = 0.0
+
+        def read() -> _Result:
+            nonlocal took_s
+            began_s = time.monotonic()
+            try:
+                return call()
+            finally:
+                took_s = time.monotonic() - began_s
+
+        reading = self._history_thread.submit(read)
+        reading.add_done_callback(self._end_history_read)
+        # Otherwise, whoever asks again and again would take Python's lock from the streams.
+        self._history_thread.submit(lambda: time.sleep(_HISTORY_REST * took_s))
+        return await disk_result(reading, self.folder.directory)
+
+    def _end_history_read(self, _reading: Future[Any]) -> None:
+        self._num_history_reads -= 1
+
     async def written(self) -> None:
-        """Wait until everything that was published so far is in the files."""
-        await asyncio.wrap_future(self.started_writer().call(lambda: None))
+        """Wait until everything that was published so far is in the files. Raises QueryError."""
+        await disk_result(self.started_writer().call(lambda: None), self.folder.directory, self.disk)
 
     def refusal(self) -> OutputError | None:
         """Return the error for a message that is published while the output is not open."""

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, Final
 
 from gateway.logs.losses import Losses
+from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import (
     Command,
@@ -193,6 +194,14 @@ class TakesOutput(Output):
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Link or copy the C3D file beside the take during which, or soon after which, it was sent."""
         self.source(source).add_c3d(file.path)
+
+    async def recorded_messages(self, source: str, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages from the rolling segments."""
+        return await self._sources[source].find(key, wanted) if source in self._sources else None
+
+    def oldest_recorded(self, source: str, key: str) -> tuple[int, int] | None:
+        """Return number and time of the oldest message in the rolling segments."""
+        return self._sources[source].oldest(key) if source in self._sources else None
 
     def serve_queries(self, service: QueryService) -> None:
         """Use ``service`` to describe the sources in the files."""

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import os
 import shutil
+import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -12,13 +13,19 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import QueryError, TakeError
+from gateway.messages.history import FoundMessages, WantedMessages, sequence_of
 from gateway.outputs.takes.folder import free_stem, is_full
+from gateway.outputs.takes.segment_index import (
+    SegmentIndex,
+    plan_reading,
+    read_planned,
+)
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.new_file import default_name
 from gateway.takes.files.reader import SUFFIX
-from gateway.takes.files.take_writer import begin_log
+from gateway.takes.files.take_writer import Messages, begin_log
 from gateway.takes.files.writer_thread import LogFile
 
 SEGMENT_S: Final = 10.0
@@ -38,6 +45,7 @@ class _Segment:
     path: Path
     begin_s: float
     end_s: float
+    index: SegmentIndex
 
 
 class Save:
@@ -71,7 +79,7 @@ class RollingSegments(SourceWriter):
     """Keeps the last ``keep_s`` seconds of a source, rounded up to whole segments, in ``folder``.
 
     Segments are on the same file system as the takes, so saving them is a matter of hard links. All methods
-    are called in the thread that writes, except for ``kept_s``.
+    are called in the thread that writes, except for ``kept_s`` and those that read.
     """
 
     def __init__(
@@ -89,6 +97,9 @@ class RollingSegments(SourceWriter):
         self._num_segments = 0  # so far: no name is used twice
         self._saves: list[Save] = []
         self._written_s = 0.0  # when something was written before a problem of the disk
+        self._index = SegmentIndex(folder)  # of the present segment
+        self._newest: dict[bytes, int] = {}  # the number of the newest message on the disk, by channel
+        self._indexing = threading.Lock()  # of the indices and of self._newest
 
     def kept_s(self) -> float:
         """Return how many seconds of the past could be saved now; a problem of the disk ends them."""
@@ -118,6 +129,7 @@ class RollingSegments(SourceWriter):
                 folder.mkdir(exist_ok=True)
             name = f"{default_name(self.description.source)}-{self._num_segments:06}"
             self._log = self._begin_log(self.path / f"{name}{SUFFIX}", name, utime)
+            self._index = SegmentIndex(self._log.path)
             self._num_segments += 1
             self._log_began_s = now_s
             for save in [*self._saves]:
@@ -145,7 +157,10 @@ class RollingSegments(SourceWriter):
     def _end_segment(self) -> None:
         log = self._close_log()
         if log is not None:
-            self._segments.append(_Segment(log.path, self._log_began_s, self._monotonic()))
+            segment = _Segment(log.path, self._log_began_s, self._monotonic(), self._index)
+            with self._indexing:
+                self._segments.append(segment)
+                self._index = SegmentIndex(self.path)
             self._delete_expired()
 
     def _delete_expired(self) -> None:
@@ -154,7 +169,8 @@ class RollingSegments(SourceWriter):
             self._delete_oldest()
 
     def _delete_oldest(self) -> None:
-        segment = self._segments.popleft()
+        with self._indexing:
+            segment = self._segments.popleft()
         try:
             segment.path.unlink(missing_ok=True)
         except OSError as error:
@@ -166,6 +182,57 @@ class RollingSegments(SourceWriter):
         for _ in range(-(-num_segments // 2)):
             self._delete_oldest()
         return bool(num_segments)
+
+    # Reading, in other threads.
+
+    def written(self, begin: int, messages: Messages) -> None:
+        """See TakeWriter."""
+        assert self._log is not None  # noqa: S101 - it has the messages
+        newest = {channel: sequence_of(message) for channel, message in dict(messages).items()}
+        with self._indexing:
+            for channel in newest.keys() & self._newest.keys():
+                if newest[channel] <= self._newest[channel]:  # the numbers have begun again
+                    self._forget(channel)
+            self._index.add(begin, self._log.num_bytes, messages)
+            self._newest.update(newest)
+
+    def forget(self, channel: bytes) -> None:
+        """Do not find the messages of a channel again: another topic may get its name."""
+        with self._indexing:
+            self._forget(channel)
+
+    def _forget(self, channel: bytes) -> None:
+        self._newest.pop(channel, None)
+        for index in self._indices():
+            index.forget(channel)
+
+    def _indices(self) -> list[SegmentIndex]:
+        return [*(segment.index for segment in self._segments), self._index]
+
+    def oldest(self, channel: bytes) -> tuple[int, int] | None:
+        """Return number and time of the oldest message of a channel on the disk; None if it has none."""
+        with self._indexing:
+            found = (index.oldest(channel) for index in self._indices())
+            return next((oldest for oldest in found if oldest is not None), None)
+
+    def newest(self, channel: bytes) -> int:
+        """Return the number of the newest message of a channel on the disk; -1 if it has none."""
+        with self._indexing:
+            return self._newest.get(channel, -1)
+
+    def find(self, channel: bytes, wanted: WantedMessages) -> FoundMessages | None:
+        """Read messages of a channel, as MessageHistory.find returns them; None if there are none."""
+        oldest = self.oldest(channel)
+        if oldest is None:
+            return None
+        with self._indexing:
+            indices, newest = self._indices(), self._newest.get(channel, -1)
+            plan = plan_reading(indices, channel, wanted, newest)
+        messages, next_number = read_planned(plan, channel, wanted)
+        first = wanted.first
+        if first is None:
+            first = sequence_of(messages[0]) if messages else next_number
+        return FoundMessages(messages, first, next_number - 1, oldest[0], newest)
 
     # Saving.
 

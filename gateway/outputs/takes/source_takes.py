@@ -26,6 +26,7 @@ from typing import Any, Final, NamedTuple, Self
 
 from gateway.errors import QueryError, TakeError
 from gateway.logs.losses import Losses
+from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import ServerParameters, encode_parameters, published_again
@@ -240,6 +241,26 @@ class SourceTakes:
         folder = self.storage.folder
         return await self.storage.read(partial(folder.read, self.source, name, offset), folder.directory)
 
+    async def find(self, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        """Return messages from the rolling segments (see Output.recorded_messages)."""
+        segments, channel = self.segments, self._rolling_channel(key)
+        if segments is None or channel is None:
+            return None
+        if wanted.last is None or wanted.last > segments.newest(channel):
+            await self.storage.written()
+        return await self.storage.read_history(partial(segments.find, channel, wanted))
+
+    def oldest(self, key: str) -> tuple[int, int] | None:
+        """Return number and time of the oldest message of a key in the rolling segments."""
+        channel = self._rolling_channel(key)
+        return None if self.segments is None or channel is None else self.segments.oldest(channel)
+
+    def _rolling_channel(self, key: str) -> bytes | None:
+        """Return the channel of a key in the rolling segments; None if it is not there."""
+        channels = {} if self.segments is None else self.segments.channels
+        found = (name for publisher, name in channels.items() if "/".join(publisher.topic.path) == key)
+        return next((name.encode() for name in found), None)
+
     def _new_stem(self, name: str) -> Path:
         if name:
             check_name(name)
@@ -342,7 +363,9 @@ class SourceTakes:
         if publisher in self._publishers:
             self._publishers.remove(publisher)
             for sink in self._sinks:
-                sink.channels.pop(publisher, None)
+                channel = sink.channels.pop(publisher, None)
+                if channel is not None and sink is self.segments:  # another topic may get this channel
+                    self._call(partial(self.segments.forget, channel.encode()))
 
     def _set_targets(self, publisher: TakesPublisher) -> None:
         """Give a publisher a channel of its own in each file, unless its component is not recorded there."""

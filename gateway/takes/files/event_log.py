@@ -30,6 +30,9 @@ _MAX_NAMES: Final = 1000
 """How many names of channels are kept, so that each is decoded only once."""
 
 _READ_BYTES: Final = 1024 * 1024
+_PIECE_BYTES: Final = 64 * 1024
+"""How much is read at a time of a file, and of a part of a file."""
+
 _AHEAD_BYTES: Final = 32 * 1024 * 1024
 """How far the system reads ahead, so that a slow disk does not delay what is replayed."""
 
@@ -70,13 +73,16 @@ class EventLogReader:
         self.damaged_bytes = 0
         """How many bytes belong to no readable event."""
 
-    def events(self, start_offset: int = 0) -> Iterator[Event]:
-        """Yield the events from a place in the file on. Raises TakeError if it is no event log."""
+    def events(self, start_offset: int = 0, stop_offset: int | None = None) -> Iterator[Event]:
+        """Yield the events from a place in the file on, to the end of the file or to another place.
+
+        Raises TakeError if it is no event log. Nothing behind ``stop_offset`` is read.
+        """
         self.damage, self.num_damaged, self.damaged_bytes = [], 0, 0
         try:
             with open_file(self.path) as file:
                 file.seek(start_offset)
-                yield from self._events(_Window(file, start_offset))
+                yield from self._events(_Window(file, start_offset, stop_offset))
         except (OSError, ValueError) as error:  # ValueError: of a path with NUL
             reason = getattr(error, "strerror", None) or error
             raise TakeError(f"{safe_text(str(self.path))} cannot be read: {reason}") from error
@@ -163,20 +169,26 @@ class EventBoundary:
 class _Window:
     """A part of a file in memory, which moves forward. ``offset`` is the present place in the file."""
 
-    def __init__(self, file: BinaryIO, offset: int) -> None:
+    def __init__(self, file: BinaryIO, offset: int, stop_offset: int | None = None) -> None:
         self._file = file
+        self._stop_offset = stop_offset
         self._names: dict[bytes, str] = {}
         self._data = b""
         self._start = 0  # of the present place in _data
         self.offset = offset
-        os.posix_fadvise(file.fileno(), offset, _AHEAD_BYTES, os.POSIX_FADV_WILLNEED)
+        if stop_offset is None:
+            os.posix_fadvise(file.fileno(), offset, _AHEAD_BYTES, os.POSIX_FADV_WILLNEED)
 
     def has(self, num_bytes: int) -> bool:
         """Whether the file has this many more bytes; they are in memory then."""
         while (missing := self._start + num_bytes - len(self._data)) > 0:
-            more = self._file.read(max(missing, _READ_BYTES))
-            ahead = self._file.tell() + _AHEAD_BYTES
-            os.posix_fadvise(self._file.fileno(), ahead, _READ_BYTES, os.POSIX_FADV_WILLNEED)
+            if self._stop_offset is None:
+                num_wanted = max(missing, _READ_BYTES)
+                ahead = self._file.tell() + num_wanted + _AHEAD_BYTES
+                os.posix_fadvise(self._file.fileno(), ahead, _READ_BYTES, os.POSIX_FADV_WILLNEED)
+            else:
+                num_wanted = min(max(missing, _PIECE_BYTES), self._stop_offset - self._file.tell())
+            more = self._file.read(num_wanted)
             if not more:
                 break
             self._data = self._data[self._start :] + more

@@ -66,6 +66,9 @@ class TakeWriter(ABC):
     def lose_newest(self, error: OSError) -> None:
         """Count the newest message, which was removed to make room for the end; ``error`` says why."""
 
+    def written(self, begin: int, messages: Messages) -> None:  # noqa: B027 - optional
+        """Note that messages are in the present log, from ``begin`` on, in bytes. By default, do nothing."""
+
     def make_room(self, error: OSError) -> bool:  # noqa: ARG002 - for those that override it
         """Delete what is less important; return whether to write again at once what was not accepted."""
         return False
@@ -85,7 +88,8 @@ class TakeWriter(ABC):
             is_last_try = self._gives_up.is_set()
             try:
                 log = self.log_for(utime_of(rest[0][1]))
-                rest = rest[log.append(rest) :]
+                begin = log.num_bytes
+                num_written = log.append(rest)
             except OSError as error:
                 if self.make_room(error):
                     continue
@@ -96,6 +100,8 @@ class TakeWriter(ABC):
                 self._gives_up.wait(RETRY_S)
             else:
                 self.succeeded()
+                self.written(begin, rest[:num_written])
+                rest = rest[num_written:]
 
     def sync(self) -> None:
         """Store on the disk what was written."""

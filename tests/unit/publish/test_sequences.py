@@ -1,11 +1,14 @@
 """Sequence numbers: assigned when a frame arrives, so that every gap is loss."""
 
+from collections.abc import Sequence
+
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.encode import encode_message
-from gateway.messages.history import WantedMessages, sequence_of
+from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages, sequence_of
 from gateway.publish.fan_out import FanOut
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
@@ -92,7 +95,7 @@ def test_what_pacing_leaves_out_is_no_gap_and_what_is_skipped_beyond_that_is_one
     assert numbered(paced, "3d") == numbered(paced, "6d") == expected
 
 
-def test_the_history_has_the_numbers_of_the_output_that_asks() -> None:
+async def test_the_history_has_the_numbers_of_the_output_that_asks() -> None:
     """Also those of messages that were skipped, so that a subscriber can fill the gap that they leave."""
     paced, unpaced = ToyOutput("paced"), ToyOutput("unpaced")
     paced.max_rate_hz = {MARKERS: 50.0}
@@ -102,13 +105,67 @@ def test_the_history_has_the_numbers_of_the_output_that_asks() -> None:
     skip(fan_out, 6, 7)
     publish(fan_out, *range(8, 10))
     for output, number in ((paced, 5), (unpaced, 10)):
-        found = fan_out.find("3d", output.name, WantedMessages(0))
+        found = await fan_out.find("3d", output.name, WantedMessages(0))
         assert found is not None
         assert [sequence_of(message) for message in found.messages] == list(range(number))
         assert set(found.messages) >= {message for topic, message in output.messages if topic.path == ("3d",)}
     fan_out.publish_status(b"s" * 48)
     fan_out.publish_clock(b"c" * 48)
     assert fan_out.history.overview["keys"].keys() == {"3d", "6d", "3d on paced", "status", "clock"}
+
+
+class Disk(ToyOutput):
+    """An output that has had messages of markers on a disk for longer than the memory; it may fail."""
+
+    def __init__(self) -> None:
+        super().__init__("disk")
+        self.recorded = MessageHistory()
+        self.recorded.set_limits(1e9, 1 << 30)
+        self.code = ""
+
+    async def recorded_messages(self, _source: str, key: str, wanted: WantedMessages) -> FoundMessages | None:
+        if self.code:
+            raise QueryError("the disk fails", code=self.code)
+        return self.recorded.find(key, wanted)
+
+    def oldest_recorded(self, _source: str, key: str) -> tuple[int, int] | None:
+        keys = self.recorded.overview["keys"]
+        return (keys[key]["oldest"], keys[key]["oldest_utime"]) if key in keys else None
+
+
+async def test_what_is_older_than_the_memory_comes_from_the_disk_up_to_what_is_in_memory() -> None:
+    """Nothing in between is left out; a paced output has other numbers, so the disk has nothing for it."""
+    disk, paced = Disk(), ToyOutput("paced")
+    paced.max_rate_hz = {MARKERS: 50.0}
+    fan_out = FanOut("lab", [disk, paced])
+    fan_out.history.set_limits(60, 1 << 20)
+    publish(fan_out, *range(8))
+    for topic, message in disk.messages:
+        disk.recorded.add(topic.path[0], message)
+    fan_out.history.set_limits(60, 0)
+    fan_out.history.set_limits(60, 1 << 20)
+    only_on_disk = await fan_out.find("3d", "zenoh", WantedMessages(6))
+    publish(fan_out, 8, 9)
+
+    async def numbers(wanted: WantedMessages, output: str = "zenoh") -> tuple[list[int], Sequence[int]]:
+        found = await fan_out.find("3d", output, wanted)
+        assert found is not None
+        return [sequence_of(message) for message in found.messages], found[1:]
+
+    assert only_on_disk is not None
+    assert only_on_disk[1:] == (6, 7, 0, 7)
+    assert await numbers(WantedMessages(2)) == ([2, 3, 4, 5, 6, 7], (2, 7, 0, 9))
+    assert await numbers(WantedMessages(2, None, 4)) == ([2, 3, 4], (2, 4, 0, 9))
+    assert await numbers(WantedMessages(None, 0)) == ([*range(8)], (0, 7, 0, 9))
+    assert await numbers(WantedMessages(8)) == ([8, 9], (8, 9, 0, 9))
+    _, (_, _, oldest, _) = await numbers(WantedMessages(0), "paced")
+    assert oldest > 0
+    assert fan_out.history_overview["keys"]["3d"]["oldest"] == 0
+    disk.code = "disk"
+    assert (await numbers(WantedMessages(2)))[0] == [8, 9]
+    disk.code = "busy"
+    with pytest.raises(QueryError):
+        await numbers(WantedMessages(2))
 
 
 def test_a_skipped_message_is_lost_if_one_output_would_have_got_it() -> None:

@@ -55,13 +55,13 @@ def test_tools_have_topics_only_where_switched_on() -> None:
     assert without.tool_names() == []
 
 
-def test_the_history_has_the_poses_of_tools_that_were_published() -> None:
+async def test_the_history_has_the_poses_of_tools_that_were_published() -> None:
     output, fan_out = lab("Probe", "Head", wanted=("Probe",))
     fan_out.history.set_limits(60, 1 << 20)
     publish_tools(fan_out, 2)
     publish_tools(fan_out, 2)
-    assert fan_out.find("6d/Head", "toy", WantedMessages(0)) is None
-    found = fan_out.find("6d/Probe", "toy", WantedMessages(0))
+    assert await fan_out.find("6d/Head", "toy", WantedMessages(0)) is None
+    found = await fan_out.find("6d/Probe", "toy", WantedMessages(0))
     assert found is not None
     published = [message for topic, message in output.messages if topic.path == ("6d", "Probe")]
     assert list(found.messages) == published

@@ -120,8 +120,12 @@ class FakeSource:
     def newest(self, component: ComponentType, _output: str) -> bytes | None:
         return self.newest_messages.get(component)
 
-    def find(self, key: str, _output: str, wanted: WantedMessages) -> FoundMessages | None:
+    async def find(self, key: str, _output: str, wanted: WantedMessages) -> FoundMessages | None:
         return self.history.find(key, wanted)
+
+    @property
+    def history_overview(self) -> dict[str, Any]:
+        return self.history.overview
 
     @property
     def streams(self) -> list[StreamAccess]:

@@ -265,6 +265,7 @@ class ScriptedLog:
 
     def __init__(self, *steps: int | OSError) -> None:
         self.steps = [*steps]
+        self.num_bytes = 0
         self.content: list[tuple[bytes, bytes]] = []
         self.sizes: list[int] = []
         self.on_failure: Callable[[], None] = lambda: None
