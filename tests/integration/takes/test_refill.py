@@ -40,6 +40,9 @@ def record_past(path: Path, gateway: Lab, options: tuple[str, ...], disturb: Cal
     """Record some frames, ``disturb`` the process with this id, and record what follows."""
     with recording(path, *options) as record:
         wait_until(lambda: num_recorded(path, MARKERS) > 20)
+        wait_until(
+            lambda: num_recorded(path, "MOCAP_LAB_1_CLOCK") > 0
+        )  # the last of what comes once a second
         disturb(record.process.pid)
         newest = gateway.published[MARKERS][-1]
         wait_until(lambda: newest in path.read_bytes())
