@@ -118,7 +118,7 @@ def play_list(
     for utime, source, key, message in reader.messages(FIRST_PLACE if point is None else point.place):
         if index is not None and timeline.position_us >= index.next_us:
             index.add(SeekPoint(reader.place, ReplayTimeline().go_on(timeline), dict(parameters)))
-        position_us = timeline.place(source, utime)
+        position_us = timeline.place(source, key, utime)
         is_selected = has(source, key)
         if is_selected and key == _PARAMETERS:
             parameters[source] = message

@@ -1,5 +1,6 @@
 """Where the messages of a take are in time, without steps of clocks and without long gaps."""
 
+import math
 from collections.abc import Callable
 from typing import Final, NamedTuple, Self
 
@@ -38,8 +39,10 @@ class ReplayTimeline:
 
     A message whose time is before the newest position, or more than ``max_gap_s`` after it, follows at once,
     and the time of its source goes on from there: either somebody has set the clock of the gateway that
-    published it, or nothing was recorded for that long. Each source has its own clock, because a take can
-    have sources of several gateways. ``on_jump`` is called for each jump, before ``place`` returns.
+    published it, or nothing was recorded for that long. A message that is only behind those of other keys was
+    requested late by the recorder: it follows at once, and the time goes on as before. Each source has its
+    own clock, because a take can have sources of several gateways. ``on_jump`` is called for each jump,
+    before ``place`` returns.
     """
 
     def __init__(
@@ -51,19 +54,25 @@ class ReplayTimeline:
         self._max_gap_us = round(max_gap_s * 1e6)
         self._starts: dict[str, int] = {}  # by source: the time of the message that would be at position 0
         self._newest_start = 0  # the newest of these
+        self._newest_utimes: dict[tuple[str, str], int] = {}  # by source and key
 
     def go_on(self, other: Self) -> Self:
         """Go on from where another one is."""
         self.position_us, self._newest_start = other.position_us, other._newest_start
         self._starts = dict(other._starts)
+        self._newest_utimes = dict(other._newest_utimes)
         return self
 
-    def place(self, source: str, utime: int) -> int:
+    def place(self, source: str, key: str, utime: int) -> int:
         """Return the position of the next message; ``utime`` is its time in µs since the Unix epoch."""
         start = self._starts.get(source)
         if start is None:
             start = self._begin(source, utime)
         ahead_us = utime - start - self.position_us
+        newest_utime = self._newest_utimes.get((source, key), math.inf)
+        self._newest_utimes[source, key] = utime
+        if ahead_us < -_BACK_US and utime >= newest_utime:
+            return self.position_us
         if ahead_us > SHOWN_GAP_US or ahead_us < -_BACK_US:
             ahead_us = self._jump(source, utime, ahead_us)
         if ahead_us > 0:

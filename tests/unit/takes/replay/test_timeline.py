@@ -23,8 +23,8 @@ class Placed:
         self.jumps: list[Jump] = []
         self._timeline = ReplayTimeline(max_gap_s, self.jumps.append)
 
-    def place(self, *utimes: int, source: str = "lab") -> list[int]:
-        return [self._timeline.place(source, START + utime) for utime in utimes]
+    def place(self, *utimes: int, source: str = "lab", key: str = "3d") -> list[int]:
+        return [self._timeline.place(source, key, START + utime) for utime in utimes]
 
 
 def set_clock(step: int) -> tuple[list[int], list[int], list[Jump]]:
@@ -57,6 +57,17 @@ def test_messages_are_placed_by_time(utimes: list[int], positions: list[int], ju
     placed = Placed()
     assert placed.place(*utimes) == positions
     assert placed.jumps == jumps
+
+
+def test_messages_that_a_recorder_has_requested_late_move_no_clock() -> None:
+    placed = Placed()
+    assert placed.place(0, key="event") == [0]
+    assert placed.place(5000, 2_000_000) == [5000, 2_000_000]
+    assert placed.place(500_000, 1_000_000, key="event") == [2_000_000] * 2
+    assert placed.place(2_005_000) == [2_005_000]
+    assert placed.jumps == []
+    assert placed.place(999_999, key="event") == [2_005_000]
+    assert [jump.jump_us for jump in placed.jumps] == [999_999 - 2_005_000]
 
 
 @pytest.mark.parametrize(
