@@ -184,9 +184,17 @@ async def test_on_lcm_messages_are_sent_again_on_a_channel_of_their_own() -> Non
         peer = open_lcm(queries_url)
         with (
             closing(
-                LcmSubscriber(peer, "MOCAP_LAB_COMMAND_REPLY", lambda _, each: replies.append(decode(each)))
+                LcmSubscriber(
+                    open_lcm(queries_url),
+                    "MOCAP_LAB_COMMAND_REPLY",
+                    lambda _, each: replies.append(decode(each)),
+                )
             ),
-            closing(LcmSubscriber(peer, "MOCAP_LAB_3D_REFILL", lambda _, each: again.append(each))),
+            closing(
+                LcmSubscriber(
+                    open_lcm(queries_url), "MOCAP_LAB_3D_REFILL", lambda _, each: again.append(each)
+                )
+            ),
         ):
             for number, options in enumerate((["key=3d", "from=3", "to=5"], ["key=3d"], [])):
                 request = rtc3d.command_request_t()
