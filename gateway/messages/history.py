@@ -98,7 +98,7 @@ class MessageHistory:
     def overview(self) -> dict[str, Any]:
         """The limits, and what there is of each key."""
         keys = sorted({key for block in self._blocks for key in block.messages})
-        found = {key: [messages for _, messages in self._runs(key)] for key in keys}
+        found = {key: self._runs(key) for key in keys}
         return {
             "seconds": self._seconds,
             "max_bytes": self._max_bytes,
@@ -149,7 +149,7 @@ class MessageHistory:
 
         Numbers up to ``last`` of what is returned that are not among its messages exist no more.
         """
-        runs = [messages for _, messages in self._runs(key)]
+        runs = self._runs(key)
         if not runs:
             return None
         oldest, newest = sequence_of(runs[0][0]), sequence_of(runs[-1][-1])
@@ -170,11 +170,9 @@ class MessageHistory:
             messages.append(message)
         return FoundMessages(messages, first, last, oldest, newest)
 
-    def _runs(self, key: str) -> Iterator[tuple["_Block", list[bytes]]]:
-        for block in self._blocks:
-            messages = block.messages.get(key)
-            if messages:
-                yield block, messages
+    def _runs(self, key: str) -> list[list[bytes]]:
+        """Return the messages of a key in each block that has some, in order."""
+        return [messages for block in self._blocks if (messages := block.messages.get(key))]
 
 
 class _Block:

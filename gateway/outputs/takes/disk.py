@@ -285,7 +285,7 @@ class Storage:
 
         reading = self._history_thread.submit(read)
         reading.add_done_callback(self._end_history_read)
-        # Otherwise, whoever asks again and again would take Python's lock from the streams.
+        # Otherwise, peers that ask again and again would take Python's lock from the streams.
         self._history_thread.submit(lambda: time.sleep(_HISTORY_REST * took_s))
         return await disk_result(reading, self.folder.directory)
 

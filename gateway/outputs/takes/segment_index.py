@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gateway.errors import TakeError
-from gateway.messages.history import MAX_ANSWER_BYTES, WantedMessages, sequence_of
+from gateway.messages.history import MAX_ANSWER_BYTES, WantedMessages, sequence_of, utime_of
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.take_writer import Messages
-from gateway.takes.files.writer_thread import utime_of
 
 STRETCH_BYTES: Final = 256 * 1024
 """A segment has one entry for each channel in a stretch of this size.

@@ -19,6 +19,7 @@ import zenoh
 from gateway.descriptions.labels import describe, event_labels
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, MAX_JSON_SOURCE_BYTES, decode, json_text
+from gateway.messages.history import utime_of
 from gateway.messages.topics import JSON_NAME, Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
@@ -42,7 +43,6 @@ _MAX_WAITING: Final = 1024
 _MAX_WAITING_BYTES: Final = 16 * 1024 * 1024
 """How many messages of one source wait for their conversion, and their size."""
 
-_UTIME: Final = slice(8, 16)
 _CAPTURE_UTIME: Final = slice(16, 24)
 """Places in a message, behind the fingerprint."""
 
@@ -143,7 +143,7 @@ class JsonPace:
 
     def due(self, message: bytes) -> bool:
         """Return whether to send this message. Call it for every message."""
-        utime = int.from_bytes(message[_UTIME], "big", signed=True)
+        utime = utime_of(message)
         capture_utime = int.from_bytes(message[_CAPTURE_UTIME], "big", signed=True)
         is_due = self._pacer.due(None if capture_utime == utime else capture_utime, utime)
         return is_due and self._bucket.try_take()

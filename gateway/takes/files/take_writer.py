@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.takes.files.writer_thread import LogFile, utime_of
+from gateway.messages.history import utime_of
+from gateway.takes.files.writer_thread import LogFile
 
 RETRY_S: Final = 0.25
 """How often what the disk did not accept is written again."""

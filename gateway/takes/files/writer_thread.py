@@ -235,8 +235,3 @@ class WriterThread:
                 self._defects.log(defect)
             self._unsynced[sink] = None
         self._written_bytes += num_bytes
-
-
-def utime_of(message: bytes) -> int:
-    """Return the ``utime`` of a message of the gateway, in µs since the Unix epoch."""
-    return int.from_bytes(message[_UTIME_START:_UTIME_STOP], "big", signed=True)

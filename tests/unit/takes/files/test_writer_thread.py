@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from gateway.messages.history import utime_of
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.files.writer_thread import LogFile, WriterThread, utime_of
+from gateway.takes.files.writer_thread import LogFile, WriterThread
 
 ENTRY_BYTES = 128
 """What a message takes in the queue besides its content."""
