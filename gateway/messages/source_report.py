@@ -108,6 +108,8 @@ class SourceReport:
     name: str
     gateway: str = ""
     """The id of the gateway's Zenoh session, if the status came from there."""
+    routers: Sequence[str] | None = None
+    """The names of the Zenoh routers between, the gateway's first; None if they are not known."""
     problem: str = ""
     server: str = ""
     """HOST:PORT."""
