@@ -32,7 +32,7 @@ from gateway.messages.decode import TEXT
 from gateway.messages.history import unpack_messages
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
 from gateway.outputs.kind import DISCOVERY_S
-from gateway.outputs.zenoh.routers import ROUTERS, RouterNetwork, read_routers
+from gateway.outputs.zenoh.routers import DESCRIPTIONS, RouterNetwork, read_routers
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
@@ -340,7 +340,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             self._get(source, "status", partial(self._take_gateway, source))
         self._network = RouterNetwork(self._session)
         if self._network.connected:
-            self._session.get(ROUTERS, self._network.add, timeout=_QUERY_S)
+            self._session.get(DESCRIPTIONS, self._network.add, timeout=_QUERY_S)
 
     def _take_gateway(self, source: Source, reply: zenoh.Reply) -> None:
         if reply.ok is not None and reply.replier_id is not None:

@@ -2,22 +2,23 @@
 
 import contextlib
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.client.reception import Messages, Source
+from gateway.client.transport import GatewaySubscriber
 from gateway.errors import ConfigError, OutputError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.source_report import SourceReport
-from gateway.outputs.findings import Check, Finding, Result, as_sentence, failing_first
+from gateway.outputs.findings import Check, Finding, Result, counted, failing_first
 from gateway.outputs.zenoh.checks import AFTER_LINK, GATEWAY, LINK, no_session
-from gateway.outputs.zenoh.router_checks import carried, check_routers, why_absent
-from gateway.outputs.zenoh.routers import read_routers
+from gateway.outputs.zenoh.router_checks import carried, check_links, check_routers, why_absent
+from gateway.outputs.zenoh.routers import RouterNetwork, read_routers
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
-from gateway.outputs.zenoh.subscriber import served_sources, subscriber_config
+from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources, subscriber_config
 
 _ANSWER_S: Final = 2.0
 """How long routers and gateways may take to answer."""
@@ -40,58 +41,67 @@ def run_subscriber_checks(
 
     The data are watched for ``seconds``. Yields each finding as soon as it is known.
     """
-    if not address.is_lcm:
-        findings = _check_zenoh(address, wanted)
-        yield from findings
-        if any(finding.result is Result.FAILING for finding in findings):
-            return
-    try:
-        with GatewayClient(address) as client:
-            found = client.sources()
-            if found.absence:
-                yield Check("lcm" if address.is_lcm else "zenoh", "gateway").problem(found.absence)
-                return
-            yield from _check_data(client, {each.name: each for each in found.sources}, wanted, seconds)
-    except (OutputError, QueryError) as error:
-        yield Check("lcm" if address.is_lcm else "zenoh", "link").problem(str(error))
-
-
-def _check_zenoh(address: GatewayAddress, wanted: Sequence[str]) -> list[Finding]:
-    """Check the session, the routers, what crosses their links, and that gateways are found."""
+    if address.is_lcm:
+        yield from _check_data(address, wanted, seconds)
+        return
     try:
         config = subscriber_config(address.connect, address.zenoh_config)
     except ConfigError as error:
-        return failing_first(LINK.failing(str(error), "Correct this file."), AFTER_LINK)
+        yield from failing_first(LINK.failing(str(error), "Correct this file."), AFTER_LINK)
+        return
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        return failing_first(no_session(error, config), AFTER_LINK)
+        yield from failing_first(no_session(error, config), AFTER_LINK)
+        return
     prefix = address.prefix or DEFAULT_ZENOH_PREFIX
     with contextlib.closing(session):
         served = _served(session, prefix)
         network = read_routers(session, _ANSWER_S)
-        num_peers = len(session.info.peers_zid())
-        others = [network.name_of(zid) for zid in network.connected]
-        others += [f"{num_peers} peers"] if num_peers else []
-        link = LINK.passing(f"the session is open, with links to {', '.join(others) or 'nobody so far'}")
-        findings = [link, *check_routers(network)]
-        missing = [name for name in wanted if name not in served]
-        if not served or missing:
-            absence = why_absent(session, network, prefix, missing, _ANSWER_S)
-            what = f"that serves {', '.join(map(safe_text, missing))}" if missing else f"at {prefix}/*/alive"
-            remedy = (
-                "Check that it runs with this prefix. Multicast finds only computers in the same network: "
-                "for others, name the address of a router with --connect."
-            )
-            reason, remedy = absence[:2] if absence else (f"found no gateway {what}", remedy)
-            return [*findings, GATEWAY.failing(reason, remedy)]
-        findings.append(GATEWAY.passing(f"gateways serve {', '.join(map(safe_text, served))}"))
-        for gateway in sorted(_gateways(session, prefix)):
-            for link_text, keys in carried(session, network, network.way_from(gateway) or [], _ANSWER_S):
-                more = f" and {len(keys) - _MAX_KEYS} more" if len(keys) > _MAX_KEYS else ""
-                named = ", ".join(keys[:_MAX_KEYS]) + more
-                findings.append(Check("zenoh", "carried").note(f"{link_text}: {named or 'nothing'}"))
-    return findings
+        yield _link_finding(session, network)
+        yield from check_routers(network)
+        finding = _gateway_finding(session, network, prefix, served, wanted)
+        yield finding
+        if finding.result is Result.FAILING:
+            return
+        gateways = _gateways(session, prefix)
+        for gateway in gateways:
+            for link, keys in carried(session, network, network.way_from(gateway) or [], _ANSWER_S):
+                yield _carried_finding(link, keys)
+        yield from _check_data(address, wanted, seconds)
+        yield from check_links(network, read_routers(session, _ANSWER_S), gateways)
+
+
+def _link_finding(session: zenoh.Session, network: RouterNetwork) -> Finding:
+    num_peers = len(session.info.peers_zid())
+    others = [network.name_of(zid) for zid in network.connected]
+    others += [counted(num_peers, "peer")] if num_peers else []
+    return LINK.passing(f"the session is open, with links to {', '.join(others) or 'nobody'}")
+
+
+def _gateway_finding(
+    session: zenoh.Session,
+    network: RouterNetwork,
+    prefix: str,
+    served: Sequence[str],
+    wanted: Sequence[str],
+) -> Finding:
+    missing = [name for name in wanted if name not in served]
+    if served and not missing:
+        return GATEWAY.passing(f"gateways serve {', '.join(map(safe_text, served))}")
+    absence = why_absent(session, network, prefix, missing, _ANSWER_S)
+    if absence is not None:
+        return GATEWAY.failing(absence.reason, absence.remedy)
+    return GATEWAY.failing(
+        no_gateway_on_zenoh(prefix, wanted, served).partition("; ")[0],
+        "Check that it runs with this prefix. Multicast finds only computers in the same network: for "
+        "others, name the address of a router with --connect.",
+    )
+
+
+def _carried_finding(link: str, keys: Sequence[str]) -> Finding:
+    more = f" and {len(keys) - _MAX_KEYS} more" if len(keys) > _MAX_KEYS else ""
+    return Check("zenoh", "carried").note(f"{link}: {', '.join(keys[:_MAX_KEYS]) or 'nothing'}{more}")
 
 
 def _served(session: zenoh.Session, prefix: str) -> list[str]:
@@ -107,26 +117,36 @@ def _gateways(session: zenoh.Session, prefix: str) -> set[str]:
     return {str(each.replier_id.zid) for each in replies if each.ok is not None and each.replier_id}
 
 
-def _check_data(
-    client: GatewayClient, reports: Mapping[str, SourceReport], wanted: Sequence[str], seconds: float
-) -> Iterator[Finding]:
+def _check_data(address: GatewayAddress, wanted: Sequence[str], seconds: float) -> Iterator[Finding]:
     """Receive for ``seconds``, fetch what is missing, and check each source."""
     reception = Messages(lambda *_: None)
-    with contextlib.closing(client.subscribe(wanted, None, reception, complete=True)) as subscriber:
-        end_s = time.monotonic() + seconds
-        while time.monotonic() < end_s:
-            time.sleep(_POLL_S)
-            subscriber.tick()
-        refill = reception.refill
-        if refill is not None:
-            refill.end()
-            end_s = time.monotonic() + _REFILL_S
-            while refill.num_incomplete and time.monotonic() < end_s:
-                time.sleep(_POLL_S)
+    try:
+        with GatewayClient(address) as client:
+            found = client.sources()
+            if found.absence:
+                yield Check("lcm" if address.is_lcm else "zenoh", "gateway").problem(found.absence)
+                return
+            with contextlib.closing(client.subscribe(wanted, None, reception, complete=True)) as subscriber:
+                _receive(subscriber, reception, seconds)
+    except (OutputError, QueryError) as error:
+        yield Check("lcm" if address.is_lcm else "zenoh", "link").problem(str(error))
+        return
+    reports = {each.name: each for each in found.sources}
     received = {source.name: source for source in reception.sources_now}
     for name in wanted or reports:
-        report = reports.get(name, SourceReport(name))
-        yield _data_finding(report, received.get(name), seconds)
+        yield _data_finding(reports.get(name, SourceReport(name)), received.get(name), seconds)
+
+
+def _receive(subscriber: GatewaySubscriber, reception: Messages, seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        time.sleep(_POLL_S)
+        subscriber.tick()
+    if (refill := reception.refill) is not None:
+        refill.end()
+        end_s = time.monotonic() + _REFILL_S
+        while refill.num_incomplete and time.monotonic() < end_s:
+            time.sleep(_POLL_S)
 
 
 def _data_finding(report: SourceReport, source: Source | None, seconds: float) -> Finding:
@@ -149,21 +169,11 @@ def _data_finding(report: SourceReport, source: Source | None, seconds: float) -
     if not num_missed:
         return check.passing(f"{amount}, none missing")
     fetched = "all of them" if not num_lost else str(num_refilled) if num_refilled else "none of them"
-    found = f"{amount}; {num_missed} are missing, of which the history of the gateway has {fetched}"
+    cause = "A link or a program on the way is too slow now and then."
     if num_missed > _THINNED_SHARE * (num_messages + num_lost):
-        cause = "Either a router thins them out (downsampling), or a link is much too slow"
-    else:
-        cause = "A link or a program on the way is too slow now and then"
-    where = ""
-    if report.routers:
-        where = f"the way is {' → '.join(report.routers)}; run this at each of them to see where it begins"
+        cause = "A router thins them out (downsampling), or a link is much too slow."
+    where = f" Run this at each of {' → '.join(report.routers)} to see which." if report.routers else ""
     return check.warning(
-        found,
-        " ".join(
-            [
-                f"{cause}.",
-                *([as_sentence(where)] if where else []),
-                "Programs that must miss nothing fetch it: record, or complete=True in Python.",
-            ]
-        ),
+        f"{amount}; {num_missed} are missing, of which the gateway's history has {fetched}",
+        f"{cause}{where} Programs that must miss nothing fetch them: record, or complete=True in Python.",
     )

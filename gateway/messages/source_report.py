@@ -108,8 +108,6 @@ class SourceReport:
     name: str
     gateway: str = ""
     """The id of the gateway's Zenoh session, if the status came from there."""
-    routers: Sequence[str] | None = None
-    """The names of the Zenoh routers between, the gateway's first; None if they are not known."""
     problem: str = ""
     server: str = ""
     """HOST:PORT."""
@@ -125,6 +123,8 @@ class SourceReport:
     translation_m: Sequence[float] = ()
     streams: Sequence[StreamReport] = ()
     outputs: Sequence[OutputReport] = ()
+    routers: Sequence[str] | None = None
+    """The names of the Zenoh routers between, the gateway's first; None if they are not known."""
 
     @property
     def text(self) -> str:

@@ -94,8 +94,8 @@ def _gateway_finding(sources: Sequence[str], missing: Sequence[str], absence: Ab
         return GATEWAY.passing(f"a gateway serves {', '.join(sources)}")
     if absence is not None and absence.is_hidden:
         return GATEWAY.failing(absence.reason, absence.remedy)
-    reason = absence.reason if absence else "if one is running, check its zenoh.prefix"
-    return GATEWAY.not_tested(f"found no gateway that serves {', '.join(missing)}; {reason}")
+    default = f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix"
+    return GATEWAY.not_tested(absence.reason if absence else default)
 
 
 def leaves_host(settings: ZenohSettings) -> bool:

@@ -2,17 +2,18 @@
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from operator import sub
 from typing import Final, NamedTuple
 
 import zenoh
 
 from gateway.logs.safe_text import safe_text
 from gateway.outputs.findings import Check, Finding
-from gateway.outputs.zenoh.routers import ROUTERS, Router, RouterNetwork
+from gateway.outputs.zenoh.routers import ROUTERS, Dropped, Router, RouterNetwork
 
-_ROUTERS: Final = Check("zenoh", "routers")
+_ROUTERS, _LINKS = Check("zenoh", "routers"), Check("zenoh", "links")
 
 _OLDEST: Final = (1, 9)
 """The first version with regions. Older routers do not pass on everything that newer ones announce."""
@@ -47,8 +48,8 @@ def check_routers(network: RouterNetwork) -> list[Finding]:
     reached = network.reachable_from(first)
     findings += [
         _ROUTERS.warning(
-            f"the routers {network.name_of(first)} and {network.name_of(zid)} have no link with each other, so "
-            "subscribers of one do not get what gateways publish at the other",
+            f"the routers {network.name_of(first)} and {network.name_of(zid)} have no link with each other, "
+            "so subscribers of one do not get what gateways publish at the other",
             "Name one of them in connect/endpoints of the other. Routers do not look for each other.",
         )
         for zid in others
@@ -94,16 +95,16 @@ def why_absent(
                 f"liveliness_query and the other messages for {prefix}/** to this computer.",
                 is_hidden=True,
             )
+    what = f"gateway that serves {', '.join(map(safe_text, sources))}" if sources else "gateway"
     if network.silent:
         return Absence(
-            f"no gateway is found behind {', '.join(network.silent)}",
-            "Check that the gateway runs and that the access control of the router lets this computer see "
-            f"{prefix}/**.",
+            f"found no {what} behind {', '.join(network.silent)}, whose access control may hide it",
+            f"Check that the gateway runs, and that this computer may use {prefix}/** there.",
         )
     alone = [router.name for router in network.routers.values() if not router.routers]
     if alone and len(alone) == len(network.routers):
         return Absence(
-            f"no gateway is connected to {', '.join(alone)}, and it has no link with another router",
+            f"no {what} is connected to {', '.join(alone)}, which has no link with another router",
             "If the gateway is at another site, name that site's router in connect/endpoints of this one. "
             "Otherwise, check that the gateway runs and connects to this router.",
         )
@@ -128,6 +129,39 @@ def carried(
         }
         found.append((f"{router.name} → {next_router.name}", sorted(keys)))
     return found
+
+
+def check_links(before: RouterNetwork, after: RouterNetwork, gateways: Iterable[str]) -> list[Finding]:
+    """Check what the routers dropped meanwhile on the ways from ``gateways`` to the session: see Dropped.
+
+    Returns [] if they do not count.
+    """
+    findings = {}
+    for gateway in gateways:
+        way = after.way_from(gateway) or []
+        for router, next_zid in zip(way, [*(each.zid for each in way[1:]), after.own], strict=True):
+            former = before.routers.get(router.zid, router).dropped.get(next_zid)
+            dropped = router.dropped.get(next_zid)
+            if former is None or dropped is None:
+                continue
+            is_here = next_zid == after.own
+            link = f"{router.name} → {'this computer' if is_here else after.name_of(next_zid)}"
+            findings[link] = _link_finding(link, Dropped(*map(sub, dropped, former)))
+    return [*findings.values()]
+
+
+def _link_finding(link: str, dropped: Dropped) -> Finding:
+    thinned = f"{dropped.thinned} messages left out by the router's rules" if dropped.thinned else ""
+    if dropped.congested > 0:
+        return _LINKS.warning(
+            f"{link}: {dropped.congested} messages dropped, because the link is too slow"
+            + (f"; {thinned}" if thinned else ""),
+            "Let less cross it (max_rate_hz of the gateway, downsampling or access control of the router), "
+            "or make it faster.",
+        )
+    if thinned:
+        return _LINKS.note(f"{link}: {thinned} (downsampling, low_pass_filter)")
+    return _LINKS.passing(f"{link}: nothing dropped")
 
 
 class _Answer(NamedTuple):

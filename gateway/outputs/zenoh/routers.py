@@ -6,6 +6,7 @@ A router answers queries on ``@/ZID/router`` about itself and its connections: z
 
 import json
 from collections import deque
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import zenoh
@@ -13,18 +14,31 @@ import zenoh
 from gateway.logs.safe_text import safe_text
 
 ROUTERS: Final = "@/*/router"
-"""What to query for the descriptions of all routers."""
+DESCRIPTIONS: Final = f"{ROUTERS}?_stats=true"
+"""What to query for the descriptions of all routers, with what they count if they do."""
 
 _MAX_ROUTERS: Final = 64
 _MAX_ANSWER_BYTES: Final = 1024 * 1024
 """A router with 1000 connections describes itself in 0.3 MB."""
 
 
+class Dropped(NamedTuple):
+    """How many messages a router has not sent to another side of a link, since the link was opened.
+
+    ``congested``: they were published faster than the link takes them. ``thinned``: rules for the rate or
+    the size of messages (downsampling, low_pass_filter) leave them out.
+    """
+
+    congested: int
+    thinned: int
+
+
 class Router(NamedTuple):
     """A router. ``name`` is ``metadata.name`` of its configuration, or an address, or its Zenoh id.
 
     ``routers`` and ``others`` are the Zenoh ids of the routers, and of the peers and clients, that are
-    connected to it.
+    connected to it. ``dropped`` is by the Zenoh id of the other side; only a zenohd that was built with
+    ``--features zenoh/stats`` counts.
     """
 
     zid: str
@@ -32,6 +46,7 @@ class Router(NamedTuple):
     version: str
     routers: frozenset[str]
     others: frozenset[str]
+    dropped: Mapping[str, Dropped]
 
 
 class RouterNetwork:
@@ -40,6 +55,8 @@ class RouterNetwork:
     def __init__(self, session: zenoh.Session) -> None:
         self._peers = {str(zid) for zid in session.info.peers_zid()}
         self._addresses = _addresses(session)
+        self.own = str(session.info.zid())
+        """The Zenoh id of the session."""
         self.connected: tuple[str, ...] = tuple(self._addresses)
         """The Zenoh ids of the routers to which the session is connected."""
         self.routers: dict[str, Router] = {}
@@ -60,7 +77,7 @@ class RouterNetwork:
 
     def _router(self, description: Any) -> Router:
         zid = str(description["zid"])
-        others = [(str(each["peer"]), each["whatami"]) for each in description["sessions"]]
+        links = {str(each["peer"]): each for each in description["sessions"]}
         metadata = description.get("metadata")
         names = [metadata.get("name") if isinstance(metadata, dict) else None, self._addresses.get(zid)]
         name = next((each for each in [*names, *description["locators"]] if each), zid[:8])
@@ -68,8 +85,9 @@ class RouterNetwork:
             zid,
             safe_text(str(name), 64),
             safe_text(str(description["version"]).partition("-")[0].removeprefix("v"), 32),
-            frozenset(each for each, mode in others if mode == "router"),
-            frozenset(each for each, mode in others if mode != "router"),
+            frozenset(peer for peer, link in links.items() if link["whatami"] == "router"),
+            frozenset(peer for peer, link in links.items() if link["whatami"] != "router"),
+            {peer: _dropped(link["stats"]) for peer, link in links.items() if "stats" in link},
         )
 
     def name_of(self, zid: str) -> str:
@@ -123,9 +141,14 @@ def read_routers(session: zenoh.Session, timeout_s: float) -> RouterNetwork:
     """Return the routers that answer within ``timeout_s``. It takes as long only if one does not."""
     network = RouterNetwork(session)
     if network.connected:
-        for reply in session.get(ROUTERS, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s):
+        for reply in session.get(DESCRIPTIONS, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s):
             network.add(reply)
     return network
+
+
+def _dropped(counts: Any) -> Dropped:
+    thinned = counts["tx_downsampler_dropped_msgs"] + counts["tx_low_pass_dropped_msgs"]
+    return Dropped(int(counts["tx_n_dropped"]), int(thinned))
 
 
 def _addresses(session: zenoh.Session) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Why a TLS connection to a Zenoh endpoint fails: Zenoh itself only says that it does."""
 
+import contextlib
 import json
 import re
 import socket
@@ -38,9 +39,8 @@ def tls_problem(endpoint: str, config: zenoh.Config) -> str:
             context.wrap_socket(connection, server_hostname=host) as channel,
         ):
             channel.settimeout(_ALERT_S)
-            channel.recv(1)
-    except TimeoutError:
-        return ""  # the router waits for Zenoh's first message
+            with contextlib.suppress(TimeoutError):  # the router waits for Zenoh's first message
+                channel.recv(1)
     except OSError as error:
         return _connection_problem(error, f"{host}:{port}")
     return ""
@@ -58,20 +58,21 @@ def _connection_problem(error: OSError, where: str) -> str:
     match error:
         case ssl.SSLCertVerificationError():
             return (
-                f"the certificate of {where} is not accepted: {error.verify_message}; the router's certificate "
-                "must come from the authority in root_ca_certificate, be valid today and contain the name or "
-                "address in the endpoint"
+                f"the certificate of {where} is not accepted: {error.verify_message}; the router's "
+                "certificate must come from the authority in root_ca_certificate, be valid today and contain "
+                "the name or address in the endpoint"
             )
         case ssl.SSLError() if "ALERT" in (error.reason or ""):
             return (
-                f"{where} refuses this computer's certificate: {_reason(error)}; connect_certificate must come "
-                "from the authority that the router trusts and be valid today"
+                f"{where} refuses this computer's certificate: {_reason(error)}; connect_certificate must "
+                "come from the authority that the router trusts and be valid today"
             )
-        case ssl.SSLError():
-            return f"{where} does not speak TLS: {_reason(error)}; correct the port, or use a tcp/ endpoint"
+        case ssl.SSLError() | TimeoutError():
+            return f"{where} does not answer with TLS: {_reason(error)}; correct the endpoint"
         case _:
             return f"{where}: {error.strerror or error}; start the router, or correct the address"
 
 
-def _reason(error: ssl.SSLError) -> str:
-    return (error.reason or str(error)).lower().replace("_", " ")
+def _reason(error: OSError) -> str:
+    reason = error.reason if isinstance(error, ssl.SSLError) else None
+    return (reason or str(error)).lower().replace("_", " ")
