@@ -6,7 +6,7 @@ import struct
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
@@ -118,6 +118,8 @@ class Source:
         """How many ``parameters_t`` were made of the parameters from Zenoh."""
         self.running_take: str | None = None
         """The name of the take that its gateway records; "" if none, None if it is not known."""
+        self.routers: Sequence[str] | None = None
+        """The names of the Zenoh routers between, the gateway's first; None if they are not known."""
         self.has_answer = False
         """Whether a gateway has answered the query for the parameters, or published them."""
         self.series_by_key: dict[str, Any] = {}

@@ -4,7 +4,8 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from gateway.client.completion import HistoryAnswer, HistoryRequest
@@ -71,6 +72,12 @@ class FoundSources:
         """Add sources whose gateways do not answer."""
         for name in names:
             self.add(SourceReport(safe_text(name), problem=NO_ANSWER))
+
+    def add_routers(self, way_from: Callable[[str], Sequence[str] | None]) -> None:
+        """Add to each source what ``way_from`` returns for its gateway: see SourceReport.routers."""
+        for identity, source in self._sources.items():
+            if source.gateway:
+                self._sources[identity] = replace(source, routers=way_from(source.gateway))
 
     def add(self, source: SourceReport) -> None:
         """Add a source, or replace what an earlier status said about it."""
@@ -267,6 +274,9 @@ class GatewaySubscriber(ABC):
     @abstractmethod
     def query_takes(self, source: Source) -> None:
         """Query which take the gateway of a source records; see Source.running_take."""
+
+    def query_routers(self) -> None:  # noqa: B027 - there are none on LCM
+        """Query now and then which routers are between gateways and here: Source.routers. Call it often."""
 
     @abstractmethod
     def silence(self) -> str:

@@ -1,9 +1,11 @@
 """Gateways on Zenoh: asking one source or all until there is a reply, and receiving what they publish."""
 
 import json
+import math
 import re
 import time
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any, Final
 from urllib.parse import unquote
 
@@ -30,6 +32,7 @@ from gateway.messages.decode import TEXT
 from gateway.messages.history import unpack_messages
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
 from gateway.outputs.kind import DISCOVERY_S
+from gateway.outputs.zenoh.routers import DESCRIPTIONS, RouterNetwork, read_routers
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
@@ -71,6 +74,7 @@ class ZenohTransport(Transport):
                 found.add_silent(sorted(silent))
                 break
             time.sleep(RETRY_S)
+        found.add_routers(read_routers(self._session, _STATUS_S).names_from)
         return found
 
     def _served(self) -> list[str]:
@@ -199,6 +203,8 @@ class ZenohTransport(Transport):
 
 
 _QUERY_S: Final = 1.0
+_KNOWN_S: Final = 5.0
+"""When to query again which routers are between, if that is known."""
 
 _SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,24}")
 _NO_KEYS: Final = {"c3d", "recording", "take"}
@@ -223,6 +229,9 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         super().__init__(prefix, reception, completeness)
         self._session = session
         self._sources = sources
+        self._network = RouterNetwork(session)
+        self._gateways: dict[Source, str] = {}  # the Zenoh ids of their gateways
+        self._queried_s = -math.inf  # when routers were queried
         for name in served_sources(session, prefix):
             if _SOURCE_NAME.fullmatch(name) and (not sources or name in sources):
                 self._source(name)
@@ -316,6 +325,26 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
                 self._reception.answered_takes(source, reply.ok.payload.to_bytes())
 
         self._get(source, "take", take)
+
+    def query_routers(self) -> None:
+        """See GatewaySubscriber. It takes what the queries before have found."""
+        sources = self._reception.sources_now
+        is_known = all(source.routers is not None for source in sources)
+        now_s = time.monotonic()
+        if now_s - self._queried_s < (_KNOWN_S if is_known else _QUERY_S):
+            return
+        self._queried_s = now_s
+        for source in sources:
+            if source in self._gateways:
+                source.routers = self._network.names_from(self._gateways[source])
+            self._get(source, "status", partial(self._take_gateway, source))
+        self._network = RouterNetwork(self._session)
+        if self._network.connected:
+            self._session.get(DESCRIPTIONS, self._network.add, timeout=_QUERY_S)
+
+    def _take_gateway(self, source: Source, reply: zenoh.Reply) -> None:
+        if reply.ok is not None and reply.replier_id is not None:
+            self._gateways[source] = str(reply.replier_id.zid)
 
     def _get(self, source: Source, key: str, on_reply: Callable[[zenoh.Reply], None]) -> None:
         self._session.get(zenoh_key(self._prefix, source.name, key), on_reply, timeout=_QUERY_S)

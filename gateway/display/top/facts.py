@@ -210,6 +210,7 @@ def source_facts(source: LiveSource) -> dict[str, Any]:
         "server": report.server,
         "host": report.host,
         "gateway_version": report.version,
+        "routers": None if source.routers is None else [*source.routers],
         "state": found.text,
         "level": _LEVELS[found.level],
         "status_age_s": source.status_age_s,

@@ -51,7 +51,8 @@ def overview(sources: Sequence[LiveSource]) -> Table:
     sections = []
     for source in sources:
         state = facts.state(source)
-        heading = [(f"{_name(source)}: {state.text}", _LEVEL_STYLES[state.level])]
+        way = f", by {' → '.join(source.routers)}" if source.routers else ""
+        heading = [(f"{_name(source)}: {state.text}{way}", _LEVEL_STYLES[state.level])]
         if facts.has_two_gateways(source):
             heading.append((TWO_GATEWAYS, Style.BAD))
         rows = [_component_row(each) for each in facts.components(source)]
