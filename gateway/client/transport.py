@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-from gateway.client.completion import HistoryAnswer, HistoryRequest
+from gateway.client.completion import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SERIES, Reception, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
@@ -185,27 +185,24 @@ class TimeLimits:
         )
 
 
-class Completeness(NamedTuple):
-    """Whether to request what was missed; each series begins with the messages of ``last_s`` seconds."""
-
-    is_complete: bool = False
-    last_s: float | None = None
-
-
-INCOMPLETE: Final = Completeness()
-
-
 class GatewaySubscriber(ABC):
     """Hands what gateways publish to a Reception, sorted by source and key.
 
     An address is what a message arrives under: its key on Zenoh, or its channel on LCM.
     """
 
-    def __init__(self, prefix: str, reception: Reception[Any, Any], completeness: Completeness) -> None:
+    def __init__(
+        self,
+        prefix: str,
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        completeness: Completeness,
+    ) -> None:
         self._prefix = prefix
+        self._components = components
         self._reception = reception
-        if completeness.is_complete:
-            reception.complete(self._ask_history, completeness.last_s)
+        if completeness != INCOMPLETE:
+            reception.complete(self._ask_history, self._find_kept, completeness)
         self._series: dict[str, Series | None] = {}  # by address; None: left out
 
     # In the threads that receive.
@@ -249,8 +246,35 @@ class GatewaySubscriber(ABC):
     # In the threads that request what is missing.
 
     @abstractmethod
-    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """Request messages of a series, and return the answer. Raises QueryError."""
+
+    def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[Series]:
+        """Return the wanted series of which the gateway has messages of the last seconds; see FindSeries."""
+        try:
+            newest = {
+                str(key): int(facts["newest_utime"])
+                for key, facts in self._history_overview(source, timeout_s)["keys"].items()
+            }
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise QueryError("an answer about the history cannot be read", code="unreadable") from error
+        now_utime = max(newest.values(), default=0)  # on the gateway's clock: it sends a status every second
+        wanted = {*(self._components or ()), "status"}
+        found = [
+            self._kept_series(source, key)
+            for key, utime in newest.items()
+            if utime >= now_utime - 1e6 * last_s
+            and (self._components is None or key.partition("/")[0] in wanted)
+        ]
+        return [series for series in found if series is not None]
+
+    @abstractmethod
+    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+        """Return what the history has of a source (docs/reference/queries.md). Raises QueryError."""
+
+    @abstractmethod
+    def _kept_series(self, source: Source, key: str) -> Series | None:
+        """Return the series of a key of the history, new or not; None if there are too many."""
 
     # In one other thread.
 

@@ -8,9 +8,11 @@ from hypothesis import given, note, settings
 from hypothesis import strategies as st
 
 from gateway.client.completion import (
+    COMPLETE,
     GRACE_S,
     NOBODY_S,
     PATIENCE_S,
+    Completeness,
     Completion,
     HeldBytes,
     HistoryAnswer,
@@ -30,10 +32,12 @@ class Network:
     ``handed_on`` has the run of the gateway and the number of each message.
     """
 
-    def __init__(self, window: int = 10**9, limit: int = 10**9, last_s: float | None = None) -> None:
+    def __init__(
+        self, window: int = 10**9, limit: int = 10**9, completeness: Completeness = COMPLETE
+    ) -> None:
         self.room = HeldBytes(limit)
         self.check = SequenceCheck(counts_first=True, max_listed=100)
-        self.completion = Completion(self._hand_on, self.check.end, self.room, last_s)
+        self.completion = Completion(self._hand_on, self.check, self.room, completeness)
         self.handed_on: list[tuple[int, int]] = []
         self.history: list[bytes] = []
         self.published: list[tuple[int, int]] = []
@@ -134,7 +138,7 @@ def test_everything_that_still_exists_comes_once_and_in_order(  # noqa: C901, PL
     events: list[str], window: int, limit: int, last_s: float | None
 ) -> None:
     """Whatever the network does: the numbers of each run grow, and what is missing is counted."""
-    network = Network(window, limit, last_s)
+    network = Network(window, limit, Completeness(is_complete=True, last_s=last_s))
     late: list[bytes] = []
     came_late: set[tuple[int, int]] = set()
     asked: tuple[HistoryRequest, HistoryAnswer | None] | None = None
@@ -371,7 +375,7 @@ def test_what_is_missing_at_the_end_is_counted() -> None:
 
 
 def test_the_last_seconds_come_before_the_first_message() -> None:
-    network = Network(last_s=1.0)
+    network = Network(completeness=Completeness(is_complete=True, last_s=1.0))
     for _ in range(20):
         network.publish()
     network.arrives(20)
