@@ -28,6 +28,10 @@ REPLY_S: Final = 2.0
 
 _MIN_REPLY_S: Final = 0.05
 
+_ESTIMATE_SHARE: Final = 0.3
+_SAFE_SHARE: Final = 0.5
+"""After which share of the patience it shows how much of the past will come; how much of that to count on."""
+
 _SILENCE_S: Final = 1.0
 """If nothing has arrived for longer, the connection was lost, and patience begins again."""
 
@@ -138,6 +142,7 @@ class Completion:
         self._fills_gaps, self._last_s = completeness.is_complete, completeness.last_s
         self._patience_s = math.inf if completeness.patience_s is None else completeness.patience_s
         self._past_until_s = math.inf  # when to give up the time before the first message
+        self._num_past = 0  # how many messages of it have come
         self._arrivals = SequenceCheck()  # of what arrives, in that order
         self._held: dict[int, bytes] = {}
         self._run = 0
@@ -290,6 +295,9 @@ class Completion:
         if answer.is_whole:
             last = answer.last if request.last is None else min(answer.last, request.last)
             self._skip_to(last + 1)
+        if self.is_past and self._patience_s < math.inf:
+            self._num_past += len(numbered)
+            self._shorten_past(now_s)
         has_helped = self._next != former
         if not has_helped and request.known is not None:
             self._next_utime = None  # the known message may be so long that an answer has only that
@@ -331,6 +339,25 @@ class Completion:
                 self._hand_on(self._release(each))
             self._next, self._next_utime = number, None
 
+    def _shorten_past(self, now_s: float) -> None:
+        """Leave out the beginning of the past if all of it would take too long.
+
+        What is missing directly before the live messages would be worse for a display.
+        """
+        left_s = max(self._past_until_s - now_s, 0.0)
+        taken_s = self._patience_s - left_s
+        if self._next is None or taken_s < _ESTIMATE_SHARE * self._patience_s:
+            return
+        num_possible = int(self._num_past * left_s / taken_s)
+        first = min(self._held, default=self._until + 1)
+        if first - self._next > num_possible:
+            self._skip_past(first - int(_SAFE_SHARE * num_possible))
+
+    def _skip_past(self, number: int) -> None:
+        """Go on at a number, of the past or the first that is live: nobody has missed those before it."""
+        self._check.skip(number)
+        self._skip_to(number)
+
     def fail(self, request: HistoryRequest, code: str, text: str, now_s: float) -> None:
         """Take the error of a request: the code of the gateway, or no-gateway if nobody takes requests."""
         if request.run != self._run or self._passes_on:
@@ -365,9 +392,7 @@ class Completion:
             self._next = min(self._held, default=None)
         else:
             first = min(self._held, default=self._until + 1)
-            if self.is_past:  # nobody has missed it
-                self._check.skip(first)
-            self._skip_to(first)
+            (self._skip_past if self.is_past else self._skip_to)(first)
         self.due_s = math.inf
         self._look(now_s)
         self._end_past()
