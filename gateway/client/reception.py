@@ -250,8 +250,10 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
             series = source.series_by_key[key] = self._new_series(source, key, free)
             self._num_series += 1
-            if self.refill is not None and self._completes(series):
-                series.completion = self.refill.add(series, partial(self._hand_on, series))
+            if self.refill is not None:
+                self.refill.begin(source)
+                if self._completes(series):
+                    series.completion = self.refill.add(series, partial(self._hand_on, series))
         return series
 
     def receive(self, series: SeriesT, message: bytes) -> None:

@@ -73,15 +73,25 @@ class Refill:
         self._completions[series] = completion
         return completion
 
-    def check(self, series: "Series") -> None:
-        """Note that there is something to request of a series."""
-        due = self._due.get(series.source)
+    def begin(self, source: "Source") -> None:
+        """Note that there is a source, which may have had messages in the last seconds."""
+        if self.completeness.last_s is not None:
+            self._due_of(source)
+
+    def _due_of(self, source: "Source") -> "dict[Series, Completion]":
+        """Return the series of a source of which something is to be requested, by a thread of the source."""
+        due = self._due.get(source)
         if due is None:
             due = {}
-            thread = threading.Thread(target=self._run, args=(series.source, due), name="refill", daemon=True)
+            thread = threading.Thread(target=self._run, args=(source, due), name="refill", daemon=True)
             with contextlib.suppress(RuntimeError):  # without a thread now, the next message tries again
                 thread_starts.start(thread)
-                self._due[series.source] = due
+                self._due[source] = due
+        return due
+
+    def check(self, series: "Series") -> None:
+        """Note that there is something to request of a series."""
+        due = self._due_of(series.source)
         if series not in due:
             due[series] = self._completions[series]
             self._changed.notify_all()

@@ -1,5 +1,6 @@
 """Filling gaps from the gateway's history, against a model of the gateway and of the network between."""
 
+import itertools
 import math
 from typing import Final
 
@@ -383,3 +384,98 @@ def test_the_last_seconds_come_before_the_first_message() -> None:
     assert network.completion.request().options == {"last_s": "1.000"}
     network.ask_all()
     assert network.numbers == [*range(15, 21)]
+
+
+DISPLAY: Final = Completeness(last_s=1.0, patience_s=1.0)
+"""What a display wants: the last seconds if they come at once, and then the newest messages."""
+
+
+def test_a_display_gets_the_last_seconds_and_then_what_arrives() -> None:
+    """A gap later is shown as lost, and holds up nothing."""
+    network = Network(completeness=DISPLAY)
+    network.arrives(20)
+    network.ask_all()
+    assert network.numbers == [*range(15, 21)]
+    network.arrives(23)
+    assert network.completion.due_s == math.inf
+    assert network.numbers == [*range(15, 21), 23]
+    assert network.check.num_lost == 2
+    network.restart()
+    network.arrives(0)
+    assert network.handed_on[-1] == (1, 0)
+
+
+@pytest.mark.parametrize("is_complete", [False, True])
+def test_a_history_that_does_not_answer_delays_a_display_by_its_patience(is_complete: bool) -> None:
+    """No more than once, and nothing counts as lost: nobody has missed what was before."""
+    network = Network(completeness=DISPLAY._replace(is_complete=is_complete))
+    begin_s = network.now_s
+    network.arrives(20)
+    while not network.handed_on:
+        assert network.completion.reply_s(network.now_s) <= begin_s + 1.0 - network.now_s + 0.06
+        network.now_s += 0.25
+        network.arrive(network.publish())
+    assert network.now_s == begin_s + 1.0
+    assert network.numbers == [*range(20, 25)]
+    network.arrive(network.publish())
+    assert network.numbers == [*range(20, 26)]
+    assert network.completion.due_s == math.inf
+    assert network.check.num_lost == 0
+
+
+def test_a_complete_display_waits_for_a_gap_no_longer_than_its_patience() -> None:
+    network = Network(completeness=Completeness(is_complete=True, patience_s=1.0))
+    network.arrives(0)
+    network.arrives(5)
+    network.completion.expire(network.now_s + 0.9)
+    assert network.numbers == [0]
+    network.completion.expire(network.now_s + 1.1)
+    assert network.numbers == [0, 5]
+    assert network.check.num_lost == 4
+
+
+def test_the_last_seconds_of_a_key_that_is_silent_now() -> None:
+    """An event of some seconds ago, of which nothing arrives that would show that there was one."""
+    network = Network(completeness=DISPLAY)
+    for _ in range(10):
+        network.publish()
+    network.completion.begin(network.now_s)
+    assert network.completion.due_s == network.now_s
+    network.ask_all()
+    assert network.numbers == [*range(4, 10)]
+    network.arrive(network.publish())
+    assert network.numbers == [*range(4, 11)]
+    assert not network.completion.is_past
+
+
+def test_of_a_silent_key_without_an_answer_the_first_message_is_handed_on_at_once() -> None:
+    network = Network(completeness=DISPLAY)
+    network.completion.begin(network.now_s)
+    network.completion.expire(network.now_s + 1.0)
+    assert network.completion.due_s == math.inf
+    network.arrives(7)
+    assert network.numbers == [7]
+
+
+def test_if_the_last_seconds_take_too_long_their_end_is_there_and_no_gap_follows() -> None:
+    """A plot would begin again at a gap, and show nothing."""
+    network = Network(completeness=DISPLAY)
+    for _ in range(1000):
+        network.publish()
+    network.arrive(network.publish())
+
+    def find(request: HistoryRequest) -> HistoryAnswer:
+        first = int(request.options.get("from", 0))
+        last = min(first + 19, int(request.options.get("to", 1000)))
+        return HistoryAnswer(network.history[first : last + 1], first, last, 1000)
+
+    while network.completion.is_past:
+        network.now_s += 0.05
+        request = network.completion.request()
+        network.completion.answer(request, find(request), network.now_s)
+        assert network.now_s < 101
+    numbers = network.numbers
+    [begin] = [after for before, after in itertools.pairwise(numbers) if after != before + 1]
+    assert 100 < 1000 - begin < 300
+    assert numbers[-1] == 1000
+    assert network.check.num_lost == 0
