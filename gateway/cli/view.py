@@ -51,7 +51,7 @@ def view(
     complete: Annotated[
         bool,
         typer.Option(
-            "--complete", help="Fill gaps from the gateway's history; live data wait up to 1 s for it."
+            "--complete", help="Fill gaps from the gateway's history; newer data wait for that, at most 1 s."
         ),
     ] = False,
     host: Annotated[
