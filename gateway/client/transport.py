@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from gateway.client.completion import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
-from gateway.client.reception import FINGERPRINTS, MAX_SERIES, Reception, Series, Source
+from gateway.client.reception import FINGERPRINTS, MAX_SERIES, POSE, TYPES_BY_KEY, Reception, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
@@ -102,6 +102,9 @@ RETRY_S: Final = 0.5
 """How long to wait before repeating a query that got no reply, or came while there were too many."""
 
 _CLOSE_S: Final = 0.5
+
+_MAX_KEY_CHARACTERS: Final = 512
+"""Gateways accept no longer keys in queries, and Zenoh panics above 64 kB."""
 
 ReceivedT = TypeVar("ReceivedT")
 
@@ -251,21 +254,8 @@ class GatewaySubscriber(ABC):
 
     def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[Series]:
         """Return the wanted series of which the gateway has messages of the last seconds; see FindSeries."""
-        try:
-            newest = {
-                str(key): int(facts["newest_utime"])
-                for key, facts in self._history_overview(source, timeout_s)["keys"].items()
-            }
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise QueryError("an answer about the history cannot be read", code="unreadable") from error
-        now_utime = max(newest.values(), default=0)  # on the gateway's clock: it sends a status every second
-        wanted = {*(self._components or ()), "status"}
-        found = [
-            self._kept_series(source, key)
-            for key, utime in newest.items()
-            if utime >= now_utime - 1e6 * last_s
-            and (self._components is None or key.partition("/")[0] in wanted)
-        ]
+        keys = recent_keys(self._history_overview(source, timeout_s), self._components, last_s)
+        found = [self._kept_series(source, key) for key in keys]
         return [series for series in found if series is not None]
 
     @abstractmethod
@@ -333,6 +323,27 @@ class Transport(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the connection."""
+
+
+def recent_keys(overview: Mapping[str, Any], components: Collection[str] | None, last_s: float) -> list[str]:
+    """Return the keys of these components (None: all) of which a history has messages of the last seconds.
+
+    Raises QueryError if the overview cannot be read.
+    """
+    try:
+        newest = {str(key): int(facts["newest_utime"]) for key, facts in overview["keys"].items()}
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise QueryError("an answer about the history cannot be read", code="unreadable") from error
+    begin_utime = max(newest.values(), default=0) - 1e6 * last_s  # a gateway publishes a status every second
+    wanted = {*TYPES_BY_KEY, "6d"} if components is None else {*components, "status"}
+    return [
+        key
+        for key, utime in newest.items()
+        if utime >= begin_utime
+        and key.partition("/")[0] in wanted
+        and (key in TYPES_BY_KEY or key.startswith(POSE))
+        and len(key) <= _MAX_KEY_CHARACTERS
+    ]
 
 
 def history_answer(

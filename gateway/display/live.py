@@ -402,7 +402,6 @@ class LiveData(QueuedReception[LiveSource]):
         waiting = {series for series in self.all_series if series.is_past}
         for arrival in self.take_waiting():
             self._past.setdefault(arrival.series, []).append(arrival)
-        waiting.update(series for series in self._past if series.is_past)
         if (
             waiting
             and sum(len(each.message) for all_ in self._past.values() for each in all_) > MAX_WAITING_BYTES

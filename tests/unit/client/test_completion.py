@@ -423,6 +423,15 @@ def test_a_history_that_does_not_answer_delays_a_display_by_its_patience(is_comp
     assert network.check.num_lost == 0
 
 
+def test_what_is_missing_in_what_waited_for_the_past_holds_up_nothing() -> None:
+    network = Network(completeness=DISPLAY)
+    network.arrives(20)
+    network.arrives(22)
+    network.completion.expire(network.now_s + 1.0)
+    assert network.numbers == [20, 22]
+    assert network.check.num_lost == 1
+
+
 def test_a_complete_display_waits_for_a_gap_no_longer_than_its_patience() -> None:
     network = Network(completeness=Completeness(is_complete=True, patience_s=1.0))
     network.arrives(0)
