@@ -40,6 +40,11 @@ class QueuedSeries(Series):
         """How many of them came after the last one that could be."""
         self._num_lost = 0
 
+    @property
+    def is_past(self) -> bool:
+        """Whether what is taken now ``is_past``; see Arrival."""
+        return self.completion is not None and self.completion.is_past
+
     def new_losses(self) -> int:
         """Return how many messages are missing before the one that was counted last."""
         before, self._num_lost = self._num_lost, self.check.num_lost
@@ -47,12 +52,17 @@ class QueuedSeries(Series):
 
 
 class Arrival(NamedTuple):
-    """A message of a component, when it arrived on this host's clock, and how many are missing before it."""
+    """A message of a component.
+
+    ``arrived_utime`` is when it arrived, on this host's clock; ``gap`` is how many are missing before it. One
+    that ``is_past`` was published before the subscriber began, or has waited for such messages.
+    """
 
     series: QueuedSeries
     message: bytes
     arrived_utime: int
     gap: int
+    is_past: bool = False
 
 
 class DescribedSource(Source):
@@ -187,7 +197,7 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         if series.key not in COMPONENTS_BY_KEY:
             return
         gap = series.new_losses()
-        series.newest = arrival = Arrival(series, message, now_utime(), gap)
+        series.newest = arrival = Arrival(series, message, now_utime(), gap, series.is_past)
         if not self.is_queueing:
             return
         self._waiting.append(arrival)

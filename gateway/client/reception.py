@@ -12,8 +12,8 @@ from typing import Any, Final, Generic, TypeVar
 
 import rtc3d
 
-from gateway.client.completion import Completion
-from gateway.client.refill import Ask, Refill
+from gateway.client.completion import Completeness, Completion
+from gateway.client.refill import Ask, FindSeries, Refill
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES, MESSAGE_TYPES, NOT_PUBLISHED, VERSION_OFFSET
@@ -252,8 +252,10 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
             series = source.series_by_key[key] = self._new_series(source, key, free)
             self._num_series += 1
-            if self.refill is not None and self._completes(series):
-                series.completion = self.refill.add(series, partial(self._hand_on, series))
+            if self.refill is not None:
+                self.refill.begin(source)
+                if self._completes(series):
+                    series.completion = self.refill.add(series, partial(self._hand_on, series))
         return series
 
     def receive(self, series: SeriesT, message: bytes) -> None:
@@ -282,9 +284,9 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             series.count(message)
             self._take(series, message)
 
-    def complete(self, ask: Ask, last_s: float | None) -> None:
-        """Fill the gaps of all series from now on, with what ``ask`` returns; see Refill."""
-        self.refill = Refill(self, self._lock, ask, last_s)
+    def complete(self, ask: Ask, find: FindSeries, completeness: Completeness) -> None:
+        """Complete all series from now on, with what ``ask`` returns; see Refill."""
+        self.refill = Refill(self, self._lock, ask, find, completeness)
 
     def ignore(self, *, beyond_limit: bool) -> None:
         """Count a message that is left out."""

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-from gateway.client.completion import HistoryAnswer, HistoryRequest
-from gateway.client.reception import FINGERPRINTS, MAX_SERIES, Reception, Series, Source
+from gateway.client.completion import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.reception import FINGERPRINTS, MAX_SERIES, POSE, TYPES_BY_KEY, Reception, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
@@ -110,6 +110,9 @@ RETRY_S: Final = 0.5
 
 _CLOSE_S: Final = 0.5
 
+_MAX_KEY_CHARACTERS: Final = 512
+"""Gateways accept no longer keys in queries, and Zenoh panics above 64 kB."""
+
 ReceivedT = TypeVar("ReceivedT")
 
 
@@ -192,27 +195,24 @@ class TimeLimits:
         )
 
 
-class Completeness(NamedTuple):
-    """Whether to request what was missed; each series begins with the messages of ``last_s`` seconds."""
-
-    is_complete: bool = False
-    last_s: float | None = None
-
-
-INCOMPLETE: Final = Completeness()
-
-
 class GatewaySubscriber(ABC):
     """Hands what gateways publish to a Reception, sorted by source and key.
 
     An address is what a message arrives under: its key on Zenoh, or its channel on LCM.
     """
 
-    def __init__(self, prefix: str, reception: Reception[Any, Any], completeness: Completeness) -> None:
+    def __init__(
+        self,
+        prefix: str,
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        completeness: Completeness,
+    ) -> None:
         self._prefix = prefix
+        self._components = components
         self._reception = reception
-        if completeness.is_complete:
-            reception.complete(self._ask_history, completeness.last_s)
+        if completeness != INCOMPLETE:
+            reception.complete(self._ask_history, self._find_kept, completeness)
         self._series: dict[str, Series | None] = {}  # by address; None: left out
 
     # In the threads that receive.
@@ -256,8 +256,22 @@ class GatewaySubscriber(ABC):
     # In the threads that request what is missing.
 
     @abstractmethod
-    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """Request messages of a series, and return the answer. Raises QueryError."""
+
+    def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[Series]:
+        """Return the wanted series of which the gateway has messages of the last seconds; see FindSeries."""
+        keys = recent_keys(self._history_overview(source, timeout_s), self._components, last_s)
+        found = [self._kept_series(source, key) for key in keys]
+        return [series for series in found if series is not None]
+
+    @abstractmethod
+    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+        """Return what the history has of a source (docs/reference/queries.md). Raises QueryError."""
+
+    @abstractmethod
+    def _kept_series(self, source: Source, key: str) -> Series | None:
+        """Return the series of a key of the history, new or not; None if there are too many."""
 
     # In one other thread.
 
@@ -319,6 +333,27 @@ class Transport(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the connection."""
+
+
+def recent_keys(overview: Mapping[str, Any], components: Collection[str] | None, last_s: float) -> list[str]:
+    """Return the keys of these components (None: all) of which a history has messages of the last seconds.
+
+    Raises QueryError if the overview cannot be read.
+    """
+    try:
+        newest = {str(key): int(facts["newest_utime"]) for key, facts in overview["keys"].items()}
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise QueryError("an answer about the history cannot be read", code="unreadable") from error
+    begin_utime = max(newest.values(), default=0) - 1e6 * last_s  # a gateway publishes a status every second
+    wanted = {*TYPES_BY_KEY, "6d"} if components is None else {*components, "status"}
+    return [
+        key
+        for key, utime in newest.items()
+        if utime >= begin_utime
+        and key.partition("/")[0] in wanted
+        and (key in TYPES_BY_KEY or key.startswith(POSE))
+        and len(key) <= _MAX_KEY_CHARACTERS
+    ]
 
 
 def history_answer(

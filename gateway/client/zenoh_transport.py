@@ -1,23 +1,22 @@
 """Gateways on Zenoh: asking one source or all until there is a reply, and receiving what they publish."""
 
+import contextlib
 import json
 import math
 import re
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 from urllib.parse import unquote
 
 import zenoh
 
-from gateway.client.completion import BUSY_CODES, HistoryAnswer, HistoryRequest
+from gateway.client.completion import BUSY_CODES, INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
-from gateway.client.refill import REPLY_S
 from gateway.client.transport import (
-    INCOMPLETE,
+    MAX_STATUS_BYTES,
     RETRY_S,
-    Completeness,
     FoundSources,
     GatewaySubscriber,
     Query,
@@ -30,7 +29,14 @@ from gateway.client.transport import (
 from gateway.errors import ProtocolError, QueryError
 from gateway.messages.decode import TEXT
 from gateway.messages.history import unpack_messages
-from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
+from gateway.messages.topics import (
+    DEFAULT_LCM_PREFIX,
+    escape_key_chunk,
+    is_json_key,
+    lcm_channel,
+    unique_name,
+    zenoh_key,
+)
 from gateway.outputs.kind import DISCOVERY_S
 from gateway.outputs.zenoh.routers import DESCRIPTIONS, RouterNetwork, read_routers
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
@@ -226,7 +232,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         reception: Reception[Any, Any],
         completeness: Completeness,
     ) -> None:
-        super().__init__(prefix, reception, completeness)
+        super().__init__(prefix, components, reception, completeness)
         self._session = session
         self._sources = sources
         self._network = RouterNetwork(session)
@@ -258,8 +264,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             self._reception.ignore(beyond_limit=False)
             return None
         source = self._source(name)
-        names = (path,) if label is None else ("6d", label)
-        return source, path, "" if source is None else lcm_channel(source.channels, *names)
+        return source, path, "" if source is None else _channel(source, path)
 
     def _take(self, series: Series, message: bytes, sample: zenoh.Sample) -> None:
         if series.key != "parameters":
@@ -281,22 +286,43 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             float(age_s) if isinstance(age_s, int | float) and 0 <= age_s < 1e9 else 0.0,
         )
 
-    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """See GatewaySubscriber."""
         options = ";".join(f"{name}={value}" for name, value in request.options.items())
         selector = f"{zenoh_key(self._prefix, series.source.name)}/{series.key}?{options}"
+        sample = self._first_reply(selector, timeout_s)
+        try:
+            return history_answer(attached_facts(sample), unpack_messages(sample.payload.to_bytes()))
+        except ProtocolError as problem:
+            raise QueryError(str(problem), code="zenoh") from problem
+
+    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+        """See GatewaySubscriber."""
+        sample = self._first_reply(zenoh_key(self._prefix, source.name, "history"), timeout_s)
+        overview = None
+        if len(sample.payload) <= MAX_STATUS_BYTES:
+            with contextlib.suppress(ValueError, RecursionError):
+                overview = json.loads(sample.payload.to_bytes())
+        return overview if isinstance(overview, dict) else {}
+
+    def _kept_series(self, source: Source, key: str) -> Series | None:
+        """See GatewaySubscriber."""
+        path = "/".join(map(escape_key_chunk, key.split("/", 1)))
+        return self._reception.series(source, path, _channel(source, path))
+
+    def _first_reply(self, selector: str, timeout_s: float) -> zenoh.Sample:
+        """Return the first reply that is no error. Raises QueryError if there is none."""
         error = QueryError("no gateway keeps these messages", code="no-gateway")
         try:
             for reply in self._session.get(
-                selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=REPLY_S
+                selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s
             ):
                 if reply.ok is not None:
-                    messages = unpack_messages(reply.ok.payload.to_bytes())
-                    return history_answer(attached_facts(reply.ok), messages)
+                    return reply.ok
                 if reply.err is not None:
                     text = reply.err.payload.to_bytes().decode("utf-8", "replace")
                     error = QueryError(text, code=error_code(reply.err) or "timeout")
-        except (zenoh.ZError, ProtocolError) as problem:
+        except zenoh.ZError as problem:
             error = QueryError(str(problem), code="zenoh")
         raise error
 
@@ -355,6 +381,12 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
 
     def _close(self) -> None:
         self._session.close()
+
+
+def _channel(source: Source, path: str) -> str:
+    """Return the channel of a key below a source."""
+    is_pose = path.startswith(POSE)
+    return lcm_channel(source.channels, *(("6d", unquote(path.removeprefix(POSE))) if is_pose else (path,)))
 
 
 def attached_facts(sample: zenoh.Sample) -> dict[str, Any]:
