@@ -27,9 +27,9 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
-# What is slow by nature: attacks, browsers, installation, systemd, the examples in other languages, and the commands
-# in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging hostile docs languages benchmarks view site)
+# What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
+# commands in the documents.
+SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view site)
 
 test-slow: .venv/installed build/wheelhouse/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
