@@ -61,6 +61,7 @@ async def test_on_zenoh_a_subscriber_gets_the_very_messages_that_it_has_missed()
         overview = (await query(peer, "mocap/lab/history")).json
         assert overview["keys"]["3d"]["newest"] == 9
         assert 0 < overview["num_bytes"] <= overview["max_bytes"]
+        assert overview["num_found"] == {"zenoh": 15}
 
 
 @pytest.mark.netns
@@ -102,6 +103,7 @@ async def test_on_lcm_messages_are_sent_again_on_a_channel_of_their_own() -> Non
         assert again == found.messages
         assert "key= needs one of from=" in replies[1].error
         assert json.loads(replies[2].content)["keys"]["3d"]["newest"] == 9
+        assert json.loads(replies[2].content)["num_found"] == {"lcm": 3}
 
 
 async def test_what_is_too_old_for_the_memory_comes_from_the_last_seconds_on_the_disk(tmp_path: Path) -> None:
