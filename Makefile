@@ -230,7 +230,7 @@ hiroz: .venv/installed
 	cargo build --quiet --manifest-path tests/ros2_hiroz/Cargo.toml
 	tests/with-netns $(BIN)/python -m tests.ros2_hiroz
 
-# Mutation tests: about a hundred changes of meaning, each of which some test should notice. PACKAGES="stream publish"
+# Mutation tests: about 150 changes of meaning, each of which some test should notice. PACKAGES="stream publish"
 # selects packages. Not part of the check.
 PACKAGES ?=
 
