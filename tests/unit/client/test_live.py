@@ -173,6 +173,9 @@ def test_a_message_that_cannot_be_decoded_is_a_gap() -> None:
     channel, message = ones(MARKERS, 1)
     data.feed([parameters(xml()), ones(MARKERS, 0), (channel, message[:-1]), ones(MARKERS, 2)])
     assert [(each.sequence, each.gap) for each in data.frames(2)] == [(0, 0), (2, 1)]
+    channel, message = ones(MARKERS, 5)
+    data.feed([(channel, message[:-1]), ones(MARKERS, 6)])
+    assert [(each.sequence, each.gap) for each in data.frames(1)] == [(6, 3)]
 
 
 def test_a_program_that_is_too_slow_loses_the_oldest_and_is_warned_once(
@@ -218,6 +221,14 @@ def test_a_version_that_a_gateway_uses_again_means_the_parameters_of_its_time() 
     data.feed([parameters(xml("old"), 1), parameters(xml("new"), 1, utime=START_UTIME + 1_000_000)])
     data.feed([ones(MARKERS, 0, 1), ones(MARKERS, 200, 1)])
     assert [each.markers.labels for each in data.frames(2)] == [("old",), ("new",)]
+
+
+def test_parameters_that_come_later_with_a_version_known_by_then_count() -> None:
+    data = Fed()
+    data.feed([parameters(xml("old"), 1), ones(MARKERS, 0, 1)])
+    assert data.frames(1)[0].markers.labels == ("old",)
+    data.feed([parameters(xml("new"), 1, utime=START_UTIME + 1_000_000), ones(MARKERS, 200, 1)])
+    assert data.frames(1)[0].markers.labels == ("new",)
 
 
 @pytest.mark.parametrize("ahead", [MARKERS, ANALOG])
