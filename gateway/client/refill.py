@@ -97,7 +97,7 @@ class Refill:
 
     def _run(self, due: "dict[Series, Completion]") -> None:
         while True:
-            while not self._reception.has_room:
+            while not (self._reception.has_room or self._is_closed):
                 time.sleep(_WAIT_S)
             with self._changed:
                 series = self._wait(due)
