@@ -159,8 +159,13 @@ class Completion:
 
     # What arrives.
 
-    def receive(self, message: bytes, sequence: int, utime: int, session: int, now_s: float) -> None:
-        """Take a message that was published now. ``sequence`` is not negative."""
+    def receive(
+        self, message: bytes, sequence: int, utime: int, session: int, now_s: float, *, has_room: bool = True
+    ) -> None:
+        """Take a message that was published now. ``sequence`` is not negative.
+
+        Unless ``has_room``, it is let go, and is requested later.
+        """
         if self._is_ending:
             return
         self._arrivals.add(sequence, utime, session)
@@ -177,10 +182,10 @@ class Completion:
             return
         if self._next is None and self._last_s is None:
             self._next = sequence
-        if sequence == self._next:
-            self._pass(sequence, message)
-        elif self._next is None or sequence > self._next:
-            self._hold(sequence, message)
+        if has_room:
+            self._pass_or_hold(sequence, message)
+        else:
+            self._since_s = now_s  # patience begins when requests can be made again
         self._look(now_s, is_live=True)
         self.expire(now_s)
 
@@ -194,6 +199,12 @@ class Completion:
         if utime > self._newest_utime:
             return sequence <= self._newest or session < self._newest_session
         return self._newest - sequence > MAX_LATE
+
+    def _pass_or_hold(self, sequence: int, message: bytes) -> None:
+        if sequence == self._next:
+            self._pass(sequence, message)
+        elif self._next is None or sequence > self._next:
+            self._hold(sequence, message)
 
     def _hold(self, sequence: int, message: bytes) -> None:
         room = self._held_bytes

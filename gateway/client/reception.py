@@ -273,7 +273,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             if completion is not None:
                 utime, _, sequence, session = _FIELDS.unpack_from(message, FINGERPRINT_BYTES)
                 if sequence >= 0:
-                    completion.receive(message, sequence, utime, session, now_s)
+                    completion.receive(message, sequence, utime, session, now_s, has_room=not self.is_full)
                     if completion.due_s < math.inf and self.refill is not None:
                         self.refill.check(series)
                     return
@@ -363,6 +363,11 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
     def has_room(self) -> bool:
         """Whether more messages can be taken now. Nothing is requested otherwise."""
         return True
+
+    @property
+    def is_full(self) -> bool:
+        """Whether what arrives of completed series is let go now, and requested when there is room."""
+        return False
 
     def _completes(self, series: SeriesT) -> bool:
         """Whether to fill the gaps of a series."""

@@ -132,7 +132,7 @@ class Refill:
         if self.completeness.last_s is not None:
             self._begin_silent(source, self.completeness.last_s)
         while True:
-            while not self._reception.has_room:
+            while not (self._reception.has_room or self._is_closed):
                 time.sleep(_WAIT_S)
             with self._changed:
                 series = self._wait(due)
