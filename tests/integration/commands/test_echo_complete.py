@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from gateway.messages.decode import prefix_of
-from tests.integration.takes.test_record import lab
-from tests.integration.takes.test_refill import MARKERS, wait_for_frames
 from tests.support.gateway_process import PROGRAM
+from tests.support.record_process import MARKERS, lab, wait_for_frames
 from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns

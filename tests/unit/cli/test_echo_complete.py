@@ -9,7 +9,7 @@ import pytest
 
 from gateway.cli import echo_complete
 from gateway.cli.echo_complete import CompleteMessages, print_complete
-from gateway.client.completion import HistoryAnswer, HistoryRequest
+from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, Series
 from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel
@@ -32,7 +32,7 @@ class Gateway:
         self._newest = frames - 1
 
     def subscribe(self, messages: CompleteMessages) -> Mock:
-        messages.complete(self.answer, None)
+        messages.complete(self.answer, Mock(), COMPLETE)
         source = messages.source("lab", "MOCAP_LAB", is_known=True)
         assert source is not None
         series = messages.series(source, "3d", "MOCAP_LAB_3D")
@@ -42,7 +42,7 @@ class Gateway:
         assert messages.refill is not None
         return Mock(close=messages.refill.close)
 
-    def answer(self, _series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def answer(self, _series: Series, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
         first = int(request.options["from"])
         last = min(int(request.options.get("to", self._newest)), first + ANSWER_MESSAGES, self._newest)
         found = [self.history[number] for number in range(first, last + 1) if number in self.history]
@@ -106,7 +106,7 @@ def test_only_the_component_is_printed_and_requested(
     """The subscriber gets more than that, because one subscription is for all poses."""
     for is_lcm, wanted in ((False, zenoh), (True, lcm)):
         messages = CompleteMessages(component, None, is_lcm=is_lcm)
-        messages.complete(Mock(), None)
+        messages.complete(Mock(), Mock(), COMPLETE)
         source = messages.source("lab", "MOCAP_LAB", is_known=True)
         assert source is not None
         labels = ("TOOL_1", "TOOL_2") if is_lcm else ("Tool%201", "Tool%202")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.client.completion import HistoryAnswer, HistoryRequest
+from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.refill import Refill
 from gateway.messages.encode import PREFIX
 from gateway.messages.sequence_check import SequenceCheck
@@ -38,7 +38,7 @@ class Subscriber:
         self.handed_on: list[int] = []
         self.series: Any = [Series("lab") for _ in range(num_series)]
         self._answer_size = answer_size
-        self.refill = Refill(self, self.lock, self._ask, None)  # type: ignore[arg-type] # only has_room
+        self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE)  # type: ignore[arg-type] # only has_room
         self.completions = [self.refill.add(each, self._hand_on) for each in self.series]
 
     @property
@@ -52,7 +52,7 @@ class Subscriber:
     def _hand_on(self, message: bytes) -> None:
         self.handed_on.append(PREFIX.unpack_from(message, 8)[2])
 
-    def _ask(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask(self, series: Series, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
         self.asked.append(series)
         first = int(request.options["from"])
         last = min(first + self._answer_size - 1, int(request.options["to"]))
