@@ -122,15 +122,14 @@ def _check_data(address: GatewayAddress, wanted: Sequence[str], seconds: float) 
     reception = Messages(lambda *_: None)
     try:
         with GatewayClient(address) as client:
-            found = client.sources()
-            if found.absence:
-                yield Check("lcm" if address.is_lcm else "zenoh", "gateway").problem(found.absence)
-                return
             with contextlib.closing(client.subscribe(wanted, None, reception, complete=True)) as subscriber:
                 _receive(subscriber, reception, seconds)
+            found = client.sources()
     except (OutputError, QueryError) as error:
         yield Check("lcm" if address.is_lcm else "zenoh", "link").problem(str(error))
         return
+    if found.absence:
+        yield Check("lcm" if address.is_lcm else "zenoh", "gateway").problem(found.absence)
     reports = {each.name: each for each in found.sources}
     received = {source.name: source for source in reception.sources_now}
     for name in wanted or reports:
