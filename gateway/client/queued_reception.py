@@ -19,6 +19,9 @@ MAX_WAITING: Final = 40_000
 
 MAX_WAITING_BYTES: Final = 64 * 1024 * 1024
 
+_FULL: Final = 0.75
+"""From which share of these limits completed series let go what arrives, and request it later."""
+
 _MAX_ENTRIES: Final = 16
 """How many parameters of a source are kept: frames that wait belong to the newest ones."""
 
@@ -184,6 +187,11 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
     def has_room(self) -> bool:
         """Whether more messages can be taken now without leaving out older ones."""
         return len(self._waiting) < MAX_WAITING // 2 and self._waiting_bytes < MAX_WAITING_BYTES // 2
+
+    @property
+    def is_full(self) -> bool:
+        """See Reception. There is still room for what was requested."""
+        return len(self._waiting) >= _FULL * MAX_WAITING or self._waiting_bytes >= _FULL * MAX_WAITING_BYTES
 
     def close(self) -> None:
         """Take nothing more, and wake all that wait."""

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gateway.client import queued_reception
 from gateway.client.client import GatewayAddress
+from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.live_frames import ClockDifference, Frame
 from gateway.client.live_join import MAX_WAIT_S
 from gateway.client.live_stream import Live, live
@@ -191,6 +192,22 @@ def test_a_program_that_is_too_slow_loses_the_oldest_and_is_warned_once(
     assert [each.gap for each in data.frames(3)] == [2, 0, 0]
     assert len(warned) == 1
     assert data.num_dropped == 9
+
+
+def test_a_complete_program_that_is_too_slow_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queued_reception, "MAX_WAITING", 8)
+    history = [message for _, message in (ones(MARKERS, number) for number in range(30))]
+
+    def answer(_series: object, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
+        first = int(request.options["from"])
+        last = min(int(request.options["to"]), first + 2)
+        return HistoryAnswer(history[first : last + 1], first, last, len(history) - 1)
+
+    data = Fed()
+    data._reception.complete(answer, lambda *_: [], COMPLETE)
+    data.feed([parameters(xml()), *(ones(MARKERS, number) for number in range(30))])
+    assert [(each.sequence, each.gap) for each in data.frames(30)] == [(number, 0) for number in range(30)]
+    assert data.num_dropped == 0
 
 
 def test_the_newest_frame_needs_no_queue() -> None:

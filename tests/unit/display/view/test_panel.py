@@ -77,9 +77,10 @@ def test_a_stop_is_said_at_once_and_texts_change_rarely(
             return ""
 
         monkeypatch.setattr(view_panel, name, count)
+    begin_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: begin_s)
     lab.send_markers(True)
     panel.update(lab.live.update())
-    begin_s = time.monotonic()
     for picture in range(60):
         now_s = begin_s + picture / 30
         monkeypatch.setattr(time, "monotonic", lambda now_s=now_s: now_s)
