@@ -30,7 +30,10 @@ settings.load_profile("gateway")
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
-_INSTALLATION: Final = ("tests/systemd/", "tests/packaging/test_wheel.py")
+_GROUPS: Final = {
+    "installation": ("tests/systemd/", "tests/packaging/test_wheel.py"),
+    "outages": ("tests/outages/",),
+}
 
 _NEEDS: Final = {
     "netns": (
@@ -76,13 +79,14 @@ def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.Abstrac
 
 
 class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
-    """Runs the tests of the installation in one worker: each would boot a machine of its own.
+    """Runs some groups of tests in one worker each.
 
+    Each test of the installation would boot a machine of its own, and each of the outages needs a core.
     pytest-xdist's own groups have no effect with pytest 9.2.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return "installation" if nodeid.startswith(_INSTALLATION) else nodeid
+        return next((name for name, paths in _GROUPS.items() if nodeid.startswith(paths)), nodeid)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:

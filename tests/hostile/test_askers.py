@@ -118,8 +118,13 @@ async def test_askers_that_do_not_read_the_answers(
     gateway.report.check(MAX_GROWTH_MIB)
 
 
-async def silence_with_ten_askers(gateway: RunningGateway, seconds: float, *selectors: str) -> float:
-    """Run ten peers that ask and then do not read; return the longest silence of the healthy source in s."""
+async def silence_with_ten_askers(
+    gateway: RunningGateway, seconds: float, count: int, *selectors: str
+) -> float:
+    """Return the longest silence of the healthy source, in s, while ten peers do not read their answers.
+
+    Each asks ``count`` times at once, and is then stopped for ``seconds``.
+    """
 
     async def stop_after_its_questions(process: Process) -> None:
         await printed(process)
@@ -127,7 +132,7 @@ async def silence_with_ten_askers(gateway: RunningGateway, seconds: float, *sele
 
     await gateway.arrivals()
     async with AsyncExitStack() as askers:
-        stalled = [await askers.enter_async_context(asker(gateway, 600, *selectors)) for _ in range(10)]
+        stalled = [await askers.enter_async_context(asker(gateway, count, *selectors)) for _ in range(10)]
         await asyncio.gather(*map(stop_after_its_questions, stalled))
         await asyncio.sleep(seconds)
         return max(longest_silence_s(await gateway.arrivals()).values())
@@ -136,17 +141,20 @@ async def silence_with_ten_askers(gateway: RunningGateway, seconds: float, *sele
 async def check_ten_askers(gateway: RunningGateway, *selectors: str) -> None:
     """Check that the healthy source waits hardly longer than with ten peers that ask for what nobody has.
 
-    Other work on the computer can delay either, but not each time.
+    Other work on the computer can delay either, but not each time. A flood of questions, which costs the
+    gateway CPU time even if it refuses them, is not compared.
     """
     tries = []
     for _ in range(NUM_TRIES):
-        control_s = await silence_with_ten_askers(gateway, 3, "mocap/nobody/3d?from={}")
+        control_s = await silence_with_ten_askers(gateway, 2, 60, "mocap/nobody/3d?from={}")
         # Zenoh waits for 5 s for a peer that does not read.
-        silence_s = await silence_with_ten_askers(gateway, 6, *selectors)
+        silence_s = await silence_with_ten_askers(gateway, 6, 60, *selectors)
         if silence_s <= control_s + MAX_MORE_SILENCE_S:
-            return
+            break
         tries.append((control_s, silence_s))
-    raise AssertionError(f"silences in control runs and with the askers, in s: {tries}")
+    else:
+        raise AssertionError(f"silences in control runs and with the askers, in s: {tries}")
+    await silence_with_ten_askers(gateway, 2, 600, *selectors)
 
 
 async def test_askers_for_the_whole_history_that_do_not_read_the_answers(

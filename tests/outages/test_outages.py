@@ -1,4 +1,4 @@
-"""Outages in full length on a dense stream: ``record`` ends complete, with what a recorder beside it wrote.
+"""Long outages on a dense stream: ``record`` ends complete, with what a recorder beside it wrote.
 
 tests/integration/takes/test_refill.py has the same in short, and what else can happen.
 """
@@ -30,15 +30,15 @@ from tests.support.record_process import (
 
 pytestmark = pytest.mark.netns
 
-RATE_HZ: Final = 1000
+SHARE: Final = 1.0 if os.environ.get("FULL_OUTAGES") else 0.5
+"""The share of the promised rate, and of the promised length of the long outages."""
+
+RATE_HZ: Final = round(1000 * SHARE)
 DENSE: Final = (
     *("--rate", str(RATE_HZ), "--analog-rate", str(RATE_HZ)),
     *("--markers", "100", "--tools", "10", "--analog", "32"),
 )
 """What the benchmarks call dense: five components in every frame."""
-
-SHARE: Final = 1.0 if os.environ.get("FULL_OUTAGES") else 0.5
-"""The share of the promised length that the long outages last."""
 
 
 def assert_complete_past(
