@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, Self
 
-from gateway.client.completion import Completeness
+from gateway.client.history_requests import Completeness
 from gateway.client.lcm_transport import LcmTransport
 from gateway.client.reception import Reception
 from gateway.client.transport import (

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import rtc3d
 
-from gateway.client.completion import HistoryAnswer
-from gateway.client.transport import history_answer
+from gateway.client.history_requests import HistoryAnswer, history_answer
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.history import MAX_ANSWER_BYTES, sequence_of
 from gateway.outputs.lcm.connection import open_lcm, receiving_url

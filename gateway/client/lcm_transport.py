@@ -15,7 +15,13 @@ from typing import Any, Final
 
 import rtc3d
 
-from gateway.client.completion import BUSY_CODES, INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import (
+    BUSY_CODES,
+    INCOMPLETE,
+    Completeness,
+    HistoryAnswer,
+    HistoryRequest,
+)
 from gateway.client.lcm_refill import LcmRefill
 from gateway.client.reception import FINGERPRINTS, POSE, Reception, Series, Source
 from gateway.client.transport import (

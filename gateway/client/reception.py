@@ -12,7 +12,8 @@ from typing import Any, Final, Generic, TypeVar
 
 import rtc3d
 
-from gateway.client.completion import Completeness, Completion
+from gateway.client.completion import Completion
+from gateway.client.history_requests import Completeness
 from gateway.client.refill import Ask, FindSeries, Refill
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode

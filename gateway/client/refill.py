@@ -7,16 +7,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from gateway.client.completion import (
-    BUSY_CODES,
-    REPLY_S,
-    RETRY_S,
-    Completeness,
-    Completion,
-    HeldBytes,
-    HistoryAnswer,
-    HistoryRequest,
-)
+from gateway.client.completion import RETRY_S, Completion, HeldBytes
+from gateway.client.history_requests import BUSY_CODES, REPLY_S, Completeness, HistoryAnswer, HistoryRequest
 from gateway.errors import QueryError
 from gateway.workers import thread_starts
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-from gateway.client.completion import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SERIES, POSE, TYPES_BY_KEY, Reception, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
@@ -354,16 +354,6 @@ def recent_keys(overview: Mapping[str, Any], components: Collection[str] | None,
         and (key in TYPES_BY_KEY or key.startswith(POSE))
         and len(key) <= _MAX_KEY_CHARACTERS
     ]
-
-
-def history_answer(
-    facts: Mapping[str, Any], messages: Sequence[bytes], *, is_whole: bool = True
-) -> HistoryAnswer:
-    """Return messages as the answer that the gateway's ``facts`` describe. Raises ProtocolError."""
-    first, last, newest = (facts.get(name) for name in ("from", "to", "newest"))
-    if not (isinstance(first, int) and isinstance(last, int) and isinstance(newest, int)):
-        raise ProtocolError("an answer with messages from the history does not say which they are")
-    return HistoryAnswer(messages, first, last, newest, is_whole)
 
 
 def silence_text(subscriber: GatewaySubscriber, reception: Reception[Any, Any]) -> str:

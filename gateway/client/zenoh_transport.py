@@ -12,7 +12,14 @@ from urllib.parse import unquote
 
 import zenoh
 
-from gateway.client.completion import BUSY_CODES, INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import (
+    BUSY_CODES,
+    INCOMPLETE,
+    Completeness,
+    HistoryAnswer,
+    HistoryRequest,
+    history_answer,
+)
 from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
 from gateway.client.transport import (
     MAX_STATUS_BYTES,
@@ -24,7 +31,6 @@ from gateway.client.transport import (
     Reply,
     TimeLimits,
     Transport,
-    history_answer,
 )
 from gateway.errors import ProtocolError, QueryError
 from gateway.messages.decode import TEXT

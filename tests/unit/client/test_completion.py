@@ -8,17 +8,8 @@ import pytest
 from hypothesis import given, note, settings
 from hypothesis import strategies as st
 
-from gateway.client.completion import (
-    COMPLETE,
-    GRACE_S,
-    NOBODY_S,
-    PATIENCE_S,
-    Completeness,
-    Completion,
-    HeldBytes,
-    HistoryAnswer,
-    HistoryRequest,
-)
+from gateway.client.completion import GRACE_S, NOBODY_S, PATIENCE_S, Completion, HeldBytes
+from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.messages.encode import PREFIX
 from gateway.messages.sequence_check import SequenceCheck
 

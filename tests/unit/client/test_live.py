@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gateway.client import queued_reception
 from gateway.client.client import GatewayAddress
-from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.live_frames import ClockDifference, Frame
 from gateway.client.live_join import MAX_WAIT_S
 from gateway.client.live_stream import Live, live

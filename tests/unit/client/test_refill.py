@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.refill import Refill
 from gateway.messages.encode import PREFIX
 from gateway.messages.sequence_check import SequenceCheck

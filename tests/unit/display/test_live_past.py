@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import pytest
 
-from gateway.client.completion import Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.queued_reception import QueuedSeries
 from gateway.client.reception import Source
 from gateway.display import live as live_module

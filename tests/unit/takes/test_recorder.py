@@ -9,7 +9,7 @@ import pytest
 import rtc3d
 
 from gateway.client import reception
-from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
 from gateway.errors import TakeError
 from gateway.messages.decode import decode

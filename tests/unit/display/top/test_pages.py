@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from gateway.client.completion import COMPLETE, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.reception import Series
 from gateway.display.live import LiveData, LiveSource
 from gateway.display.top import facts
