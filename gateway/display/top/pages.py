@@ -5,7 +5,8 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Final, NamedTuple
 
-from gateway.display.live import SLOW_SHARE, LiveSource, visible_percent
+from gateway.display.live import SLOW_SHARE, LiveSource
+from gateway.display.statistics import visible_percent
 from gateway.display.terminal import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
