@@ -174,7 +174,7 @@ class Source:
             return None
 
 
-MAX_SOURCES: Final = 64
+MAX_SOURCES: Final = 256
 MAX_SERIES: Final = 4096
 """The most sources, and keys of all sources together. Names come from the network."""
 

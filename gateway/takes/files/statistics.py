@@ -213,7 +213,7 @@ def _change_text(before: Parameters | None, after: Parameters) -> str:
     return "; ".join(text for text in texts if text) or "the same"
 
 
-_MAX_SOURCES: Final = 100
+_MAX_SOURCES: Final = 256
 
 
 @dataclass

@@ -86,9 +86,9 @@ def test_what_is_no_message_of_a_gateway_is_left_out(lab: Lab) -> None:
 
 
 def test_sources_are_bounded(lab: Lab) -> None:
-    for number in range(200):
+    for number in range(300):
         lab.lcm.publish(f"MOCAP_S{number}_3D", lab.markers(1))
-    wait_until(lambda: lab.recording.num_beyond == 200 - MAX_SOURCES)
+    wait_until(lambda: lab.recording.num_beyond == 300 - MAX_SOURCES)
     assert len(lab.recording.sources) == MAX_SOURCES
 
 
