@@ -30,7 +30,12 @@ settings.load_profile("gateway")
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
-_INSTALLATION: Final = ("tests/systemd/", "tests/packaging/test_wheel.py")
+_TOGETHER: Final = {
+    "tests/systemd/": "installation",
+    "tests/packaging/test_wheel.py": "installation",
+    "tests/hostile/test_sites.py": "sites",
+}
+"""The group of tests that share what takes long to start, such as a machine of their own."""
 
 _NEEDS: Final = {
     "netns": (
@@ -76,13 +81,13 @@ def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.Abstrac
 
 
 class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
-    """Runs the tests of the installation in one worker: each would boot a machine of its own.
+    """Runs the tests of each group of ``_TOGETHER`` in one worker.
 
     pytest-xdist's own groups have no effect with pytest 9.2.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return "installation" if nodeid.startswith(_INSTALLATION) else nodeid
+        return next((group for place, group in _TOGETHER.items() if nodeid.startswith(place)), nodeid)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:
