@@ -27,9 +27,9 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
-# What is slow by nature: attacks, browsers, installation, systemd, the examples in other languages, and the commands
-# in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging hostile docs languages benchmarks view site)
+# What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
+# commands in the documents.
+SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view site)
 
 test-slow: .venv/installed build/wheelhouse/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
@@ -230,7 +230,7 @@ hiroz: .venv/installed
 	cargo build --quiet --manifest-path tests/ros2_hiroz/Cargo.toml
 	tests/with-netns $(BIN)/python -m tests.ros2_hiroz
 
-# Mutation tests: about a hundred changes of meaning, each of which some test should notice. PACKAGES="stream publish"
+# Mutation tests: about 150 changes of meaning, each of which some test should notice. PACKAGES="stream publish"
 # selects packages. Not part of the check.
 PACKAGES ?=
 

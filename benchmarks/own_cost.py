@@ -19,7 +19,7 @@ import uvloop
 from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Pair, Progress, Table, table_cell
 from benchmarks.workloads import DENSE, Frames
-from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
+from gateway.config.settings import HistorySettings, MetricsSettings, SourceSettings, StreamSettings
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.takes.output import TakesOutput
@@ -92,13 +92,15 @@ class _StoringOutput(MemoryOutput):
         return self.publishers.setdefault(topic.path, _StoringPublisher())
 
 
-class _FedGateway:
+class FedGateway:
     """A running gateway, connected to a silent server. ``run`` passes frames to its session directly.
 
     With ``records``, a take is running, and ``run`` includes the time of the thread that writes it.
+    ``history`` is whether messages are kept for subscribers that miss some.
     """
 
-    def __init__(self, *, records: bool = False) -> None:
+    def __init__(self, *, records: bool = False, history: bool = True) -> None:
+        self._history = HistorySettings() if history else HistorySettings(seconds=0)
         self._folder = tempfile.TemporaryDirectory()
         settings = TakesSettings(enabled=True, directory=self._folder.name)
         self._takes = TakesOutput(settings) if records else None
@@ -123,7 +125,10 @@ class _FedGateway:
         )
         self._stop = asyncio.Event()
         outputs = [self._output] if self._takes is None else [self._output, self._takes]
-        gateway = Gateway(make_settings(sources=(source,), metrics=MetricsSettings(enabled=False)), outputs)
+        settings = make_settings(
+            sources=(source,), metrics=MetricsSettings(enabled=False), history=self._history
+        )
+        gateway = Gateway(settings, outputs)
         self._running = self._loop.create_task(gateway.run(self._stop))
         [source_gateway] = gateway.sources
         [stream] = source_gateway.streams
@@ -265,7 +270,7 @@ def main() -> None:
     import pyperf  # noqa: PLC0415 - as above
 
     name = sys.argv.pop(1)
-    fed = functools.cache(lambda: _FedGateway(records=name == RECORDING))
+    fed = functools.cache(lambda: FedGateway(records=name == RECORDING))
     decoded = functools.cache(lambda: [(message, type(decode(message))) for message in fed().messages()])
 
     def feed(loops: int) -> float:

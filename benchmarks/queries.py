@@ -75,7 +75,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
         lab.take_received()
         reply_ms: list[float] = client.ask("paced")
         rate_hz: float = client.ask("one after another")
-        lost = [_gaps(received) for received in lab.take_received()]
+        lost = [num_gaps(received) for received in lab.take_received()]
     return {
         "asked": round(seconds * QUERIES_HZ),
         "answered": len(reply_ms),
@@ -85,7 +85,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     }
 
 
-def _gaps(received: Received) -> int:
+def num_gaps(received: Received) -> int:
     """Return how many frame numbers are missing between the first and the last of all topics but events."""
     topics = [topic for topic in received.numbers if not topic.lower().endswith("event")]
     return sum(1 + max(n) - min(n) - len(set(n)) for n in (received.numbers[topic] for topic in topics))

@@ -38,6 +38,7 @@ PARTS: Final = (
     "scale",
     "queries",
     "replay",
+    "history",
 )
 """The parts of the benchmarks, in order; each is a module."""
 

@@ -30,12 +30,11 @@ settings.load_profile("gateway")
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
-_TOGETHER: Final = {
-    "tests/systemd/": "installation",
-    "tests/packaging/test_wheel.py": "installation",
-    "tests/hostile/test_sites.py": "sites",
+_GROUPS: Final = {
+    "installation": ("tests/systemd/", "tests/packaging/test_wheel.py"),
+    "outages": ("tests/outages/",),
+    "sites": ("tests/hostile/test_sites.py",),
 }
-"""The group of tests that share what takes long to start, such as a machine of their own."""
 
 _NEEDS: Final = {
     "netns": (
@@ -81,13 +80,15 @@ def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.Abstrac
 
 
 class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
-    """Runs the tests of each group of ``_TOGETHER`` in one worker.
+    """Runs some groups of tests in one worker each.
 
+    Each test of the installation would boot a machine of its own, and each of the outages needs a core. Those
+    of two sites share both of them.
     pytest-xdist's own groups have no effect with pytest 9.2.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        return next((group for place, group in _TOGETHER.items() if nodeid.startswith(place)), nodeid)
+        return next((name for name, paths in _GROUPS.items() if nodeid.startswith(paths)), nodeid)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:

@@ -1,4 +1,4 @@
-"""Mutation tests: change what the code means in about a hundred ways, and count what no test notices.
+"""Mutation tests: change what the code means in about 150 ways, and count what no test notices.
 
     .venv/bin/python -m tests.mutants
     .venv/bin/python -m tests.mutants stream outputs/zenoh --jobs 4
@@ -32,6 +32,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "publish": ("unit/publish/test_* property/*_pacing_*",),
     "queries": ("unit/queries/test_* unit/service/test_source*",),
     "messages": ("unit/messages/test_*",),
+    "client": ("unit/client/test_*",),
     "gateway": ("unit/test_*",),  # the modules that are in no package
     "takes/files": ("unit/takes/files/test_* property/*takes* property/*_components_*",),
 } | {

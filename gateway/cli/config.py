@@ -18,7 +18,10 @@ from gateway.outputs.findings import counted
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from gateway.config.loading import Configuration
+    from gateway.outputs.findings import Finding
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
 
@@ -75,6 +78,7 @@ def schema() -> None:
     print(schema_text(settings_type()), end="")
 
 
+@options.with_options
 def doctor(
     config: options.ConfigOption = None,
     server: options.ServerOption = None,
@@ -88,7 +92,14 @@ def doctor(
             "--no-connect", help="Ask the running gateway only; open no connection to the RT servers."
         ),
     ] = False,
-    zenoh_config: options.ZenohConfigOption = None,
+    subscriber: Annotated[
+        bool,
+        typer.Option(
+            "--subscriber", help="Check the way from gateways to this computer; needs no configuration."
+        ),
+    ] = False,
+    source: options.SourcesOption = None,
+    lcm: Annotated[bool, typer.Option("--lcm", help="With --subscriber: receive on LCM, not Zenoh.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Log what the checks do, on stderr.")
@@ -96,47 +107,72 @@ def doctor(
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print only warnings and failures; nothing if all is well.")
     ] = False,
+    *,
+    where: options.AddressOptions,
 ) -> None:
     """Find out why no data arrives, layer by layer. Exit status 1 if a check fails.
 
-    Without options, it uses the configuration of the installed service.
+    Without options, it uses the configuration of the installed service. With --subscriber, it checks what
+    reaches this computer from gateways and by which routers; --connect and the like say where they are.
     """
-    options.check_exists("--zenoh-config", zenoh_config)
+    options.check_exists("--zenoh-config", where.zenoh_config)
+    where.check(lcm=lcm)
+    if subscriber and (config or server or no_connect):
+        raise typer.BadParameter("--subscriber needs no configuration: leave out --config and --server")
+    if not subscriber and (source or lcm or where != options.AddressOptions(zenoh_config=where.zenoh_config)):
+        raise typer.BadParameter("--source, --lcm, --connect, --url and --prefix are for --subscriber")
     import uvloop
     from rich.console import Console
 
-    from gateway.doctor.all_checks import run_checks, run_checks_without_settings
     from gateway.doctor.report import Report
-    from gateway.doctor.source_checks import CONNECTION
 
     # Without --verbose, warnings would repeat the findings.
     set_up_log(LogLevel.DEBUG if verbose else LogLevel.ERROR, LogFormat.TEXT)
     report = Report(Console(quiet=as_json), quiet=quiet)
 
-    async def report_findings() -> None:
-        file = chosen_file(config, server)
-        try:
-            settings = configuration_from_options(file, server).settings
-        except ConfigError as error:
-            for finding in run_checks_without_settings(error):
-                report.add(finding)
-            return
-        origin = str(file or server or "environment")
-        sections = {}
-        if zenoh_config is not None:
-            sections["zenoh"] = settings.outputs["zenoh"].model_copy(update={"config": zenoh_config})
-        findings = run_checks(settings, origin, seconds, connects=not no_connect, output_sections=sections)
-        async for finding in findings:
-            report.add(finding)
-            if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
-                print(safe_lines(f"{finding.subject}: {finding.found}"), file=sys.stderr)
+    if subscriber:
+        from gateway.doctor.subscriber_checks import run_subscriber_checks
 
-    uvloop.run(report_findings())
+        for finding in run_subscriber_checks(where.address(lcm=lcm), source or (), seconds):
+            report.add(finding)
+    else:
+        from gateway.doctor.source_checks import CONNECTION
+
+        async def report_findings() -> None:
+            file = chosen_file(config, server)
+            connects = not no_connect
+            findings = _check_configuration(file, server, seconds, where.zenoh_config, connects=connects)
+            async for finding in findings:
+                report.add(finding)
+                if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
+                    print(safe_lines(f"{finding.subject}: {finding.found}"), file=sys.stderr)
+
+        uvloop.run(report_findings())
     report.end()
     if as_json:
         print(report.as_json())
     if not report.is_ok:
         raise typer.Exit(1)
+
+
+async def _check_configuration(
+    file: Path | None, server: str | None, seconds: float, zenoh_config: Path | None, *, connects: bool
+) -> "AsyncIterator[Finding]":
+    """Yield the findings about a configuration, and about the servers and outputs that it names."""
+    from gateway.doctor.all_checks import run_checks, run_checks_without_settings
+
+    try:
+        settings = configuration_from_options(file, server).settings
+    except ConfigError as error:
+        for finding in run_checks_without_settings(error):
+            yield finding
+        return
+    origin = str(file or server or "environment")
+    sections = {}
+    if zenoh_config is not None:
+        sections["zenoh"] = settings.outputs["zenoh"].model_copy(update={"config": zenoh_config})
+    async for finding in run_checks(settings, origin, seconds, connects=connects, output_sections=sections):
+        yield finding
 
 
 def chosen_file(

@@ -126,12 +126,16 @@ def print_messages(
                 num_printed += 1
     finally:
         if num_dropped:
-            print(
-                f"{num_dropped} messages were not printed, because they came faster than they can be "
-                "printed; choose fewer with --source or --component, or count them with --hz",
-                file=sys.stderr,
-            )
+            print(too_fast_text(num_dropped), file=sys.stderr)
     return num_printed
+
+
+def too_fast_text(num_dropped: int) -> str:
+    """Return that so many messages were left out, and what to do."""
+    return (
+        f"{num_dropped} messages were not printed, because they came faster than they can be "
+        "printed; choose fewer with --source or --component, or count them with --hz"
+    )
 
 
 WINDOW_S: Final = 10.0

@@ -72,7 +72,8 @@ class EchoSources:
         self._reason = ""
         self._is_said = False
 
-    def _client(self) -> GatewayClient:
+    def client(self) -> GatewayClient:
+        """Return a client of these gateways."""
         where, config = self._request.address, self._request.config
         is_lcm = self._output == "lcm"
         return GatewayClient(GatewayAddress(is_lcm, where, config, where, self._request.prefix), QUERY_S)
@@ -104,7 +105,7 @@ class EchoSources:
         now_s = time.monotonic()
         if now_s - self._failed_s.get(source, -math.inf) < RETRY_S or len(self._failed_s) >= _MAX_FAILED:
             return None
-        with contextlib.suppress(OutputError, ParametersError), self._client() as client:
+        with contextlib.suppress(OutputError, ParametersError), self.client() as client:
             for reply in client.parameters(source).received:
                 if reply.source == source and reply.version == version:
                     known = _Known(version, parse_parameters(reply.content).parameters, {})
@@ -135,7 +136,7 @@ class EchoSources:
     def _look(self) -> None:
         """Find out what exists, in the thread."""
         try:
-            with self._client() as client:
+            with self.client() as client:
                 found = client.sources(self._request.source)
                 if found.absence and found.heard:
                     self._error = QueryError(found.absence, code="no-gateway")

@@ -10,7 +10,7 @@ import typer
 from gateway.cli import options
 from gateway.cli.main import exit_with, print_json
 from gateway.errors import QueryError
-from gateway.messages.source_report import Level
+from gateway.messages.source_report import Level, SourceReport
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,22 +66,38 @@ def write_sources(found: "FoundSources", console: "Console") -> None:
         for source in found.sources:
             components = ", ".join(stream.components for stream in source.streams)
             texts = ", ".join(filter(None, (source.text, source.problem)))
-            record = (source.name, texts, components, source.server, source.host, source.version)
+            record = (
+                source.name,
+                texts,
+                components,
+                source.server,
+                source.host,
+                source.version,
+                _via(source),
+            )
             write_records(console.file, [record])
         return
     table = list_table()
-    for heading in ("source", "state", "components", "server", "host", "version"):
+    has_routers = any(source.routers for source in found.sources)
+    headings = ("source", "state", "components", "server", "host", "version", "routers")
+    for heading in headings if has_routers else headings[:-1]:
         width = _NARROW_WIDTHS.get(heading) if console.width in _NARROW else None
         table.add_column(heading, overflow="fold", width=width)
     for source in found.sources:
         rows = [(Text(each.text, _COLOURS[each.level]), each.components) for each in source.streams]
         if source.problem or not rows:
             rows.append((Text(source.problem or "no streams", "red"), ""))
-        name, others = source.name, (source.server, source.host, source.version)
+        name, others = source.name, [source.server, source.host, source.version]
+        others += [_via(source)] if has_routers else []
         for state, components in rows:
             table.add_row(Text(name, "bold"), state, *map(Text, (components, *others)))
-            name, others = "", ("", "", "")
+            name, others = "", [""] * len(others)
     console.print(table)
+
+
+def _via(source: SourceReport) -> str:
+    """Return the routers between the gateway and this computer, in the direction of the data."""
+    return " → ".join(source.routers or ())
 
 
 def found_json(found: "FoundSources") -> dict[str, Any]:
@@ -94,6 +110,7 @@ def found_json(found: "FoundSources") -> dict[str, Any]:
             "server": source.server or None,
             "host": source.host or None,
             "version": source.version or None,
+            "routers": None if source.routers is None else [*source.routers],
             "streams": [
                 {
                     "components": stream.components.split(),

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE
+from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE, Series
 from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
 from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording
@@ -272,13 +272,7 @@ def _problems(recording: TakeRecording, file: FileWriter) -> Iterator[str]:
 
 def _losses(recording: TakeRecording) -> Iterator[str]:
     all_series = [series for series in recording.all_series if series.is_recorded]
-    num_lost = sum(series.check.num_lost for series in all_series)
-    if num_lost:
-        yield f"{num_lost} messages were lost between the gateway and this computer, or in the gateway"
-        incomplete = [series for series in all_series if series.check.num_lost]
-        yield from map(_missing_text, incomplete[:_MAX_NOTES])
-        if len(incomplete) > _MAX_NOTES:
-            yield f"… and {len(incomplete) - _MAX_NOTES} other keys"
+    yield from missing_texts(all_series)
     for source in recording.sources_now:
         if any(series.check.has_two_publishers for series in source.series):
             yield (
@@ -290,7 +284,18 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
         yield f"{num_refused} messages were not written, because too many waited for the disk"
 
 
-def _missing_text(series: RecordedSeries) -> str:
+def missing_texts(all_series: Sequence[Series]) -> Iterator[str]:
+    """Yield how many messages of these series are missing, and which; nothing if none is."""
+    incomplete = [series for series in all_series if series.check.num_lost]
+    if incomplete:
+        num_lost = sum(series.check.num_lost for series in incomplete)
+        yield f"{num_lost} messages were lost between the gateway and this computer, or in the gateway"
+        yield from map(_missing_text, incomplete[:_MAX_NOTES])
+    if len(incomplete) > _MAX_NOTES:
+        yield f"… and {len(incomplete) - _MAX_NOTES} other keys"
+
+
+def _missing_text(series: Series) -> str:
     """Return which messages of a series are missing, and why, if that is known."""
     gaps = series.check.gaps
     ranges = [

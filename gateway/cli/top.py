@@ -39,6 +39,12 @@ def top(
             "--json", help="Print one JSON object per second, until Ctrl-C; with --once, only one object."
         ),
     ] = False,
+    complete: Annotated[
+        bool,
+        typer.Option(
+            "--complete", help="Fill gaps from the gateway's history; show what was refilled and stays lost."
+        ),
+    ] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive on LCM; the default is Zenoh.")] = False,
     where: options.AddressOptions,
 ) -> None:
@@ -59,7 +65,7 @@ def top(
     else:
         set_up_log(LogLevel.WARNING)
     live = LiveData()
-    subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(wanted, None, live)
+    subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(wanted, None, live, complete=complete)
     try:
         if is_shown:
             words = ("LCM", where.url) if lcm else ("Zenoh", where.connect)

@@ -26,6 +26,13 @@ VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
 
 _SILENCE_S: Final = 2.0
+
+_PAST_S: Final = 10.0
+"""The page shows this much: of plots, visibility and events."""
+
+_PATIENCE_S: Final = 1.0
+"""How long live data wait for what was missed: a display prefers the newest."""
+
 _INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
 
 
@@ -41,6 +48,12 @@ def view(
     source: options.SourcesOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
     where: options.AddressOptions,
+    complete: Annotated[
+        bool,
+        typer.Option(
+            "--complete", help="Fill gaps from the gateway's history; newer data wait for that, at most 1 s."
+        ),
+    ] = False,
     host: Annotated[
         str, typer.Option(callback=options.checked_host, help="The address where the page is served.")
     ] = "127.0.0.1",
@@ -51,9 +64,9 @@ def view(
 ) -> None:
     """Show markers, tools and forces in the browser as they arrive, or from a take, until Ctrl-C."""
     where.check(lcm=lcm)
-    if take is not None and (lcm or where != options.AddressOptions()):
+    if take is not None and (lcm or complete or where != options.AddressOptions()):
         raise typer.BadParameter(
-            "a take is read from its file; --lcm, --connect and --prefix are for live data"
+            "a take is read from its file; --lcm, --connect, --prefix and --complete are for live data"
         )
     stop = StopSignals(lambda _: os._exit(0))
     with ExitStack() as stack:
@@ -68,7 +81,9 @@ def view(
         live = LiveData()
         ticks: list[Callable[[], object]] = []
         if take is None:
-            subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(source or (), None, live)
+            subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(
+                *(source or (), None, live), complete=complete, last_s=_PAST_S, patience_s=_PATIENCE_S
+            )
             stack.callback(close_in_time, subscriber)
             ticks += [subscriber.tick, RunningTakes(live, subscriber, server.get_clients).tick]
             silence = threading.Timer(_SILENCE_S, _explain_silence, (live, subscriber))

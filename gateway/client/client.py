@@ -6,10 +6,10 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, Self
 
+from gateway.client.history_requests import Completeness
 from gateway.client.lcm_transport import LcmTransport
 from gateway.client.reception import Reception
 from gateway.client.transport import (
-    Completeness,
     FoundSources,
     GatewaySubscriber,
     Query,
@@ -166,16 +166,20 @@ class GatewayClient:
         *,
         complete: bool = False,
         last_s: float | None = None,
+        patience_s: float | None = None,
     ) -> GatewaySubscriber:
         """Subscribe to these sources (all, if empty) and components (None: all).
 
         With ``complete``, the messages of each key come in the order of their numbers, and those that were
-        missed come from the gateway's history; ``last_s`` seconds from before the first one come first. The
-        subscriber has a connection of its own. Raises QueryError if Zenoh does not open.
+        missed come from the gateway's history. With ``last_s``, each key begins with the messages of so many
+        seconds. What arrives waits for those, no longer than ``patience_s`` (None: as long as a gateway may
+        need). The subscriber has a connection of its own. Raises QueryError if Zenoh does not open.
         """
         transport = _open(self._address)
         try:
-            return transport.subscribe(sources, components, reception, Completeness(complete, last_s))
+            return transport.subscribe(
+                sources, components, reception, Completeness(complete, last_s, patience_s)
+            )
         except Exception:
             transport.close()
             raise

@@ -5,9 +5,18 @@ clock: ``gateway.client.refill`` requests.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Collection, Sequence
+from typing import Final
 
+from gateway.client.history_requests import (
+    BUSY_CODES,
+    COMPLETE,
+    REPLY_S,
+    RETRY_CODES,
+    Completeness,
+    HistoryAnswer,
+    HistoryRequest,
+)
 from gateway.messages.history import sequence_of, utime_of
 from gateway.messages.sequence_check import MAX_LATE, SequenceCheck
 
@@ -23,6 +32,12 @@ PATIENCE_S: Final = 60.0
 NOBODY_S: Final = 3.0
 """The same if nobody takes the requests: the gateway is one of an earlier version, or is gone."""
 
+_MIN_REPLY_S: Final = 0.05
+
+_ESTIMATE_SHARE: Final = 0.3
+_SAFE_SHARE: Final = 0.5
+"""After which share of the patience it shows how much of the past will come; how much of that to count on."""
+
 _SILENCE_S: Final = 1.0
 """If nothing has arrived for longer, the connection was lost, and patience begins again."""
 
@@ -31,47 +46,6 @@ MAX_HELD_BYTES: Final = 32 * 1024 * 1024
 
 _ENTRY_BYTES: Final = 128
 """What a held message takes besides its content."""
-
-BUSY_CODES: Final = frozenset({"busy", "rate"})
-"""The codes of a gateway that gets too many queries: the same one may be answered a little later."""
-
-RETRY_CODES: Final = BUSY_CODES | {"timeout", "no-gateway", "zenoh"}
-"""With these codes, the same request may be answered later; a gateway answered none with the last three."""
-
-
-class HistoryRequest(NamedTuple):
-    """A request for messages from ``first`` to ``last`` (None: the newest), or of ``last_s`` seconds.
-
-    ``known`` is the number and the time of a message that was handed on, if it should be among them. ``run``
-    is which run of the gateway the numbers belong to.
-    """
-
-    run: int
-    first: int = 0
-    last: int | None = None
-    last_s: float | None = None
-    known: tuple[int, int] | None = None
-
-    @property
-    def options(self) -> Mapping[str, str]:
-        """The options of the query."""
-        if self.last_s is not None:
-            return {"last_s": f"{self.last_s:.3f}"}
-        first = self.first if self.known is None else self.known[0]
-        return {"from": str(first)} | ({} if self.last is None else {"to": str(self.last)})
-
-
-class HistoryAnswer(NamedTuple):
-    """Messages in the order of their numbers: all that exist from ``first`` to ``last``, if it ``is_whole``.
-
-    Otherwise, some were lost on their way. ``newest`` is the number of the newest message of the key.
-    """
-
-    messages: Sequence[bytes]
-    first: int
-    last: int
-    newest: int
-    is_whole: bool = True
 
 
 class HeldBytes:
@@ -85,9 +59,8 @@ class HeldBytes:
 class Completion:
     """Completes the messages of one key.
 
-    It calls ``hand_on`` with each message, in the order of the numbers of each run of the gateway, and
-    ``lose_before`` with a number if everything before it is lost and nothing follows that would show it.
-    With ``last_s``, the messages of these seconds before the first one come first.
+    It calls ``hand_on`` with each message, in the order of the numbers of each run of the gateway. What is
+    handed on is counted in ``check``, which is also told what no message shows.
 
     While messages are missing, later ones are held. Those for which there is no room are let go, and are
     requested again when it is their turn; the first one is always held. ``due_s`` is when to request
@@ -98,10 +71,12 @@ class Completion:
     def __init__(
         self,
         hand_on: Callable[[bytes], object],
-        lose_before: Callable[[int], object],
+        check: SequenceCheck,
         held_bytes: HeldBytes,
-        last_s: float | None = None,
+        completeness: Completeness = COMPLETE,
     ) -> None:
+        self.is_past = completeness.last_s is not None
+        """Whether what is handed on is of the time before the first message, or has waited for it."""
         self.due_s = math.inf
         """When to request something; infinite if nothing is missing."""
         self.reached_utime = 0
@@ -111,9 +86,12 @@ class Completion:
         self.problem = ""
         """Why messages are only passed on; "" if gaps are filled."""
         self._hand_on = hand_on
-        self._lose_before = lose_before
+        self._check = check
         self._held_bytes = held_bytes
-        self._last_s = last_s
+        self._fills_gaps, self._last_s = completeness.is_complete, completeness.last_s
+        self._patience_s = math.inf if completeness.patience_s is None else completeness.patience_s
+        self._past_until_s = math.inf  # when to give up the time before the first message
+        self._num_past = 0  # how many messages of it have come
         self._arrivals = SequenceCheck()  # of what arrives, in that order
         self._held: dict[int, bytes] = {}
         self._run = 0
@@ -130,8 +108,13 @@ class Completion:
 
     # What arrives.
 
-    def receive(self, message: bytes, sequence: int, utime: int, session: int, now_s: float) -> None:
-        """Take a message that was published now. ``sequence`` is not negative."""
+    def receive(
+        self, message: bytes, sequence: int, utime: int, session: int, now_s: float, *, has_room: bool = True
+    ) -> None:
+        """Take a message that was published now. ``sequence`` is not negative.
+
+        Unless ``has_room``, it is let go, and is requested later.
+        """
         if self._is_ending:
             return
         self._arrivals.add(sequence, utime, session)
@@ -143,22 +126,34 @@ class Completion:
         self._until = max(self._until, sequence)
         if sequence > self._newest:
             self._newest, self._newest_utime, self._newest_session = sequence, utime, session
-        if self.problem:
+        if self._passes_on:
             self._hand_on(message)
             return
         if self._next is None and self._last_s is None:
             self._next = sequence
-        if sequence == self._next:
-            self._pass(sequence, message)
-        elif self._next is None or sequence > self._next:
-            self._hold(sequence, message)
+        if has_room:
+            self._pass_or_hold(sequence, message)
+        else:
+            self._since_s = now_s  # patience begins when requests can be made again
         self._look(now_s, is_live=True)
+        self.expire(now_s)
+
+    @property
+    def _passes_on(self) -> bool:
+        """Whether each message is handed on when it arrives."""
+        return bool(self.problem) or not (self._fills_gaps or self.is_past)
 
     def _is_restart(self, sequence: int, utime: int, session: int) -> bool:
         """Whether a message shows that the gateway has restarted, and is not only late."""
         if utime > self._newest_utime:
             return sequence <= self._newest or session < self._newest_session
         return self._newest - sequence > MAX_LATE
+
+    def _pass_or_hold(self, sequence: int, message: bytes) -> None:
+        if sequence == self._next:
+            self._pass(sequence, message)
+        elif self._next is None or sequence > self._next:
+            self._hold(sequence, message)
 
     def _hold(self, sequence: int, message: bytes) -> None:
         room = self._held_bytes
@@ -183,19 +178,48 @@ class Completion:
 
     def _look(self, now_s: float, *, is_live: bool = False) -> None:
         """Hand on what is held and follows, and note when to request what is missing, if it is."""
+        if self._passes_on:
+            return
         while self._next is not None and self._next in self._held:
             self._pass(self._next, self._release(self._next))
         if not self._is_missing and not (self._is_ending and not self._knows_end):
             self.due_s = math.inf
+            if self.is_past and self._next is not None:
+                self._end_past()
         elif self.due_s == math.inf:
-            self._since_s = now_s
-            self.due_s = now_s + (GRACE_S if is_live and self._next is not None else 0.0)
+            self._begin_to_request(now_s, now_s + (GRACE_S if is_live and self._next is not None else 0.0))
         elif is_live and now_s - self._heard_s > _SILENCE_S:
             self._since_s = now_s
         if is_live:
             self._heard_s = now_s
 
     # What is requested.
+
+    def begin(self, now_s: float) -> None:
+        """Request the time before the first message now: the gateway has some of it."""
+        if self.is_past and self.due_s == math.inf:
+            self._begin_to_request(now_s, now_s)
+
+    def _begin_to_request(self, now_s: float, due_s: float) -> None:
+        self._since_s, self.due_s = now_s, due_s
+        if self.is_past:
+            self._past_until_s = now_s + self._patience_s
+
+    @property
+    def _expires_s(self) -> float:
+        """When to go on without what is missing."""
+        if self.is_past:
+            return self._past_until_s
+        return self._since_s + self._patience_s if self.due_s < math.inf else math.inf
+
+    def reply_s(self, now_s: float) -> float:
+        """Return how long the next answer may take."""
+        return min(REPLY_S, max(self._expires_s - now_s, _MIN_REPLY_S))
+
+    def expire(self, now_s: float) -> None:
+        """Go on without what is missing, if that takes too long. Call it often while something is due."""
+        if now_s >= self._expires_s:
+            self._give_up(now_s)
 
     def request(self) -> HistoryRequest:
         """Return what to request; only if something is due."""
@@ -211,7 +235,7 @@ class Completion:
 
     def answer(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Take the answer to a request."""
-        if request.run != self._run or self.problem:
+        if request.run != self._run or self._passes_on:
             return
         numbered = [(sequence_of(message), message) for message in answer.messages]
         if self._is_of_other_run(numbered, request.known):
@@ -231,6 +255,9 @@ class Completion:
         if answer.is_whole:
             last = answer.last if request.last is None else min(answer.last, request.last)
             self._skip_to(last + 1)
+        if self.is_past and self._patience_s < math.inf:
+            self._num_past += len(numbered)
+            self._shorten_past(now_s)
         has_helped = self._next != former
         if not has_helped and request.known is not None:
             self._next_utime = None  # the known message may be so long that an answer has only that
@@ -272,9 +299,28 @@ class Completion:
                 self._hand_on(self._release(each))
             self._next, self._next_utime = number, None
 
+    def _shorten_past(self, now_s: float) -> None:
+        """Leave out the beginning of the past if all of it would take too long.
+
+        What is missing directly before the live messages would be worse for a display.
+        """
+        left_s = max(self._past_until_s - now_s, 0.0)
+        taken_s = self._patience_s - left_s
+        if self._next is None or taken_s < _ESTIMATE_SHARE * self._patience_s:
+            return
+        num_possible = int(self._num_past * left_s / taken_s)
+        first = min(self._held, default=self._until + 1)
+        if first - self._next > num_possible:
+            self._skip_past(first - int(_SAFE_SHARE * num_possible))
+
+    def _skip_past(self, number: int) -> None:
+        """Go on at a number, of the past or the first that is live: nobody has missed those before it."""
+        self._check.skip(number)
+        self._skip_to(number)
+
     def fail(self, request: HistoryRequest, code: str, text: str, now_s: float) -> None:
         """Take the error of a request: the code of the gateway, or no-gateway if nobody takes requests."""
-        if request.run != self._run or self.problem:
+        if request.run != self._run or self._passes_on:
             return
         if code in RETRY_CODES:
             patience_s = self._nobody_s if code == "no-gateway" else PATIENCE_S
@@ -305,9 +351,18 @@ class Completion:
             self._last_s = None
             self._next = min(self._held, default=None)
         else:
-            self._skip_to(min(self._held, default=self._until + 1))
+            first = min(self._held, default=self._until + 1)
+            (self._skip_past if self.is_past else self._skip_to)(first)
         self.due_s = math.inf
         self._look(now_s)
+        self._end_past()
+
+    def _end_past(self) -> None:
+        """Go on with what arrives now; without filling gaps, if that is not wanted."""
+        if self.is_past and not self._fills_gaps:
+            self._flush()
+            self.due_s = math.inf
+        self.is_past = False
 
     # Restarts and the end.
 
@@ -322,6 +377,7 @@ class Completion:
             self._newest, self._newest_session = -1, 0
         self.due_s = math.inf
         self._look(now_s)
+        self._end_past()
 
     def _pass_by(self, utime: int, newest: int, now_s: float) -> None:
         """Go on with the numbers of a gateway that has restarted, and is past those of before.
@@ -338,24 +394,24 @@ class Completion:
         for number in sorted(self._held.keys() - set(kept)):
             self._hand_on(self._release(number))
         if self._next is not None and not kept:
-            self._lose_before(self._until + 1)
+            self._check.end(self._until + 1)
 
     def _pass_on_only(self, problem: str) -> None:
         self._flush()
-        self.problem = problem
+        self.problem, self.is_past = problem, False
         self._next = self._next_utime = self._last_s = None
         self.due_s = math.inf
 
     def end(self, now_s: float) -> None:
         """Take nothing more that is published, and request everything until now."""
-        if not self.problem and self._next is not None:
+        if not self._passes_on and self._next is not None:
             self._is_ending = True
             self.due_s = min(self.due_s, now_s)
             self._since_s = now_s
 
     def abandon(self) -> None:
         """Hand on what is held, and request nothing more."""
-        if not self.problem:
+        if not self._passes_on:
             self._flush()
         self._is_ending = True
         self._run += 1

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import rtc3d
 
-from gateway.client.completion import HistoryAnswer
-from gateway.client.refill import REPLY_S
-from gateway.client.transport import history_answer
+from gateway.client.history_requests import HistoryAnswer, history_answer
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.history import MAX_ANSWER_BYTES, sequence_of
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
@@ -43,10 +41,13 @@ class LcmRefill:
         self._arrived: dict[str, dict[int, bytes]] = {}  # by channel and number
         self._num_bytes = 0
 
-    def ask(self, channels: str, options: Mapping[str, str]) -> HistoryAnswer:
-        """Ask the source whose channels begin with ``channels`` for messages. Raises QueryError."""
+    def ask(self, channels: str, options: Mapping[str, str], timeout_s: float) -> HistoryAnswer:
+        """Ask the source whose channels begin with ``channels`` for messages. Raises QueryError.
+
+        The reply may take ``timeout_s``.
+        """
         with self._asking:
-            facts = self._request(channels, options)
+            facts = self._request(channels, options, timeout_s)
             try:
                 channel, num_messages = str(facts["channel"]), int(facts["num_messages"])
                 answer = history_answer(facts, ())
@@ -60,12 +61,12 @@ class LcmRefill:
                         messages = [arrived[number] for number in numbers]
                         return answer._replace(messages=messages, is_whole=len(numbers) >= num_messages)
 
-    def keys(self, channels: str) -> list[str]:
-        """Return of which keys a source has messages. Raises QueryError."""
+    def overview(self, channels: str, timeout_s: float) -> Mapping[str, Any]:
+        """Return which messages there are of each key of a source. Raises QueryError."""
         with self._asking:
-            return [*self._request(channels, {}).get("keys", ())]
+            return self._request(channels, {}, timeout_s)
 
-    def _request(self, channels: str, options: Mapping[str, str]) -> Mapping[str, Any]:
+    def _request(self, channels: str, options: Mapping[str, str], timeout_s: float) -> Mapping[str, Any]:
         request = rtc3d.command_request_t()
         request.command = "history"
         request.options = [f"{name}={value}" for name, value in options.items()]
@@ -80,7 +81,7 @@ class LcmRefill:
         except (OutputError, OSError) as error:
             raise QueryError(str(error), code="timeout") from error
         with self._changed:
-            if not self._changed.wait_for(lambda: self._reply is not None, REPLY_S):
+            if not self._changed.wait_for(lambda: self._reply is not None, timeout_s):
                 raise QueryError("no reply about messages of the history", code="timeout")
             reply = self._reply
         if reply.error:

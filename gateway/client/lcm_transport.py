@@ -8,20 +8,24 @@ import threading
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 import rtc3d
 
-from gateway.client.completion import BUSY_CODES, HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import (
+    BUSY_CODES,
+    INCOMPLETE,
+    Completeness,
+    HistoryAnswer,
+    HistoryRequest,
+)
 from gateway.client.lcm_refill import LcmRefill
 from gateway.client.reception import FINGERPRINTS, POSE, Reception, Series, Source
 from gateway.client.transport import (
-    INCOMPLETE,
     RETRY_S,
-    Completeness,
     FoundSources,
     GatewaySubscriber,
     Query,
@@ -238,7 +242,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         requester: "LcmRequester",
         refill: LcmRefill,
     ) -> None:
-        super().__init__(prefix, reception, completeness)
+        super().__init__(prefix, components, reception, completeness)
         self._url = url
         self._names = {lcm_channel(prefix, name): name for name in sources}
         self._requester = requester
@@ -287,15 +291,28 @@ class LcmGatewaySubscriber(GatewaySubscriber):
                 if lcm_channel(self._prefix, name) == source.channels:
                     source.name, source.has_known_name = name, True
 
-    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """See GatewaySubscriber."""
-        channels = series.source.channels
         key = self._pose_keys.get(series, series.key)
         if key.startswith(POSE) and series not in self._pose_keys:
-            for each in self._refill.keys(channels):
-                if f"{channels}{lcm_channel('', *each.split('/', 1))}".encode() == series.channel:
+            for each in self._history_overview(series.source, timeout_s).get("keys", ()):
+                if _channel(series.source, each).encode() == series.channel:
                     key = self._pose_keys[series] = each
-        return self._refill.ask(channels, {"key": key, **request.options})
+        return self._refill.ask(series.source.channels, {"key": key, **request.options}, timeout_s)
+
+    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+        """See GatewaySubscriber."""
+        return self._refill.overview(source.channels, timeout_s)
+
+    def _kept_series(self, source: Source, key: str) -> Series | None:
+        """See GatewaySubscriber."""
+        channel = _channel(source, key)
+        is_pose = key.startswith(POSE)
+        series_key = f"{POSE}{channel.rpartition(_POSE_MARK)[2]}" if is_pose else key
+        series: Series | None = self._reception.series(source, series_key, channel)
+        if is_pose and series is not None:
+            self._pose_keys[series] = key
+        return series
 
     def _query(self, source: Source) -> None:
         """See GatewaySubscriber. Every gateway sends its status."""
@@ -340,6 +357,11 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._subscriber.close()
         self._refill.close()
         self._requester.close()
+
+
+def _channel(source: Source, key: str) -> str:
+    """Return the channel of a key of the history."""
+    return f"{source.channels}{lcm_channel('', *key.split('/', 1))}"
 
 
 class LcmRequester:

@@ -263,10 +263,10 @@ def _merged(frames: Sequence[Frame]) -> Frame:
 def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Frame]:
     """Yield the frames in messages, in their order. Messages that cannot be read are left out."""
     messages: dict[QueuedSeries, list[bytes]] = {}
-    for series, message, _, _ in arrivals:
+    for series, message, *_ in arrivals:
         messages.setdefault(series, []).append(message)
     decoded = {series: _rows(series, each) for series, each in messages.items()}
-    for series, _, arrived_utime, gap in arrivals:
+    for series, _, arrived_utime, gap, is_past in arrivals:
         found = next(decoded[series])
         if found is None:
             series.num_malformed += 1
@@ -274,7 +274,8 @@ def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Fra
             continue
         head, items = found
         source = cast(LiveSource, series.source)
-        source.clock.add(head[1], arrived_utime)
+        if not is_past:
+            source.clock.add(head[1], arrived_utime)
         component = COMPONENTS_BY_KEY[series.key]
         row = Row(component, head, items, *source.describe(component, head[5], head[1], items.shape[1]))
         total_gap, series.malformed_gap = gap + series.malformed_gap, 0

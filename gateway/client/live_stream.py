@@ -348,7 +348,7 @@ class Live:
         with self._taking:
             arrivals, self._pending = [*self._pending, *self._reception.take_waiting()], []
         batches: dict[QueuedSeries, MessageBatch] = {}
-        for series, message, arrived_utime, _ in arrivals:
+        for series, message, arrived_utime, *_ in arrivals:
             batch = batches.get(series)
             if batch is None:
                 batch = batches[series] = MessageBatch(series.source.name, series.key)

@@ -19,6 +19,9 @@ MAX_WAITING: Final = 40_000
 
 MAX_WAITING_BYTES: Final = 64 * 1024 * 1024
 
+_FULL: Final = 0.75
+"""From which share of these limits completed series let go what arrives, and request it later."""
+
 _MAX_ENTRIES: Final = 16
 """How many parameters of a source are kept: frames that wait belong to the newest ones."""
 
@@ -40,6 +43,11 @@ class QueuedSeries(Series):
         """How many of them came after the last one that could be."""
         self._num_lost = 0
 
+    @property
+    def is_past(self) -> bool:
+        """Whether what is taken now ``is_past``; see Arrival."""
+        return self.completion is not None and self.completion.is_past
+
     def new_losses(self) -> int:
         """Return how many messages are missing before the one that was counted last."""
         before, self._num_lost = self._num_lost, self.check.num_lost
@@ -47,12 +55,17 @@ class QueuedSeries(Series):
 
 
 class Arrival(NamedTuple):
-    """A message of a component, when it arrived on this host's clock, and how many are missing before it."""
+    """A message of a component.
+
+    ``arrived_utime`` is when it arrived, on this host's clock; ``gap`` is how many are missing before it. One
+    that ``is_past`` was published before the subscriber began, or has waited for such messages.
+    """
 
     series: QueuedSeries
     message: bytes
     arrived_utime: int
     gap: int
+    is_past: bool = False
 
 
 class DescribedSource(Source):
@@ -175,6 +188,11 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         """Whether more messages can be taken now without leaving out older ones."""
         return len(self._waiting) < MAX_WAITING // 2 and self._waiting_bytes < MAX_WAITING_BYTES // 2
 
+    @property
+    def is_full(self) -> bool:
+        """See Reception. There is still room for what was requested."""
+        return len(self._waiting) >= _FULL * MAX_WAITING or self._waiting_bytes >= _FULL * MAX_WAITING_BYTES
+
     def close(self) -> None:
         """Take nothing more, and wake all that wait."""
         with self._lock:
@@ -187,7 +205,7 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         if series.key not in COMPONENTS_BY_KEY:
             return
         gap = series.new_losses()
-        series.newest = arrival = Arrival(series, message, now_utime(), gap)
+        series.newest = arrival = Arrival(series, message, now_utime(), gap, series.is_past)
         if not self.is_queueing:
             return
         self._waiting.append(arrival)

@@ -6,14 +6,15 @@ import struct
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 import rtc3d
 
 from gateway.client.completion import Completion
-from gateway.client.refill import Ask, Refill
+from gateway.client.history_requests import Completeness
+from gateway.client.refill import Ask, FindSeries, Refill
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES, MESSAGE_TYPES, NOT_PUBLISHED, VERSION_OFFSET
@@ -118,6 +119,8 @@ class Source:
         """How many ``parameters_t`` were made of the parameters from Zenoh."""
         self.running_take: str | None = None
         """The name of the take that its gateway records; "" if none, None if it is not known."""
+        self.routers: Sequence[str] | None = None
+        """The names of the Zenoh routers between, the gateway's first; None if they are not known."""
         self.has_answer = False
         """Whether a gateway has answered the query for the parameters, or published them."""
         self.series_by_key: dict[str, Any] = {}
@@ -250,8 +253,10 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
             series = source.series_by_key[key] = self._new_series(source, key, free)
             self._num_series += 1
-            if self.refill is not None and self._completes(series):
-                series.completion = self.refill.add(series, partial(self._hand_on, series))
+            if self.refill is not None:
+                self.refill.begin(source)
+                if self._completes(series):
+                    series.completion = self.refill.add(series, partial(self._hand_on, series))
         return series
 
     def receive(self, series: SeriesT, message: bytes) -> None:
@@ -269,7 +274,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             if completion is not None:
                 utime, _, sequence, session = _FIELDS.unpack_from(message, FINGERPRINT_BYTES)
                 if sequence >= 0:
-                    completion.receive(message, sequence, utime, session, now_s)
+                    completion.receive(message, sequence, utime, session, now_s, has_room=not self.is_full)
                     if completion.due_s < math.inf and self.refill is not None:
                         self.refill.check(series)
                     return
@@ -280,9 +285,9 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             series.count(message)
             self._take(series, message)
 
-    def complete(self, ask: Ask, last_s: float | None) -> None:
-        """Fill the gaps of all series from now on, with what ``ask`` returns; see Refill."""
-        self.refill = Refill(self, self._lock, ask, last_s)
+    def complete(self, ask: Ask, find: FindSeries, completeness: Completeness) -> None:
+        """Complete all series from now on, with what ``ask`` returns; see Refill."""
+        self.refill = Refill(self, self._lock, ask, find, completeness)
 
     def ignore(self, *, beyond_limit: bool) -> None:
         """Count a message that is left out."""
@@ -359,6 +364,11 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
     def has_room(self) -> bool:
         """Whether more messages can be taken now. Nothing is requested otherwise."""
         return True
+
+    @property
+    def is_full(self) -> bool:
+        """Whether what arrives of completed series is let go now, and requested when there is room."""
+        return False
 
     def _completes(self, series: SeriesT) -> bool:
         """Whether to fill the gaps of a series."""

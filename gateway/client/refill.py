@@ -7,18 +7,26 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from gateway.client.completion import Completion, HeldBytes, HistoryAnswer, HistoryRequest
+from gateway.client.completion import RETRY_S, Completion, HeldBytes
+from gateway.client.history_requests import BUSY_CODES, REPLY_S, Completeness, HistoryAnswer, HistoryRequest
 from gateway.errors import QueryError
 from gateway.workers import thread_starts
 
 if TYPE_CHECKING:
     from gateway.client.reception import Reception, Series, Source
 
-Ask = Callable[[Any, HistoryRequest], HistoryAnswer]
-"""Requests messages of a series, and returns the answer. It blocks. Raises QueryError."""
+Ask = Callable[[Any, HistoryRequest, float], HistoryAnswer]
+"""Requests messages of a series, and returns the answer. The last argument is how many seconds it may take.
 
-REPLY_S: Final = 2.0
-"""How long an answer may take. The gateway drops those to a peer that reads too slowly."""
+It blocks. Raises QueryError.
+"""
+
+FindSeries = Callable[[Any, float, float], "list[Any]"]
+"""Returns the series of a source of which the gateway has messages of the last seconds, and that are wanted.
+
+The arguments are the source, the number of these seconds, and how many seconds it may take. It blocks. Raises
+QueryError.
+"""
 
 _WAIT_S: Final = 0.05
 """When to look again whether the program can take more messages."""
@@ -27,15 +35,22 @@ _WAIT_S: Final = 0.05
 class Refill:
     """Completes the series of a reception; its ``lock`` protects everything here.
 
-    Requests are made with ``ask``. With ``last_s``, each series begins with the messages of these seconds.
+    Requests are made with ``ask``. If the last seconds are wanted, ``find`` finds the series that nothing
+    arrives of now.
     """
 
     def __init__(
-        self, reception: "Reception[Any, Any]", lock: threading.Lock, ask: Ask, last_s: float | None
+        self,
+        reception: "Reception[Any, Any]",
+        lock: threading.Lock,
+        ask: Ask,
+        find: FindSeries,
+        completeness: Completeness,
     ) -> None:
+        self.completeness = completeness
         self._reception = reception
         self._ask = ask
-        self._last_s = last_s
+        self._find = find
         self._held_bytes = HeldBytes()
         self._changed = threading.Condition(lock)
         self._completions: dict[Series, Completion] = {}
@@ -46,19 +61,29 @@ class Refill:
 
     def add(self, series: "Series", hand_on: Callable[[bytes], object]) -> Completion:
         """Return what completes a series, which hands its messages on."""
-        completion = Completion(hand_on, series.check.end, self._held_bytes, self._last_s)
+        completion = Completion(hand_on, series.check, self._held_bytes, self.completeness)
         self._completions[series] = completion
         return completion
 
-    def check(self, series: "Series") -> None:
-        """Note that there is something to request of a series."""
-        due = self._due.get(series.source)
+    def begin(self, source: "Source") -> None:
+        """Note that there is a source, which may have had messages in the last seconds."""
+        if self.completeness.last_s is not None:
+            self._due_of(source)
+
+    def _due_of(self, source: "Source") -> "dict[Series, Completion]":
+        """Return the series of a source of which something is to be requested, by a thread of the source."""
+        due = self._due.get(source)
         if due is None:
             due = {}
-            thread = threading.Thread(target=self._run, args=(due,), name="refill", daemon=True)
+            thread = threading.Thread(target=self._run, args=(source, due), name="refill", daemon=True)
             with contextlib.suppress(RuntimeError):  # without a thread now, the next message tries again
                 thread_starts.start(thread)
-                self._due[series.source] = due
+                self._due[source] = due
+        return due
+
+    def check(self, series: "Series") -> None:
+        """Note that there is something to request of a series."""
+        due = self._due_of(series.source)
         if series not in due:
             due[series] = self._completions[series]
             self._changed.notify_all()
@@ -95,20 +120,22 @@ class Refill:
 
     # In the threads.
 
-    def _run(self, due: "dict[Series, Completion]") -> None:
+    def _run(self, source: "Source", due: "dict[Series, Completion]") -> None:
+        if self.completeness.last_s is not None:
+            self._begin_silent(source, self.completeness.last_s)
         while True:
-            while not self._reception.has_room:
+            while not (self._reception.has_room or self._is_closed):
                 time.sleep(_WAIT_S)
             with self._changed:
                 series = self._wait(due)
                 if series is None:
                     return
                 completion = due[series]
-                request = completion.request()
+                request, reply_s = completion.request(), completion.reply_s(time.monotonic())
             answer: HistoryAnswer | None = None
             code = text = ""
             try:
-                answer = self._ask(series, request)
+                answer = self._ask(series, request, reply_s)
             except QueryError as error:
                 code, text = error.code, str(error)
             except Exception as defect:  # noqa: BLE001 - what arrives is handed on
@@ -121,12 +148,36 @@ class Refill:
                 else:
                     completion.answer(request, answer, now_s)
 
+    def _begin_silent(self, source: "Source", last_s: float) -> None:
+        """Begin the series of a source that had messages in the last seconds, and may have none now."""
+        end_s = time.monotonic() + min(REPLY_S, self.completeness.patience_s or REPLY_S)
+        found: list[Series] = []
+        while (left_s := end_s - time.monotonic()) > 0 and not self._is_closed:
+            try:
+                found = self._find(source, last_s, left_s)
+                break
+            except QueryError as error:
+                if error.code not in BUSY_CODES:
+                    return  # without it, only series that something arrives of are found
+            except Exception as defect:  # noqa: BLE001 - as in _run
+                self._reception.failed(defect)
+                return
+            time.sleep(RETRY_S)
+        with self._changed:
+            for series in found:
+                completion = self._completions.get(series)
+                if completion is not None:
+                    completion.begin(time.monotonic())
+                    self.check(series)
+
     def _wait(self, due: "dict[Series, Completion]") -> "Series | None":
         """Wait until there is something to request, and return of which series; None at the end."""
         while not self._is_closed:
+            now_s = time.monotonic()
+            for completion in due.values():
+                completion.expire(now_s)
             for series in [each for each, completion in due.items() if completion.due_s == math.inf]:
                 del due[series]
-            now_s = time.monotonic()
             ready = [series for series in due if due[series].due_s <= now_s]
             if ready:  # so no series is far ahead of the others
                 return min(ready, key=lambda series: due[series].reached_utime)

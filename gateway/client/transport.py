@@ -4,11 +4,12 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
-from gateway.client.completion import HistoryAnswer, HistoryRequest
-from gateway.client.reception import FINGERPRINTS, MAX_SERIES, Reception, Series, Source
+from gateway.client.history_requests import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.reception import FINGERPRINTS, MAX_SERIES, POSE, TYPES_BY_KEY, Reception, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
@@ -72,6 +73,12 @@ class FoundSources:
         for name in names:
             self.add(SourceReport(safe_text(name), problem=NO_ANSWER))
 
+    def add_routers(self, way_from: Callable[[str], Sequence[str] | None]) -> None:
+        """Add to each source what ``way_from`` returns for its gateway: see SourceReport.routers."""
+        for identity, source in self._sources.items():
+            if source.gateway:
+                self._sources[identity] = replace(source, routers=way_from(source.gateway))
+
     def add(self, source: SourceReport) -> None:
         """Add a source, or replace what an earlier status said about it."""
         where = (source.gateway,) if source.gateway else (source.server, source.host)
@@ -102,6 +109,9 @@ RETRY_S: Final = 0.5
 """How long to wait before repeating a query that got no reply, or came while there were too many."""
 
 _CLOSE_S: Final = 0.5
+
+_MAX_KEY_CHARACTERS: Final = 512
+"""Gateways accept no longer keys in queries, and Zenoh panics above 64 kB."""
 
 ReceivedT = TypeVar("ReceivedT")
 
@@ -185,27 +195,24 @@ class TimeLimits:
         )
 
 
-class Completeness(NamedTuple):
-    """Whether to request what was missed; each series begins with the messages of ``last_s`` seconds."""
-
-    is_complete: bool = False
-    last_s: float | None = None
-
-
-INCOMPLETE: Final = Completeness()
-
-
 class GatewaySubscriber(ABC):
     """Hands what gateways publish to a Reception, sorted by source and key.
 
     An address is what a message arrives under: its key on Zenoh, or its channel on LCM.
     """
 
-    def __init__(self, prefix: str, reception: Reception[Any, Any], completeness: Completeness) -> None:
+    def __init__(
+        self,
+        prefix: str,
+        components: Collection[str] | None,
+        reception: Reception[Any, Any],
+        completeness: Completeness,
+    ) -> None:
         self._prefix = prefix
+        self._components = components
         self._reception = reception
-        if completeness.is_complete:
-            reception.complete(self._ask_history, completeness.last_s)
+        if completeness != INCOMPLETE:
+            reception.complete(self._ask_history, self._find_kept, completeness)
         self._series: dict[str, Series | None] = {}  # by address; None: left out
 
     # In the threads that receive.
@@ -249,8 +256,22 @@ class GatewaySubscriber(ABC):
     # In the threads that request what is missing.
 
     @abstractmethod
-    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """Request messages of a series, and return the answer. Raises QueryError."""
+
+    def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[Series]:
+        """Return the wanted series of which the gateway has messages of the last seconds; see FindSeries."""
+        keys = recent_keys(self._history_overview(source, timeout_s), self._components, last_s)
+        found = [self._kept_series(source, key) for key in keys]
+        return [series for series in found if series is not None]
+
+    @abstractmethod
+    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+        """Return what the history has of a source (docs/reference/queries.md). Raises QueryError."""
+
+    @abstractmethod
+    def _kept_series(self, source: Source, key: str) -> Series | None:
+        """Return the series of a key of the history, new or not; None if there are too many."""
 
     # In one other thread.
 
@@ -267,6 +288,9 @@ class GatewaySubscriber(ABC):
     @abstractmethod
     def query_takes(self, source: Source) -> None:
         """Query which take the gateway of a source records; see Source.running_take."""
+
+    def query_routers(self) -> None:  # noqa: B027 - there are none on LCM
+        """Query now and then which routers are between gateways and here: Source.routers. Call it often."""
 
     @abstractmethod
     def silence(self) -> str:
@@ -311,14 +335,25 @@ class Transport(ABC):
         """Close the connection."""
 
 
-def history_answer(
-    facts: Mapping[str, Any], messages: Sequence[bytes], *, is_whole: bool = True
-) -> HistoryAnswer:
-    """Return messages as the answer that the gateway's ``facts`` describe. Raises ProtocolError."""
-    first, last, newest = (facts.get(name) for name in ("from", "to", "newest"))
-    if not (isinstance(first, int) and isinstance(last, int) and isinstance(newest, int)):
-        raise ProtocolError("an answer with messages from the history does not say which they are")
-    return HistoryAnswer(messages, first, last, newest, is_whole)
+def recent_keys(overview: Mapping[str, Any], components: Collection[str] | None, last_s: float) -> list[str]:
+    """Return the keys of these components (None: all) of which a history has messages of the last seconds.
+
+    Raises QueryError if the overview cannot be read.
+    """
+    try:
+        newest = {str(key): int(facts["newest_utime"]) for key, facts in overview["keys"].items()}
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise QueryError("an answer about the history cannot be read", code="unreadable") from error
+    begin_utime = max(newest.values(), default=0) - 1e6 * last_s  # a gateway publishes a status every second
+    wanted = {*TYPES_BY_KEY, "6d"} if components is None else {*components, "status"}
+    return [
+        key
+        for key, utime in newest.items()
+        if utime >= begin_utime
+        and key.partition("/")[0] in wanted
+        and (key in TYPES_BY_KEY or key.startswith(POSE))
+        and len(key) <= _MAX_KEY_CHARACTERS
+    ]
 
 
 def silence_text(subscriber: GatewaySubscriber, reception: Reception[Any, Any]) -> str:

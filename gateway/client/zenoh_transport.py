@@ -1,21 +1,29 @@
 """Gateways on Zenoh: asking one source or all until there is a reply, and receiving what they publish."""
 
+import contextlib
 import json
+import math
 import re
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 from urllib.parse import unquote
 
 import zenoh
 
-from gateway.client.completion import BUSY_CODES, HistoryAnswer, HistoryRequest
-from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
-from gateway.client.refill import REPLY_S
-from gateway.client.transport import (
+from gateway.client.history_requests import (
+    BUSY_CODES,
     INCOMPLETE,
-    RETRY_S,
     Completeness,
+    HistoryAnswer,
+    HistoryRequest,
+    history_answer,
+)
+from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
+from gateway.client.transport import (
+    MAX_STATUS_BYTES,
+    RETRY_S,
     FoundSources,
     GatewaySubscriber,
     Query,
@@ -23,13 +31,20 @@ from gateway.client.transport import (
     Reply,
     TimeLimits,
     Transport,
-    history_answer,
 )
 from gateway.errors import ProtocolError, QueryError
 from gateway.messages.decode import TEXT
 from gateway.messages.history import unpack_messages
-from gateway.messages.topics import DEFAULT_LCM_PREFIX, is_json_key, lcm_channel, unique_name, zenoh_key
+from gateway.messages.topics import (
+    DEFAULT_LCM_PREFIX,
+    escape_key_chunk,
+    is_json_key,
+    lcm_channel,
+    unique_name,
+    zenoh_key,
+)
 from gateway.outputs.kind import DISCOVERY_S
+from gateway.outputs.zenoh.routers import DESCRIPTIONS, RouterNetwork, read_routers
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
@@ -71,6 +86,7 @@ class ZenohTransport(Transport):
                 found.add_silent(sorted(silent))
                 break
             time.sleep(RETRY_S)
+        found.add_routers(read_routers(self._session, _STATUS_S).names_from)
         return found
 
     def _served(self) -> list[str]:
@@ -203,6 +219,8 @@ class ZenohTransport(Transport):
 
 
 _QUERY_S: Final = 1.0
+_KNOWN_S: Final = 5.0
+"""When to query again which routers are between, if that is known."""
 
 _SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,24}")
 _NO_KEYS: Final = {"c3d", "recording", "take"}
@@ -224,9 +242,12 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         reception: Reception[Any, Any],
         completeness: Completeness,
     ) -> None:
-        super().__init__(prefix, reception, completeness)
+        super().__init__(prefix, components, reception, completeness)
         self._session = session
         self._sources = sources
+        self._network = RouterNetwork(session)
+        self._gateways: dict[Source, str] = {}  # the Zenoh ids of their gateways
+        self._queried_s = -math.inf  # when routers were queried
         for name in served_sources(session, prefix):
             if _SOURCE_NAME.fullmatch(name) and (not sources or name in sources):
                 self._source(name)
@@ -253,8 +274,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             self._reception.ignore(beyond_limit=False)
             return None
         source = self._source(name)
-        names = (path,) if label is None else ("6d", label)
-        return source, path, "" if source is None else lcm_channel(source.channels, *names)
+        return source, path, "" if source is None else _channel(source, path)
 
     def _take(self, series: Series, message: bytes, sample: zenoh.Sample) -> None:
         if series.key != "parameters":
@@ -276,22 +296,43 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             float(age_s) if isinstance(age_s, int | float) and 0 <= age_s < 1e9 else 0.0,
         )
 
-    def _ask_history(self, series: Series, request: HistoryRequest) -> HistoryAnswer:
+    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """See GatewaySubscriber."""
         options = ";".join(f"{name}={value}" for name, value in request.options.items())
         selector = f"{zenoh_key(self._prefix, series.source.name)}/{series.key}?{options}"
+        sample = self._first_reply(selector, timeout_s)
+        try:
+            return history_answer(attached_facts(sample), unpack_messages(sample.payload.to_bytes()))
+        except ProtocolError as problem:
+            raise QueryError(str(problem), code="zenoh") from problem
+
+    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+        """See GatewaySubscriber."""
+        sample = self._first_reply(zenoh_key(self._prefix, source.name, "history"), timeout_s)
+        overview = None
+        if len(sample.payload) <= MAX_STATUS_BYTES:
+            with contextlib.suppress(ValueError, RecursionError):
+                overview = json.loads(sample.payload.to_bytes())
+        return overview if isinstance(overview, dict) else {}
+
+    def _kept_series(self, source: Source, key: str) -> Series | None:
+        """See GatewaySubscriber."""
+        path = "/".join(map(escape_key_chunk, key.split("/", 1)))
+        return self._reception.series(source, path, _channel(source, path))
+
+    def _first_reply(self, selector: str, timeout_s: float) -> zenoh.Sample:
+        """Return the first reply that is no error. Raises QueryError if there is none."""
         error = QueryError("no gateway keeps these messages", code="no-gateway")
         try:
             for reply in self._session.get(
-                selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=REPLY_S
+                selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s
             ):
                 if reply.ok is not None:
-                    messages = unpack_messages(reply.ok.payload.to_bytes())
-                    return history_answer(attached_facts(reply.ok), messages)
+                    return reply.ok
                 if reply.err is not None:
                     text = reply.err.payload.to_bytes().decode("utf-8", "replace")
                     error = QueryError(text, code=error_code(reply.err) or "timeout")
-        except (zenoh.ZError, ProtocolError) as problem:
+        except zenoh.ZError as problem:
             error = QueryError(str(problem), code="zenoh")
         raise error
 
@@ -321,6 +362,26 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
 
         self._get(source, "take", take)
 
+    def query_routers(self) -> None:
+        """See GatewaySubscriber. It takes what the queries before have found."""
+        sources = self._reception.sources_now
+        is_known = all(source.routers is not None for source in sources)
+        now_s = time.monotonic()
+        if now_s - self._queried_s < (_KNOWN_S if is_known else _QUERY_S):
+            return
+        self._queried_s = now_s
+        for source in sources:
+            if source in self._gateways:
+                source.routers = self._network.names_from(self._gateways[source])
+            self._get(source, "status", partial(self._take_gateway, source))
+        self._network = RouterNetwork(self._session)
+        if self._network.connected:
+            self._session.get(DESCRIPTIONS, self._network.add, timeout=_QUERY_S)
+
+    def _take_gateway(self, source: Source, reply: zenoh.Reply) -> None:
+        if reply.ok is not None and reply.replier_id is not None:
+            self._gateways[source] = str(reply.replier_id.zid)
+
     def _get(self, source: Source, key: str, on_reply: Callable[[zenoh.Reply], None]) -> None:
         self._session.get(zenoh_key(self._prefix, source.name, key), on_reply, timeout=_QUERY_S)
 
@@ -330,6 +391,12 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
 
     def _close(self) -> None:
         self._session.close()
+
+
+def _channel(source: Source, path: str) -> str:
+    """Return the channel of a key below a source."""
+    is_pose = path.startswith(POSE)
+    return lcm_channel(source.channels, *(("6d", unquote(path.removeprefix(POSE))) if is_pose else (path,)))
 
 
 def attached_facts(sample: zenoh.Sample) -> dict[str, Any]:

@@ -282,7 +282,7 @@ class HistorySettings(Section):
     """The newest messages, kept in memory, so that subscribers can ask for those they have missed."""
 
     seconds: values.IntervalSeconds = 60.0
-    """How long messages are kept. 0 keeps none."""
+    """How long messages are kept. With 0, none are, and none come from the disk."""
 
     max_bytes: values.ByteLimit = 128 * 1024 * 1024
     """The memory for the messages of all sources, which share it equally. The oldest are dropped first."""

@@ -6,12 +6,20 @@
 import logging
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.client.queued_reception import DescribedSource, QueuedReception, QueuedSeries
+from gateway.client.queued_reception import (
+    MAX_WAITING_BYTES,
+    Arrival,
+    DescribedSource,
+    QueuedReception,
+    QueuedSeries,
+)
 from gateway.descriptions.labels import Description, EventText, describe, event_text
+from gateway.display.statistics import WINDOW_S, Latency, Visibility
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
@@ -22,101 +30,6 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array, decode_rows
 
 logger = logging.getLogger(__name__)
-
-WINDOW_S: Final = 10.0
-_STEP_S: Final = 0.5
-
-
-def visible_percent(share: float) -> float:
-    """Return a share from 0 to 1 in %, for one decimal: only 0 and 1 themselves become 0.0 and 100.0."""
-    return 100 * share if share in {0, 1} else min(max(100 * share, 0.1), 99.9)
-
-
-class Visibility:
-    """Counts in steps of half a second, over WINDOW_S, in how many frames each item was visible."""
-
-    def __init__(self) -> None:
-        self._steps: deque[tuple[float, int, Array]] = deque()  # begin, number of frames, visible frames
-
-    def add(self, is_visible: Array, now_s: float) -> None:
-        """Take frames; ``is_visible`` has the shape (frames, items).
-
-        If the number of items changes, counting starts again.
-        """
-        self._forget(now_s)
-        num_frames, num_items = is_visible.shape
-        if self._steps and len(self._steps[-1][2]) != num_items:
-            self._steps.clear()
-        begin_s, counts = now_s, is_visible.sum(axis=0)
-        if self._steps and now_s - self._steps[-1][0] < _STEP_S:
-            begin_s, former_frames, former_counts = self._steps.pop()
-            num_frames, counts = former_frames + num_frames, former_counts + counts
-        self._steps.append((begin_s, num_frames, counts))
-
-    def shares(self, now_s: float) -> Array:
-        """Return for each item the share of frames in which it was visible, from 0 to 1, shape (items,).
-
-        The shape is (0,) if no frame came within WINDOW_S.
-        """
-        self._forget(now_s)
-        num_frames = sum(frames for _, frames, _ in self._steps)
-        if not num_frames:
-            return np.zeros(0)
-        total: Array = np.sum([counts for _, _, counts in self._steps], axis=0)
-        return total / num_frames
-
-    def _forget(self, now_s: float) -> None:
-        while self._steps and now_s - self._steps[0][0] > WINDOW_S:
-            self._steps.popleft()
-
-
-_NUM_SAMPLES: Final = 2000
-_NUM_SHOWN: Final = 300
-"""10 s at 30 pictures per second."""
-
-
-class Percentiles(NamedTuple):
-    """Percentiles of a latency, in milliseconds."""
-
-    p50_ms: float
-    p99_ms: float
-
-    @classmethod
-    def of(cls, samples_ms: Any) -> "Percentiles | None":
-        """Return the percentiles of a sequence of samples; None if it is empty."""
-        return cls(*np.percentile(samples_ms, (50, 99)).tolist()) if len(samples_ms) else None
-
-
-class Latency:
-    """The latencies of the newest messages, at most 2000, by stage.
-
-    Latencies to this computer are on two clocks if the gateway runs on another computer, and then they are
-    only as exact as these clocks agree. They may be negative.
-    """
-
-    def __init__(self) -> None:
-        self._samples = np.zeros((_NUM_SAMPLES, 2))  # ms from capture to the gateway, and from there to here
-        self._num_added = 0
-        self.shown_ms: deque[float] = deque(maxlen=_NUM_SHOWN)
-        """From the arrival at this program to the browsers, of what they have shown."""
-
-    def add(self, capture_utime: Array, utime: Array, arrived_utime: Array) -> None:
-        """Take the times of messages, each with the shape (messages,), in µs since the Unix epoch."""
-        times = np.stack([capture_utime, utime, arrived_utime]).astype(np.float64)[:, -_NUM_SAMPLES:]
-        places = (self._num_added + np.arange(times.shape[1])) % _NUM_SAMPLES
-        self._samples[places] = np.diff(times, axis=0).T / 1000
-        self._num_added += times.shape[1]
-
-    @property
-    def to_gateway(self) -> Percentiles | None:
-        """From the capture to the arrival at the gateway; None before the first message."""
-        return Percentiles.of(self._samples[: self._num_added, 0])
-
-    @property
-    def to_here(self) -> Percentiles | None:
-        """From the arrival at the gateway to the arrival at this program; None before the first message."""
-        return Percentiles.of(self._samples[: self._num_added, 1])
-
 
 _RATE_WINDOW_S: Final = 2.0
 
@@ -151,6 +64,7 @@ class LiveComponent:
         self._rate_before_stop_hz = 0.0
         self._paused_s = 0.0  # how long it was held so far
         self._updated_s = self._now_s
+        self._has_past = False  # whether messages of the batch are of the past
         self._arrived_s: float | None = None
         self._arrived_utime = 0  # of the newest message, before it waited for ``update``
         self._described: tuple[Parameters | None, int] = (None, 0)
@@ -164,35 +78,53 @@ class LiveComponent:
         """The monotonic clock, which stands still in pauses."""
         return time.monotonic() - self._paused_s
 
-    def update(self, arrived: list[tuple[bytes, int]], parameters: Parameters | None) -> None:
-        """Decode messages that have arrived, and describe their items by the source's parameters."""
+    def update(
+        self, arrived: Sequence[Arrival], parameters: Parameters | None, gateway_utime: int = 0
+    ) -> None:
+        """Decode messages that have arrived, and describe their items by the source's parameters.
+
+        ``gateway_utime`` is the time of the newest message of the source: how old those of the past are.
+        """
         now_s = self._updated_s = self._now_s
-        self.batch = rows = decode_rows(self.type, [message for message, _ in arrived])
+        self.batch = rows = decode_rows(self.type, [arrival.message for arrival in arrived])
         self.num_malformed += rows.malformed
-        num_before = self._counts[-1][1] if self._counts else 0
-        self._counts.append((now_s, num_before + len(arrived)))
+        self._has_past = any(arrival.is_past for arrival in arrived)
+        times_s = np.full(len(rows.heads), now_s)
+        if self._has_past:
+            ages_us = gateway_utime - rows.heads["utime"].astype(np.float64)
+            times_s -= np.clip(ages_us / 1e6, 0, WINDOW_S)
+            self._count_past(times_s)
+        else:
+            num_before = self._counts[-1][1] if self._counts else 0
+            self._counts.append((now_s, num_before + len(arrived)))
         while len(self._counts) > 2 and now_s - self._counts[1][0] >= _RATE_WINDOW_S:
             self._counts.popleft()
         if len(rows.heads):
-            self._arrived_s = now_s
-            self._arrived_utime = arrived[-1][1]
+            self._arrived_s = float(times_s[-1])
+            self._arrived_utime = arrived[-1].arrived_utime
             self._rate_before_stop_hz = self.rate_hz
             head = self.newest_head = rows.heads[-1]
             self.newest_items = rows.items[int(head["num_items"])][-1]
-            if not rows.malformed:
-                times = np.array([utime for _, utime in arrived])
+            if not (rows.malformed or self._has_past):
+                times = np.array([arrival.arrived_utime for arrival in arrived])
                 self.latency.add(rows.heads["capture_utime"], rows.heads["utime"], times)
             if self.type in {ComponentType.MARKERS, ComponentType.TOOLS}:  # the others are never missing
-                for items in rows.items.values():
-                    self._visibility.add(_is_visible(items), now_s)
+                for num_items, items in rows.items.items():
+                    self._visibility.add(_is_visible(items), times_s[rows.heads["num_items"] == num_items])
         num_items = len(self.newest_items)
         if self._described[0] is not parameters or self._described[1] != num_items:
             self._described = (parameters, num_items)
             self.description = describe(self.type, parameters, num_items)
 
+    def _count_past(self, times_s: Array) -> None:
+        """Let the rate be that of the times of messages of the past; ``times_s`` are those on this clock."""
+        recent_s = times_s[times_s > times_s[-1:] - _RATE_WINDOW_S].tolist()
+        if recent_s:
+            self._counts = deque([(recent_s[0], 0), (recent_s[-1], len(recent_s) - 1)])
+
     def note_shown(self) -> None:
         """Take note that the newest messages are sent to the browsers now."""
-        if len(self.batch.heads):
+        if len(self.batch.heads) and not self._has_past:
             self.latency.shown_ms.append((now_utime() - self._arrived_utime) / 1000)
 
     @property
@@ -324,14 +256,14 @@ class LiveSource(DescribedSource):
         """Whether some component has come before and comes no more."""
         return any(component.is_stopped for component in [*self.components.values()])
 
-    def update(self, arrived: dict[str, list[tuple[bytes, int]]]) -> None:
+    def update(self, arrived: dict[str, list[Arrival]]) -> None:
         """Decode what has arrived since the last call, by the key of the component."""
         self.update_parameters()
         if self.status is not self._read_status:
             self._read_status = self.status
             self._decode_status(self.status or b"")
         for key, component in [*self.components.items()]:
-            component.update(arrived.get(key, []), self.newest_parameters)
+            component.update(arrived.get(key, []), self.newest_parameters, self.last_utime or 0)
         events = self.components.get("event")
         if events is None:
             return
@@ -358,13 +290,24 @@ class LiveData(QueuedReception[LiveSource]):
 
     Messages are received in the threads of Zenoh or LCM. ``update`` decodes them; it and everything that it
     changes belong to one thread. Messages that are not decoded in time are skipped, never queued.
+    Only those of the past wait until all are there: nobody wants to see the last seconds in fast motion.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._past: dict[QueuedSeries, list[Arrival]] = {}
 
     def update(self) -> list[LiveSource]:
         """Decode what has arrived; return the sources, sorted by name. Call it at least 10 times a second."""
-        arrived: dict[QueuedSeries, list[tuple[bytes, int]]] = {}
-        for series, message, arrived_utime, _ in self.take_waiting():
-            arrived.setdefault(series, []).append((message, arrived_utime))
+        waiting = {series for series in self.all_series if series.is_past}
+        for arrival in self.take_waiting():
+            self._past.setdefault(arrival.series, []).append(arrival)
+        if (
+            waiting
+            and sum(len(each.message) for all_ in self._past.values() for each in all_) > MAX_WAITING_BYTES
+        ):
+            waiting.clear()
+        arrived = {series: self._past.pop(series) for series in [*self._past] if series not in waiting}
         sources = self.sources_now
         for source in sources:
             all_series = source.series
@@ -397,6 +340,11 @@ class LiveData(QueuedReception[LiveSource]):
             self.sources.clear()
             self._num_series = 0
         self.clear_waiting()
+
+    def _completes(self, series: QueuedSeries) -> bool:
+        """Of what is not shown, the past is not needed."""
+        is_complete = self.refill is not None and self.refill.completeness.is_complete
+        return super()._completes(series) and (is_complete or series.key in COMPONENTS_BY_KEY)
 
     def _new_source(self, name: str, channels: str) -> LiveSource:
         return LiveSource(name, channels)

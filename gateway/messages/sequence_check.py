@@ -154,6 +154,12 @@ class SequenceCheck:
             self._add_gap(Gap(current.utime, stop - current.newest - 1, stop), current.gaps)
             current.newest = stop - 1
 
+    def skip(self, stop: int) -> None:
+        """Go on before number ``stop``: what is between the newest message and that is not missing."""
+        current = self._current
+        if current is not None and stop > current.newest + 1:
+            current.newest = stop - 1
+
     def _fill_gap(self, current: _Numbering, sequence: int, utime: int) -> bool:
         """Return whether a message was missing, and was only overtaken by others."""
         if not (0 < current.newest - sequence <= MAX_LATE and utime <= current.utime):

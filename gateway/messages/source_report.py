@@ -123,6 +123,8 @@ class SourceReport:
     translation_m: Sequence[float] = ()
     streams: Sequence[StreamReport] = ()
     outputs: Sequence[OutputReport] = ()
+    routers: Sequence[str] | None = None
+    """The names of the Zenoh routers between, the gateway's first; None if they are not known."""
 
     @property
     def text(self) -> str:

@@ -237,7 +237,7 @@ class FanOut:
         if is_older:
             last = found.oldest - 1 if wanted.last is None else min(wanted.last, found.oldest - 1)
             recorded = await self._recorded(disk, key, wanted._replace(last=last))
-            if recorded is not None and recorded.messages:
+            if recorded is not None and (recorded.messages or _goes_on(recorded, wanted, last)):
                 return recorded._replace(newest=found.newest)
         return found._replace(oldest=oldest)
 
@@ -403,3 +403,8 @@ class FanOut:
         for route in self._routes:
             if route.frame_route is not None:
                 route.output.publish_parameters(self._source, parameters)
+
+
+def _goes_on(recorded: FoundMessages, wanted: WantedMessages, last: int) -> bool:
+    """Return whether the disk may have more up to ``last``: a slow one gives a part, which may be empty."""
+    return recorded.last < last and (wanted.first is None or recorded.last >= wanted.first)

@@ -4,6 +4,7 @@ The server gets one request at a time, and equal questions at the same time shar
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, Protocol
@@ -92,6 +93,8 @@ class SourceQueries:
         self._newest_json = NewestJson()
         self._controls = TokenBucket(CONTROLS_PER_S)
         self._finds = TokenBucket(_FINDS_PER_S)
+        self.num_found: Counter[str] = Counter()
+        """How many messages of the history peers have got, by output."""
         self.parameters: ParameterCache = ParameterCache(
             settings, self._requests, announce_parameters, history
         )
@@ -204,7 +207,8 @@ class SourceQueries:
     async def _without_server(self, question: Question, output: str) -> Answer:
         """Return the status, or what the history has: all keys, or messages of MAX_ANSWER_BYTES at most."""
         if question.kind == "history":
-            return Answer(json_bytes(self._published.history_overview), JSON)
+            overview = {**self._published.history_overview, "num_found": self.num_found}
+            return Answer(json_bytes(overview), JSON)
         if question.wanted is None:
             return self._message_answer(self._status_message(), question, output)
         if not self._finds.try_take():
@@ -223,6 +227,7 @@ class SourceQueries:
             text = f"the history of source {name!r} has no messages of {quoted(question.name)}"
             raise QueryError(text, code="nothing-yet")
         messages = found.messages
+        self.num_found[output] += len(messages)
         schema = f";rtc3d.{message_type(messages[0]).__name__}" if messages else ""
         return Answer(pack_messages(messages), f"{LCM_MESSAGES}{schema}", found.facts)
 

@@ -163,6 +163,7 @@ ATTACKS: Final[dict[str, Attack]] = {
     },
     "asker: all frames as JSON": _questions("mocap/healthy/3d?format=json"),
     "asker: everything": _questions("mocap/healthy/**"),
+    "asker: the whole history": _questions("mocap/healthy/*?from=0"),
     "asker: unknown keys": _questions("mocap/healthy/none/of/these?format=none"),
     "asker: fresh parameters": _questions("mocap/*/parameters?fresh=true"),
     "asker: LCM": _lcm_requests,

@@ -15,6 +15,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.service.gateway import Gateway
 from tests.support.configurations import local_settings, local_source
@@ -226,3 +227,8 @@ async def gateway_with_server(
         await wait_until_cached(gateway)
         with zenoh_peer(endpoint) as peer:
             yield QuerySetup(server, listening.port, gateway, peer)
+
+
+async def until_a_frame(gateway: Gateway) -> None:
+    """Wait until a frame with markers has arrived."""
+    await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))

@@ -42,7 +42,7 @@ class PublishedScene:
         """Whether frames are published; the status always is."""
         self.endpoint = endpoint
         """Where a subscriber connects to."""
-        self._session = session
+        self.session = session
         self._name = name
         self._version = 0
         self._stop = threading.Event()
@@ -50,7 +50,7 @@ class PublishedScene:
 
     def start(self) -> None:
         """Begin to publish."""
-        self._token = self._session.liveliness().declare_token(f"mocap/{self._name}/alive")
+        self._token = self.session.liveliness().declare_token(f"mocap/{self._name}/alive")
         self._thread.start()
 
     def stop(self) -> None:
@@ -67,7 +67,7 @@ class PublishedScene:
 
     def _publish_parameters(self) -> None:
         facts = {"session": 1, "parameters_version": self._version, "age_s": 0.0}
-        self._session.put(f"mocap/{self._name}/parameters", self._xml, attachment=json.dumps(facts))
+        self.session.put(f"mocap/{self._name}/parameters", self._xml, attachment=json.dumps(facts))
 
     def _run(self) -> None:
         for number in itertools.count():
@@ -81,7 +81,7 @@ class PublishedScene:
                 return
 
     def _put(self, key: str, message: bytes) -> None:
-        self._session.put(f"mocap/{self._name}/{key}", message)
+        self.session.put(f"mocap/{self._name}/{key}", message)
 
     def _frame(self, number: int) -> bytes:
         items = np.zeros(len(self.markers), ITEM_DTYPES[ComponentType.MARKERS])

@@ -12,6 +12,7 @@ from gateway.takes.files.component_rows import Array
 from tests.support.browser import NewPage, chromium, new_page, pages
 from tests.support.gateway_process import gateway_process, simulator
 from tests.support.networks import free_port
+from tests.support.waiting import wait_until
 from tests.view.picture import Picture, Position
 from tests.view.published_scene import MISSING, PublishedScene, published_scene
 from tests.view.view_process import ViewProcess, view_process
@@ -132,6 +133,21 @@ def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene,
     scene.is_sending = True
     picture.wait_for_no_text("no data")
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
+
+
+def test_what_happened_before_the_view_was_opened_is_there(tmp_path: Path, new_page: NewPage) -> None:
+    """The server has ended: events and markers can only come from the gateway's history."""
+    with ExitStack() as stack:
+        port, server = stack.enter_context(simulator())
+        gateway = stack.enter_context(gateway_process(tmp_path, port, hub="router"))
+        wait_until(lambda: gateway.headers["event"])
+        server.kill()
+        view = stack.enter_context(view_process("--connect", gateway.endpoint))
+        picture = Picture(new_page(viewport=WINDOW), view.address)
+        picture.wait_for_banner("lab: no data for")
+        picture.wait_for_number_of_points(MARKERS, 10)
+        picture.page.get_by_role("tab", name="Events").click()
+        picture.page.locator(".events td").first.wait_for()
 
 
 def test_a_source_that_is_lost_and_comes_back(tmp_path: Path, new_page: NewPage) -> None:

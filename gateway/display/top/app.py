@@ -214,6 +214,7 @@ class App:
                     signal.raise_signal(signal.SIGSTOP)  # returns when the process continues
                     has_changed = True
                 self._subscriber.tick()
+                self._subscriber.query_routers()
                 sources = self._live.update()
                 self._check_silence()
                 has_changed |= size != self._screen.size
@@ -307,6 +308,7 @@ def receive_once(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSour
     """Wait for a moment, and return the sources with what has come meanwhile."""
     time.sleep(_UPDATE_S)
     subscriber.tick()
+    subscriber.query_routers()
     return live.update()
 
 

@@ -21,7 +21,10 @@ _MAX_LABEL: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class ComponentFacts:
-    """One component. What has not come so far has ``num_messages`` 0. Tool poses are together: 6d/*."""
+    """One component. What has not come so far has ``num_messages`` 0. Tool poses are together: 6d/*.
+
+    ``num_refilled`` is None unless gaps are filled; then, ``num_lost`` counts what could not be.
+    """
 
     component: str
     rate_hz: float | None
@@ -31,6 +34,7 @@ class ComponentFacts:
     num_gaps: int
     num_restarts: int
     has_two_gateways: bool
+    num_refilled: int | None
     capture_to_gateway_p50_ms: float | None = None
     capture_to_gateway_p99_ms: float | None = None
     gateway_to_here_p50_ms: float | None = None
@@ -125,16 +129,27 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     )
 
 
-def _message_counts(series: Sequence[Series]) -> tuple[int, int, int, int, bool]:
-    """Return how many messages came, were lost, in how many gaps; restarts; whether two gateways publish."""
+def _message_counts(series: Sequence[Series]) -> tuple[int, int, int, int, bool, int | None]:
+    """Return how many messages came, were lost, in how many gaps; restarts; whether two gateways publish.
+
+    The last one is how many were refilled; None if gaps are not filled.
+    """
     checks = [each.check for each in series]
+    refilled = [each.completion.num_refilled for each in series if each.completion is not None]
     return (
         sum(each.num_messages for each in series),
         sum(check.num_lost for check in checks),
         sum(check.num_gaps for check in checks),
         max((check.num_restarts for check in checks), default=0),
         any(check.has_two_publishers for check in checks),
+        sum(refilled) if refilled else None,
     )
+
+
+def refill_problems(source: LiveSource) -> list[str]:
+    """Return why gaps are not filled although they should be, each reason once."""
+    completions = [series.completion for series in source.series if series.completion is not None]
+    return [*dict.fromkeys(safe_text(each.problem) for each in completions if each.problem)]
 
 
 def has_two_gateways(source: LiveSource) -> bool:
@@ -210,12 +225,14 @@ def source_facts(source: LiveSource) -> dict[str, Any]:
         "server": report.server,
         "host": report.host,
         "gateway_version": report.version,
+        "routers": None if source.routers is None else [*source.routers],
         "state": found.text,
         "level": _LEVELS[found.level],
         "status_age_s": source.status_age_s,
         "age_s": source.age_s,
         "is_stopped": source.is_stopped,
         "has_two_gateways": has_two_gateways(source),
+        "refill_problems": refill_problems(source),
         "parameters_version": source.parameters_version,
         "components": components(source),
         "markers": items(source, ComponentType.MARKERS),

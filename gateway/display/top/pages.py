@@ -5,7 +5,8 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Final, NamedTuple
 
-from gateway.display.live import SLOW_SHARE, LiveSource, visible_percent
+from gateway.display.live import SLOW_SHARE, LiveSource
+from gateway.display.statistics import visible_percent
 from gateway.display.terminal import Style
 from gateway.display.top import facts
 from gateway.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
@@ -34,11 +35,13 @@ class Page(NamedTuple):
 
 def overview(sources: Sequence[LiveSource]) -> Table:
     """Each source with its state, and a line for each of its components."""
+    is_complete = any(series.completion for source in sources for series in source.series)
     columns = (
         Column("component"),
         Column("Hz", is_number=True, width=6),
         Column("announced", is_number=True, rank=1),
         Column("lost", is_number=True),
+        *([Column("refilled", is_number=True)] if is_complete else []),
         Column("gaps", is_number=True, rank=6),
         Column("restarts", is_number=True, rank=7),
         Column("→gateway ms", is_number=True, rank=2),
@@ -51,15 +54,17 @@ def overview(sources: Sequence[LiveSource]) -> Table:
     sections = []
     for source in sources:
         state = facts.state(source)
-        heading = [(f"{_name(source)}: {state.text}", _LEVEL_STYLES[state.level])]
+        way = f", by {' → '.join(source.routers)}" if source.routers else ""
+        heading = [(f"{_name(source)}: {state.text}{way}", _LEVEL_STYLES[state.level])]
         if facts.has_two_gateways(source):
             heading.append((TWO_GATEWAYS, Style.BAD))
-        rows = [_component_row(each) for each in facts.components(source)]
+        heading += [(f"gaps are not filled: {text}", Style.WARNING) for text in facts.refill_problems(source)]
+        rows = [_component_row(each, is_complete=is_complete) for each in facts.components(source)]
         sections.append(Section(rows, heading + _output_problems(source)))
     return Table(columns, sections, "no source so far")
 
 
-def _component_row(component: facts.ComponentFacts) -> Row:
+def _component_row(component: facts.ComponentFacts, *, is_complete: bool) -> Row:
     note, style = "", Style.PLAIN
     if component.is_stopped:
         note, style = "stopped", Style.BAD
@@ -81,6 +86,7 @@ def _component_row(component: facts.ComponentFacts) -> Row:
         number_cell(rate_hz, 1, style if style is Style.BAD else _warning_if(is_slow)),
         number_cell(announced_hz, 1),
         number_cell(component.num_lost, 0, lost_style),
+        *([number_cell(component.num_refilled)] if is_complete else []),
         number_cell(component.num_gaps, 0, lost_style),
         number_cell(component.num_restarts, 0, _warning_if(component.num_restarts > 0)),
         _latency_cell(component.capture_to_gateway_p50_ms, component.capture_to_gateway_p99_ms),

@@ -1,7 +1,8 @@
 """Scrolling plots of selected analog and force channels."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,7 +13,7 @@ from viser import uplot
 from gateway.display.live import LiveComponent, LiveSource
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from gateway.takes.files.component_rows import Array
+from gateway.takes.files.component_rows import Array, Rows
 
 MAX_CHOICES: Final = 1000
 """How many channels can be chosen from."""
@@ -68,12 +69,11 @@ def _cut(text: str) -> str:
     return safe_text(text, _MAX_LABEL_CHARACTERS)
 
 
-def samples(channel: Channel, component: LiveComponent) -> Iterator[tuple[Array, Array]]:
-    """Return the samples of a channel in the component's batch: times and values.
+def samples(channel: Channel, batch: Rows) -> Iterator[tuple[Array, Array]]:
+    """Return the samples of a channel in messages of its component: times and values.
 
     Times are those of capture, in µs since the Unix epoch on the gateway's clock.
     """
-    batch = component.batch
     for num_items, items in batch.items.items():
         if channel.position >= num_items:
             continue
@@ -151,6 +151,33 @@ class Envelope:
         self._newest = column
 
 
+MAX_RECENT_BYTES: Final = 64 * 1024 * 1024
+"""How much all components keep for plots that are added: 10 s of 256 channels at 2000 Hz need 21 MB."""
+
+
+class RecentRows:
+    """The messages of a component whose samples a plot shows: one that is added shows them at once."""
+
+    def __init__(self) -> None:
+        self.batches: deque[Rows] = deque()
+        """The oldest first."""
+        self._num_bytes = 0
+
+    def take(self, batch: Rows, max_bytes: int) -> None:
+        """Take messages, and forget what is too old, or more than ``max_bytes``."""
+        if not len(batch.heads):
+            return
+        self.batches.append(batch)
+        self._num_bytes += _num_bytes(batch)
+        oldest_utime = batch.heads["capture_utime"][-1] - NUM_COLUMNS * COLUMN_US
+        while self._num_bytes > max_bytes or self.batches[0].heads["capture_utime"][-1] < oldest_utime:
+            self._num_bytes -= _num_bytes(self.batches.popleft())
+
+
+def _num_bytes(batch: Rows) -> int:
+    return batch.heads.nbytes + sum(items.nbytes for items in batch.items.values())
+
+
 MAX_PLOTS: Final = 8
 
 _NOTE: Final = (
@@ -169,9 +196,13 @@ _FILL: Final = "rgba(77, 171, 247, 0.35)"
 class _Plot:
     """The plot of one channel."""
 
-    def __init__(self, server: viser.ViserServer, channel: Channel, title: str) -> None:
+    def __init__(
+        self, server: viser.ViserServer, channel: Channel, title: str, recent: Iterable[Rows]
+    ) -> None:
         self.channel = channel
         self._envelope = Envelope()
+        for batch in recent:
+            self._add(batch)
         self._component: LiveComponent | None = None
         line = uplot.Series(label="", stroke=_LINE, width=1, spanGaps=False, points={"show": False})
         no_ticks = uplot.Axis_Ticks(show=False)
@@ -193,7 +224,11 @@ class _Plot:
     def take(self, source: LiveSource | None) -> None:
         """Take what came since the last call."""
         component = self._component = source.components.get(self.channel.key) if source else None
-        for utimes, values in samples(self.channel, component) if component else ():
+        if component is not None:
+            self._add(component.batch)
+
+    def _add(self, batch: Rows) -> None:
+        for utimes, values in samples(self.channel, batch):
             self._envelope.add(utimes, values)
 
     def show(self) -> None:
@@ -227,12 +262,22 @@ class Plots:
         self._folder = server.gui.add_folder(None)
         self._choices: dict[str, Channel] = {}
         self._plots: dict[str, _Plot] = {}  # by their titles
+        self._recent: dict[tuple[str, str], RecentRows] = {}  # by source and key of a component
         self._has_begun = False
         """Whether somebody has chosen a channel, or the first one was chosen for them."""
 
     def take(self, sources: Sequence[LiveSource]) -> None:
         """Take what came since the last call."""
         by_name = {source.name: source for source in sources}
+        batches = {
+            (source.name, key): source.components[key].batch
+            for source in sources
+            for key in _KEYS
+            if key in source.components
+        }
+        self._recent = {each: self._recent.get(each, RecentRows()) for each in batches}
+        for each, batch in batches.items():
+            self._recent[each].take(batch, MAX_RECENT_BYTES // len(batches))
         for plot in self._plots.values():
             plot.take(by_name.get(plot.channel.source))
 
@@ -254,8 +299,10 @@ class Plots:
 
     def _plot(self, title: str) -> None:
         self._has_begun = True
+        channel = self._choices[title]
+        recent = self._recent.get((channel.source, channel.key), RecentRows())
         with self._folder:
-            self._plots[title] = _Plot(self._server, self._choices[title], title)
+            self._plots[title] = _Plot(self._server, channel, title, recent.batches)
 
     def offer(self, sources: Sequence[LiveSource]) -> None:
         """Offer the channels that there are now. The first time that they are known, plot a useful one."""

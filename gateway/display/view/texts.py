@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from gateway.display.live import LiveComponent, LiveData, LiveSource, Percentiles, visible_percent
+from gateway.display.live import LiveComponent, LiveData, LiveSource
+from gateway.display.statistics import Percentiles, visible_percent
 from gateway.logs.losses import counts_text
 from gateway.logs.safe_text import safe_text
 from gateway.messages.source_report import Level, SourceReport, State

@@ -292,15 +292,14 @@ class LcmRequests:
     async def _find_messages(self, source: str, options: dict[str, str]) -> ReplyContent:
         """Return messages of the history. Those that the peer asks for go to everybody, so one at a time."""
         key = options.pop("key")
-        if self._is_refilling:
-            text = "messages are being sent again for another subscriber; try again"
-            raise QueryError(text, code="busy")
+        self._check_nobody_is_refilled()
         component, separator, tool = key.partition("/")
         names = (component, tool) if separator else (component,)
         path = (component, escape_key_chunk(tool)) if separator else names
         answer = await self._service.answer(source, path, options)
         if not answer.encoding.startswith(LCM_MESSAGES):
             raise QueryError(f"{HISTORY} with key= needs one of from=, last_s=, since_utime=")
+        self._check_nobody_is_refilled()  # the disk may have taken a while
         channel = refill_channel(lcm_channel(self._prefix, source, *names))
         facts = json_bytes({"key": key, "channel": channel, **answer.attachment}).decode()
 
@@ -308,6 +307,11 @@ class LcmRequests:
             reply.content = facts
 
         return ReplyContent(answer.num_bytes, fill, (channel, unpack_messages(answer.payload)))
+
+    def _check_nobody_is_refilled(self) -> None:
+        if self._is_refilling:
+            text = "messages are being sent again for another subscriber; try again"
+            raise QueryError(text, code="busy")
 
     # In the thread that sends what is long.
 

@@ -60,10 +60,13 @@ class Host:
     writer: Callable[[str, int], WriterThread] = WriterThread
 
 
-async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = None) -> _Result:
+async def disk_result(
+    future: Future[_Result], path: Path, disk: Disk | None = None, late_code: str = "disk"
+) -> _Result:
     """Return the result of a call that needs the disk of ``path``. Raises QueryError if the disk fails.
 
     ``disk`` knows why the thread that writes is late: for example, rolling segments wait for room.
+    ``late_code`` is the code of the error if the call takes too long.
     """
     try:
         async with asyncio.timeout(_TIMEOUT_S):
@@ -71,7 +74,7 @@ async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = N
     except TimeoutError:
         problem = "" if disk is None else disk.problem
         text = problem or f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
-        raise QueryError(text, code="disk") from None
+        raise QueryError(text, code=late_code) from None
     except OSError as error:
         raise QueryError(disk_problem(path, error), code="disk") from error
     except TakeError as error:
@@ -89,7 +92,10 @@ _DAY_S: Final = 86_400.0
 
 
 _HISTORY_REST: Final = 3
-"""After reading for a subscriber, the thread rests this many times as long: at most a quarter of a core."""
+"""After reading for a subscriber, the thread rests for this many times the CPU time: a quarter of a core.
+
+Otherwise, peers that ask again and again would take Python's lock from the streams.
+"""
 
 MAX_HISTORY_READS: Final = 8
 """How many subscribers may wait for messages on the disk: it may not respond."""
@@ -230,6 +236,7 @@ class Storage:
         self._read_thread = host.thread("takes-read")
         self._history_thread = host.thread("takes-history")
         self._num_history_reads = 0
+        self._history_rest_until_s = 0.0
         self._max_queued_bytes = max_queued_bytes
 
     @property
@@ -268,33 +275,44 @@ class Storage:
         """Return the result of ``call``, which reads ``path`` in a thread. Raises QueryError."""
         return await disk_result(self._read_thread.submit(call), path)
 
-    async def read_history(self, call: Callable[[], _Result]) -> _Result:
-        """Return the result of ``call``, which reads rolling segments in a thread. Raises QueryError."""
+    async def read_history(self, call: Callable[[], _Result | None]) -> _Result | None:
+        """Return the result of ``call``, which reads rolling segments in a thread.
+
+        Raises QueryError, with the code busy if the disk does not respond in time: what it has is not lost.
+        """
         if self._num_history_reads >= MAX_HISTORY_READS:
             raise QueryError("too many subscribers ask for messages on the disk; try again", code="busy")
         self._num_history_reads += 1
-        took_s = 0.0
+        is_wanted = True
 
-        def read() -> _Result:
-            nonlocal took_s
-            began_s = time.monotonic()
+        def read() -> _Result | None:
+            if not is_wanted:
+                return None
+            time.sleep(max(0.0, self._history_rest_until_s - time.monotonic()))
+            began_s = time.thread_time()
             try:
                 return call()
             finally:
-                took_s = time.monotonic() - began_s
+                rest_s = _HISTORY_REST * (time.thread_time() - began_s)
+                self._history_rest_until_s = time.monotonic() + rest_s
 
         reading = self._history_thread.submit(read)
         reading.add_done_callback(self._end_history_read)
-        # Otherwise, peers that ask again and again would take Python's lock from the streams.
-        self._history_thread.submit(lambda: time.sleep(_HISTORY_REST * took_s))
-        return await disk_result(reading, self.folder.directory)
+        try:
+            return await disk_result(reading, self.folder.directory, late_code="busy")
+        finally:
+            is_wanted = False
 
     def _end_history_read(self, _reading: Future[Any]) -> None:
         self._num_history_reads -= 1
 
     async def written(self) -> None:
-        """Wait until everything that was published so far is in the files. Raises QueryError."""
-        await disk_result(self.started_writer().call(lambda: None), self.folder.directory, self.disk)
+        """Wait until everything that was published so far is in the files.
+
+        Raises QueryError, with the code busy if that takes too long.
+        """
+        writing = self.started_writer().call(lambda: None)
+        await disk_result(writing, self.folder.directory, self.disk, late_code="busy")
 
     def refusal(self) -> OutputError | None:
         """Return the error for a message that is published while the output is not open."""

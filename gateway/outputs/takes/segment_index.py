@@ -2,7 +2,7 @@
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -19,6 +19,9 @@ An hour of 1.3 MB/s on ten channels needs 4.3 MB of memory.
 
 MAX_READ_BYTES: Final = 8 * 1024 * 1024
 """The most that is read for one answer, unless one stretch is longer."""
+
+MAX_READ_S: Final = 0.5
+"""How long to read for one answer, unless one stretch takes longer: others wait for the same thread."""
 
 
 class Stretch(NamedTuple):
@@ -135,16 +138,21 @@ def _is_before(wanted: WantedMessages, sequence: int, utime: int) -> bool:
     return utime < (wanted.since_utime or 0)
 
 
-def read_planned(plan: Plan, channel: bytes, wanted: WantedMessages) -> tuple[list[bytes], int]:
+def read_planned(
+    plan: Plan, channel: bytes, wanted: WantedMessages, monotonic: Callable[[], float]
+) -> tuple[list[bytes], int]:
     """Read messages, MAX_ANSWER_BYTES at most; return them and the number with which to continue.
 
-    What has been deleted since then is left out.
+    What has been deleted since then is left out. On a slow disk, this ends after MAX_READ_S.
     """
     name, first, since_utime = channel.decode(), wanted.first or 0, wanted.since_utime or 0
     messages: list[bytes] = []
     num_bytes = 0
     nexts = [*(stretch.sequence for stretch in plan.stretches), plan.next][1:]
-    for stretch, following in zip(plan.stretches, nexts, strict=True):
+    end_s = monotonic() + MAX_READ_S
+    for number, (stretch, following) in enumerate(zip(plan.stretches, nexts, strict=True)):
+        if number and monotonic() > end_s:
+            return messages, stretch.sequence
         try:
             for event in EventLogReader(stretch.path).events(stretch.begin, stretch.end):
                 if event.channel != name:

@@ -228,7 +228,7 @@ class RollingSegments(SourceWriter):
         with self._indexing:
             indices, newest = self._indices(), self._newest.get(channel, -1)
             plan = plan_reading(indices, channel, wanted, newest)
-        messages, next_number = read_planned(plan, channel, wanted)
+        messages, next_number = read_planned(plan, channel, wanted, self._monotonic)
         first = wanted.first
         if first is None:
             first = sequence_of(messages[0]) if messages else next_number

@@ -1,4 +1,4 @@
-"""The doctor's checks of Zenoh: does a session open and reach others, and is a gateway running?
+"""The doctor's checks of Zenoh: does a session open, which routers does it reach, and is a gateway running?
 
 The doctor's session uses the gateway's configuration but does not listen, because a running gateway may
 already use the addresses. It connects to them instead.
@@ -18,7 +18,10 @@ from gateway.errors import ConfigError
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.findings import Check, Finding, MessageLoad, counted, failing_first
 from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.router_checks import Absence, check_routers, why_absent
+from gateway.outputs.zenoh.routers import read_routers
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.tls_checks import tls_problem
 
 _ROUTER_REMEDY: Final = (
     "Start zenohd at that address, or correct connect/endpoints in zenoh.config. With TLS, check that all "
@@ -28,7 +31,9 @@ _LOCAL: Final = re.compile(r"unix|(tcp|tls|quic|udp|ws)/(127\.[\d.]+|\[::1\]|loc
 """The beginning of endpoints on this computer."""
 _POLL_S: Final = 0.05
 
-_LINK, _GATEWAY = Check("zenoh", "link"), Check("zenoh", "gateway")
+LINK, GATEWAY = Check("zenoh", "link"), Check("zenoh", "gateway")
+AFTER_LINK: Final = ("routers", "gateway")
+"""The checks that need a link."""
 
 
 def check_zenoh(
@@ -50,10 +55,13 @@ def check_zenoh(
     try:
         session = zenoh.open(own_config)
     except zenoh.ZError as error:
-        return _no_link(f"the session does not open: {zenoh_reason(error)}", _ROUTER_REMEDY)
+        return failing_first(no_session(error, own_config), AFTER_LINK)
     try:
         served = _find_gateways(session, keys, seconds)
-        routers, peers = len(session.info.routers_zid()), len(session.info.peers_zid())
+        network = read_routers(session, seconds)
+        missing = [source for source in sources if source not in served]
+        absence = why_absent(session, network, settings.prefix, missing, seconds) if missing else None
+        routers, peers = len(network.connected), len(session.info.peers_zid())
     finally:
         session.close()
     if mode != "client" and not routers and not peers and connect:
@@ -69,15 +77,25 @@ def check_zenoh(
             "listen/endpoints in zenoh.config.",
         )
     others = "a router" if mode == "client" else f"{counted(routers, 'router')} and {counted(peers, 'peer')}"
-    link = _LINK.passing(f"the session is open and connected to {others}")
-    missing = [source for source in sources if source not in served]
-    if missing:
-        text = (
-            f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix "
-            "and the router's access rules"
-        )
-        return [link, _GATEWAY.not_tested(text)]
-    return [link, _GATEWAY.passing(f"a gateway serves {', '.join(sources)}")]
+    link = LINK.passing(f"the session is open and connected to {others}")
+    return [link, *check_routers(network), _gateway_finding(sources, missing, absence)]
+
+
+def no_session(error: zenoh.ZError, config: zenoh.Config) -> Finding:
+    """Return the finding that a session with this configuration does not open, and why, as far as known."""
+    for endpoint in endpoints(config, "connect"):
+        if problem := tls_problem(endpoint, config):
+            return LINK.problem(f"the session does not open: {problem}")
+    return LINK.failing(f"the session does not open: {zenoh_reason(error)}", _ROUTER_REMEDY)
+
+
+def _gateway_finding(sources: Sequence[str], missing: Sequence[str], absence: Absence | None) -> Finding:
+    if not missing:
+        return GATEWAY.passing(f"a gateway serves {', '.join(sources)}")
+    if absence is not None and absence.is_hidden:
+        return GATEWAY.failing(absence.reason, absence.remedy)
+    default = f"found no gateway that serves {', '.join(missing)}; if one is running, check its zenoh.prefix"
+    return GATEWAY.not_tested(absence.reason if absence else default)
 
 
 def leaves_host(settings: ZenohSettings) -> bool:
@@ -97,7 +115,7 @@ def is_local(endpoint: str) -> bool:
 
 
 def _no_link(found: str, remedy: str) -> list[Finding]:
-    return failing_first(_LINK.failing(found, remedy), ["gateway"])
+    return failing_first(LINK.failing(found, remedy), AFTER_LINK)
 
 
 def _find_gateways(session: zenoh.Session, keys: dict[str, str], seconds: float) -> list[str]:

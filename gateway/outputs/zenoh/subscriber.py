@@ -35,20 +35,25 @@ def key_patterns(prefix: str, source: str | None, component: str | None) -> tupl
     return ("/".join((base, group, *path)),)
 
 
-def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Session:
-    """Return an open session. Raises OutputError if it does not open, ConfigError if Zenoh rejects the file.
+def subscriber_config(connect: str | None, config_file: Path | None) -> zenoh.Config:
+    """Return the configuration of a subscriber. Raises ConfigError if Zenoh rejects the file.
 
     With ``connect``, an endpoint such as tcp/127.0.0.1:7447, the session is a client of that endpoint only.
     Without it, the session is what ``config_file`` says, or a peer that finds others by multicast, Zenoh's
     default. The file may be that of a running gateway.
     """
     config = command_config(config_file) if config_file else zenoh_config({})
+    if connect is not None:
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([connect]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
+def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Session:
+    """Return an open session with ``subscriber_config``. Raises OutputError if it does not open."""
     try:
-        if connect is not None:
-            config.insert_json5("mode", '"client"')
-            config.insert_json5("connect/endpoints", json.dumps([connect]))
-            config.insert_json5("scouting/multicast/enabled", "false")
-        return zenoh.open(config)
+        return zenoh.open(subscriber_config(connect, config_file))
     except zenoh.ZError as error:
         where = f" to {connect}" if connect else f" with {config_file}" if config_file else ""
         raise OutputError(

@@ -62,6 +62,7 @@ _HELP: Final = {
         "1 if somebody may subscribe to the source's data, else 0; always 1 with LCM, which cannot know."
     ),
     "history_bytes": "Memory for the newest messages, which subscribers can ask for.",
+    "history_messages": "Messages of the history that peers have asked for and got.",
     "messages": "Messages passed to the output; 6d/tool, status and clock count as separate components.",
     "message_bytes": "Bytes of these messages, without the overhead of Zenoh, LCM and the network.",
     "output_drops": "Messages that the output did not accept, and queries that it did not answer, by cause.",
@@ -188,6 +189,13 @@ class GatewayMetrics(Collector):
         kept = [((source.name,), source.fan_out.history.num_bytes) for source in sources]
         yield _gauge("history_bytes", ("source",), kept)
         labels = ("source", "output")
+        found = [
+            ((source.name, output.name), source.queries.num_found[output.name])
+            for source in sources
+            for output in self._gateway.outputs
+            if output.query_results is not None
+        ]
+        yield _counter("history_messages", labels, found)
         routes = [
             ((source.name, output.name), source, output, status)
             for source in sources

@@ -181,7 +181,8 @@ async def test_a_source_is_listed_with_its_server_and_state(lab: Lab) -> None:
     listed, as_json = await asyncio.gather(lab.run("list"), lab.run("list", "--json"))
     for side, done, objects in zip(SIDES, listed, as_json, strict=True):
         assert (done.status, done.stderr, done.stdout.count("\n")) == (0, "", 1)
-        name, state, components, server, host, version = done.stdout.rstrip("\n").split("\t")
+        name, state, components, server, host, version, routers = done.stdout.rstrip("\n").split("\t")
+        assert routers == ""
         assert (name, components, host) == ("lab", "3d 6d event", os.uname().nodename)
         assert server.partition(":")[0] == "127.0.0.1"
         assert state.startswith("streaming ")

@@ -115,6 +115,7 @@ def test_once_prints_every_table_or_one_object(lab: Lab) -> None:
     for text in texts:
         assert (text.status, text.stderr) == (0, "")
         assert "\x1b" not in text.stdout
+        assert "refilled" not in text.stdout
         pages = [line for line in text.stdout.splitlines() if line.isalpha()]
         assert pages == ["overview", "markers", "tools", "server", "drops", "outputs", "questions", "events"]
         assert re.search(r"^Lab-1: .*streaming \d", text.stdout, re.MULTILINE)
@@ -126,11 +127,12 @@ def test_once_prints_every_table_or_one_object(lab: Lab) -> None:
         found = json.loads(ended.stdout)
         assert {"utime", "sources", "num_foreign", "num_beyond"} == found.keys()
         [source] = found["sources"]
-        assert (source["source"], source["level"]) == ("Lab-1", "ok")
+        assert (source["source"], source["level"]) == ("Lab-1", "ok"), source["state"]
         data = {each["component"]: each for each in source["components"]}
         assert [key for key in data if not key.startswith("6d/")] == COMPONENTS
         assert (data["3d"]["announced_rate_hz"], data["3d"]["num_items"]) == (50, 12)
         assert data["3d"]["gateway_to_here_p99_ms"] is not None
+        assert data["3d"]["num_refilled"] is None
         assert ("6d/*" in data) == (ended is zenoh)
         assert (len(source["markers"]), len(source["tools"])) == (12, 2)
         assert {each["output"] for each in source["outputs"]} == {"zenoh", "lcm"}
@@ -138,8 +140,11 @@ def test_once_prints_every_table_or_one_object(lab: Lab) -> None:
 
 def test_json_prints_lines_until_it_is_interrupted(lab: Lab) -> None:
     """A program that reads the lines gets each when it is due, not when a buffer is full."""
-    with program("top", "--json", *lab.lcm, stdout=subprocess.PIPE, text=True) as process:
-        times = [json.loads(process.stdout.readline())["utime"] for _ in range(3)]
+    with program("top", "--json", "--complete", *lab.lcm, stdout=subprocess.PIPE, text=True) as process:
+        objects = map(json.loads, process.stdout)
+        times = [each["utime"] for each, _ in zip(objects, range(3), strict=False)]
+        components = (each for line in objects for source in line["sources"] for each in source["components"])
+        assert next(components)["num_refilled"] is not None
         process.send_signal(signal.SIGINT)
         assert process.wait(40) == 0
     assert times[-1] - times[0] > 1_000_000, "a line per second, not as many as possible"

@@ -8,177 +8,37 @@ import signal
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import pytest
 import rtc3d
-import yaml
-import zenoh
 
 from gateway.client.reception import FINGERPRINTS
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import PREFIX
-from gateway.messages.topics import lcm_channel
-from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.statistics import take_statistics
-from tests.support.gateway_process import PROGRAM, program, simulator
-from tests.support.networks import free_endpoint, lcm_url, open_zenoh, wait_for_zenoh, zenoh_keys
+from tests.support.gateway_process import PROGRAM
+from tests.support.networks import free_endpoint, lcm_url, open_zenoh
+from tests.support.record_process import (
+    COMPONENTS,
+    RecordProcess,
+    assert_same_bytes,
+    by_channel,
+    events,
+    lab,
+    num_recorded,
+    recording,
+    size,
+)
 from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 
-SCENE: Final = ("--rate", "100", "--analog-rate", "500", "--markers", "20", "--analog", "8", "--tools", "2")
-COMPONENTS: Final = ("3d", "6d", "analog", "force", "event")
-
-
-class Ended(NamedTuple):
-    status: int
-    stdout: str
-    stderr: str
-
-
-class RecordProcess:
-    """A running ``record``."""
-
-    def __init__(self, process: subprocess.Popen[str], stderr: Path) -> None:
-        self.process = process
-        self._stderr = stderr
-
-    def wait_for(self, text: str) -> None:
-        wait_until(lambda: text in self._stderr.read_text())
-
-    def limit_files(self, num_bytes: int) -> None:
-        """Let the kernel refuse longer files, as on a full disk."""
-        _, hard = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (num_bytes, hard))
-
-    def end(self, number: signal.Signals | None = signal.SIGINT) -> Ended:
-        """Wait for the end of the program, after a signal if given."""
-        if number is not None:
-            self.process.send_signal(number)
-        stdout, _ = self.process.communicate(timeout=120)
-        stderr = self._stderr.read_text()
-        assert "Traceback" not in stderr + stdout
-        assert "defect" not in stderr
-        return Ended(self.process.returncode, stdout, stderr)
-
-
-@contextmanager
-def recording(target: Path, *options: str, command: tuple[str, ...] = PROGRAM) -> Iterator[RecordProcess]:
-    """Run ``record`` to a file or folder until the end of the block; its messages are beside it."""
-    stderr = target.parent / "stderr"
-    environment = os.environ | {"COLUMNS": "200"}
-    with (
-        stderr.open("w") as file,
-        subprocess.Popen(
-            [*command, "record", str(target), *options],
-            stdout=subprocess.PIPE,
-            stderr=file,
-            text=True,
-            env=environment,
-        ) as process,
-    ):
-        try:
-            yield RecordProcess(process, stderr)
-        finally:
-            process.kill()
-
-
-def size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
-
-
-def num_recorded(path: Path, channel: str) -> int:
-    """Return how many messages of a channel a recording has so far."""
-    return path.read_bytes().count(channel.encode()) if path.exists() else 0
-
-
-def events(path: Path) -> list[tuple[str, bytes]]:
-    """Return the channels and messages of a file, which must not be damaged."""
-    reader = EventLogReader(path)
-    found = [(event.channel, event.message) for event in reader.events()]
-    assert not reader.damage
-    return found
-
-
-def by_channel(path: Path) -> dict[str, list[bytes]]:
-    found: defaultdict[str, list[bytes]] = defaultdict(list)
-    for channel, message in events(path):
-        found[channel].append(message)
-    return found
-
-
 # A gateway -----------------------------------------------------------------------------------
-
-
-class Lab(NamedTuple):
-    """A gateway process with the source Lab-1. ``published`` is what another subscriber got, by channel."""
-
-    options: tuple[str, ...]
-    published: dict[str, list[bytes]]
-
-
-@contextmanager
-def lab(
-    folder: Path,
-    side: str = "zenoh",
-    *scene: str,
-    router: str | None = None,
-    history_s: float = 60.0,
-    **source: Any,
-) -> Iterator[Lab]:
-    """Run a gateway, which also connects to a ``router`` on Zenoh if there is one."""
-    endpoint, url = free_endpoint(), lcm_url()
-    published: defaultdict[str, list[bytes]] = defaultdict(list)
-
-    def receive_zenoh(sample: zenoh.Sample) -> None:
-        path = str(sample.key_expr).split("/", 2)[2]
-        label = path.removeprefix("6d/").replace("%20", " ")
-        names = ("6d", label) if path.startswith("6d/") else (path,)
-        published[lcm_channel("MOCAP", "Lab-1", *names)].append(sample.payload.to_bytes())
-
-    with ExitStack() as stack:
-        port, _ = stack.enter_context(simulator(*SCENE, *scene))
-        keys = zenoh_keys("peer", listen=endpoint, connect=router)
-        configuration = {
-            "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port, **source}],
-            "zenoh": {"enabled": side == "zenoh", "tool_poses": True, "config": keys},
-            "lcm": {"enabled": side == "lcm", "tool_poses": True, "url": url},
-            "metrics": {"enabled": False},
-            "history": {"seconds": history_s},
-        }
-        (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
-        gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
-        stack.enter_context(gateway)
-        if side == "zenoh":
-            session = wait_for_zenoh(endpoint)
-            stack.callback(session.close)
-            session.declare_subscriber("mocap/Lab-1/**", receive_zenoh)
-            options: tuple[str, ...] = ("--connect", endpoint)
-        else:
-            receive = lambda channel, data: published[channel].append(data)  # noqa: E731
-            stack.callback(LcmSubscriber(open_lcm(receiving_url(url)), "MOCAP_.+", receive).close)
-            options = ("--lcm", "--url", url)
-        wait_until(lambda: len(published[lcm_channel("MOCAP", "Lab-1", "3d")]) > 10)
-        yield Lab(options, published)
-
-
-def assert_same_bytes(path: Path, published: dict[str, list[bytes]]) -> None:
-    """The file has every message from its first one to its last one, with the bytes that were published."""
-    recorded = by_channel(path)
-    for name in (*COMPONENTS, "status", "clock", "6d_TOOL_1", "6d_TOOL_2"):
-        channel = f"MOCAP_LAB_1_{name.upper()}"
-        messages = recorded[channel]
-        assert messages, name
-        start = published[channel].index(messages[0])
-        wait_until(lambda: len(published[channel]) >= start + len(messages))  # noqa: B023
-        assert published[channel][start : start + len(messages)] == messages
 
 
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])

@@ -3,60 +3,26 @@
 import os
 import re
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 import pytest
-import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.client.reception import Messages
 from gateway.messages.decode import prefix_of
-from tests.integration.takes.test_record import Ended, Lab, assert_same_bytes, lab, num_recorded, recording
 from tests.support.networks import free_endpoint, open_zenoh
+from tests.support.record_process import (
+    MARKERS,
+    assert_same_bytes,
+    lab,
+    record_past,
+    refilled,
+    stoppable_router,
+    wait_for_frames,
+)
 from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
-
-MARKERS: Final = "MOCAP_LAB_1_3D"
-
-
-def refilled(ended: Ended) -> int:
-    """Return how many messages with markers were refilled, according to the table."""
-    match = re.search(r"^Lab-1 +3d .* Hz +(\S+) +\S+ +\S+$", ended.stdout, re.MULTILINE)
-    assert match is not None, ended
-    return 0 if match[1] == "-" else int(match[1])
-
-
-def wait_for_frames(gateway: Lab, number: int) -> None:
-    """Wait until the gateway has published so many more frames."""
-    until = len(gateway.published[MARKERS]) + number
-    wait_until(lambda: len(gateway.published[MARKERS]) >= until)
-
-
-def record_past(path: Path, gateway: Lab, options: tuple[str, ...], disturb: Callable[[int], None]) -> Ended:
-    """Record some frames, ``disturb`` the process with this id, and record what follows."""
-    with recording(path, *options) as record:
-        wait_until(lambda: num_recorded(path, MARKERS) > 20)
-        wait_until(
-            lambda: num_recorded(path, "MOCAP_LAB_1_CLOCK") > 0
-        )  # the last of what comes once a second
-        disturb(record.process.pid)
-        newest = gateway.published[MARKERS][-1]
-        wait_until(lambda: newest in path.read_bytes())
-        return record.end()
-
-
-@contextmanager
-def stoppable_router(endpoint: str) -> Iterator[list[zenoh.Session]]:
-    """Run a router; a test may close it and put another one into the list."""
-    routers = [open_zenoh("router", listen=endpoint)]
-    try:
-        yield routers
-    finally:
-        routers[-1].close()
 
 
 @pytest.mark.parametrize("history_s", [60.0, 0.5])

@@ -80,9 +80,9 @@ def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
     found = found_of(two_streams(source="b"), status(source="a"))
     assert found.readable_names == ["a", "b"]
     assert printed(found, columns=10, is_terminal=False).splitlines() == [
-        "a\tstreaming 200.0 Hz\t3d 6d\t192.0.2.20:3020\tmocap-pc\t1.2.3",
+        "a\tstreaming 200.0 Hz\t3d 6d\t192.0.2.20:3020\tmocap-pc\t1.2.3\t",
         "b\t3d 6d streaming 200.0 Hz, analog force waiting for 192.0.2.20:3020, 3 tries\t3d 6d, analog force"
-        "\t192.0.2.20:3020\tmocap-pc\t1.2.3",
+        "\t192.0.2.20:3020\tmocap-pc\t1.2.3\t",
     ]
 
 
@@ -100,11 +100,24 @@ def test_json_has_the_fields_of_the_reference() -> None:
     lab = {"source": "lab", "gateway": None, "problem": "", "server": "192.0.2.20:3020", "host": "mocap-pc"}
     assert found_json(found) == {
         "sources": [
-            silent | {"host": None, "version": None, "streams": []},
-            lab | {"version": "1.2.3", "streams": [stream]},
+            silent | {"host": None, "version": None, "routers": None, "streams": []},
+            lab | {"version": "1.2.3", "routers": None, "streams": [stream]},
         ],
         "num_left_out": 0,
     }
+
+
+def test_the_routers_between_are_a_column_if_there_are_any() -> None:
+    found = FoundSources()
+    for gateway, host in (("a1", "a"), ("b2", "b")):
+        found.add_status(status(host=host).encode(), "lab", gateway)
+    assert tuple(printed(found, columns=120).splitlines()[0].split()) == COLUMNS
+    found.add_routers({"a1": ["site-a", "site-b"], "b2": []}.get)
+    lines = printed(found, columns=120).splitlines()
+    assert tuple(lines[0].split()) == (*COLUMNS, "routers")
+    assert lines[1].endswith("site-a → site-b")
+    assert [each["routers"] for each in found_json(found)["sources"]] == [["site-a", "site-b"], []]
+    assert printed(found, is_terminal=False).splitlines()[0].endswith("\tsite-a → site-b")
 
 
 def test_two_gateways_with_the_same_source_are_listed_and_the_newest_status_of_each_counts() -> None:
@@ -146,7 +159,7 @@ def test_hostile_texts_do_not_reach_the_terminal() -> None:
     found = found_of(message)
     line = printed(found, is_terminal=False)
     assert not {"\x1b", "\r"} & set(line + printed(found))
-    assert (line.count("\n"), line.count("\t")) == (1, len(COLUMNS) - 1)
+    assert (line.count("\n"), line.count("\t")) == (1, len(COLUMNS))  # and the routers
     assert found_json(found)["sources"][0]["streams"][0]["rate_hz"] is None
 
 

@@ -1,5 +1,6 @@
 """Filling gaps from the gateway's history, against a model of the gateway and of the network between."""
 
+import itertools
 import math
 from typing import Final
 
@@ -7,15 +8,8 @@ import pytest
 from hypothesis import given, note, settings
 from hypothesis import strategies as st
 
-from gateway.client.completion import (
-    GRACE_S,
-    NOBODY_S,
-    PATIENCE_S,
-    Completion,
-    HeldBytes,
-    HistoryAnswer,
-    HistoryRequest,
-)
+from gateway.client.completion import GRACE_S, NOBODY_S, PATIENCE_S, Completion, HeldBytes
+from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.messages.encode import PREFIX
 from gateway.messages.sequence_check import SequenceCheck
 
@@ -30,10 +24,12 @@ class Network:
     ``handed_on`` has the run of the gateway and the number of each message.
     """
 
-    def __init__(self, window: int = 10**9, limit: int = 10**9, last_s: float | None = None) -> None:
+    def __init__(
+        self, window: int = 10**9, limit: int = 10**9, completeness: Completeness = COMPLETE
+    ) -> None:
         self.room = HeldBytes(limit)
         self.check = SequenceCheck(counts_first=True, max_listed=100)
-        self.completion = Completion(self._hand_on, self.check.end, self.room, last_s)
+        self.completion = Completion(self._hand_on, self.check, self.room, completeness)
         self.handed_on: list[tuple[int, int]] = []
         self.history: list[bytes] = []
         self.published: list[tuple[int, int]] = []
@@ -134,7 +130,7 @@ def test_everything_that_still_exists_comes_once_and_in_order(  # noqa: C901, PL
     events: list[str], window: int, limit: int, last_s: float | None
 ) -> None:
     """Whatever the network does: the numbers of each run grow, and what is missing is counted."""
-    network = Network(window, limit, last_s)
+    network = Network(window, limit, Completeness(is_complete=True, last_s=last_s))
     late: list[bytes] = []
     came_late: set[tuple[int, int]] = set()
     asked: tuple[HistoryRequest, HistoryAnswer | None] | None = None
@@ -347,6 +343,7 @@ def test_at_the_end_everything_until_then_is_requested_and_nothing_later() -> No
     network.ask_all()
     network.arrive(later)
     assert network.numbers == [*range(6)]
+    assert network.completion.num_refilled == 0  # nothing that arrived shows that they were missed
 
 
 @pytest.mark.parametrize("code", ["no-gateway", "timeout", "nothing-yet"])
@@ -371,7 +368,7 @@ def test_what_is_missing_at_the_end_is_counted() -> None:
 
 
 def test_the_last_seconds_come_before_the_first_message() -> None:
-    network = Network(last_s=1.0)
+    network = Network(completeness=Completeness(is_complete=True, last_s=1.0))
     for _ in range(20):
         network.publish()
     network.arrives(20)
@@ -379,3 +376,107 @@ def test_the_last_seconds_come_before_the_first_message() -> None:
     assert network.completion.request().options == {"last_s": "1.000"}
     network.ask_all()
     assert network.numbers == [*range(15, 21)]
+
+
+DISPLAY: Final = Completeness(last_s=1.0, patience_s=1.0)
+"""What a display wants: the last seconds if they come at once, and then the newest messages."""
+
+
+def test_a_display_gets_the_last_seconds_and_then_what_arrives() -> None:
+    """A gap later is shown as lost, and holds up nothing."""
+    network = Network(completeness=DISPLAY)
+    network.arrives(20)
+    network.ask_all()
+    assert network.numbers == [*range(15, 21)]
+    network.arrives(23)
+    assert network.completion.due_s == math.inf
+    assert network.numbers == [*range(15, 21), 23]
+    assert network.check.num_lost == 2
+    network.restart()
+    network.arrives(0)
+    assert network.handed_on[-1] == (1, 0)
+
+
+@pytest.mark.parametrize("is_complete", [False, True])
+def test_a_history_that_does_not_answer_delays_a_display_by_its_patience(is_complete: bool) -> None:
+    """No more than once, and nothing counts as lost: nobody has missed what was before."""
+    network = Network(completeness=DISPLAY._replace(is_complete=is_complete))
+    begin_s = network.now_s
+    network.arrives(20)
+    while not network.handed_on:
+        assert network.completion.reply_s(network.now_s) <= begin_s + 1.0 - network.now_s + 0.06
+        network.now_s += 0.25
+        network.arrive(network.publish())
+    assert network.now_s == begin_s + 1.0
+    assert network.numbers == [*range(20, 25)]
+    network.arrive(network.publish())
+    assert network.numbers == [*range(20, 26)]
+    assert network.completion.due_s == math.inf
+    assert network.check.num_lost == 0
+
+
+def test_what_is_missing_in_what_waited_for_the_past_holds_up_nothing() -> None:
+    network = Network(completeness=DISPLAY)
+    network.arrives(20)
+    network.arrives(22)
+    network.completion.expire(network.now_s + 1.0)
+    assert network.numbers == [20, 22]
+    assert network.check.num_lost == 1
+
+
+def test_a_complete_display_waits_for_a_gap_no_longer_than_its_patience() -> None:
+    network = Network(completeness=Completeness(is_complete=True, patience_s=1.0))
+    network.arrives(0)
+    network.arrives(5)
+    network.completion.expire(network.now_s + 0.9)
+    assert network.numbers == [0]
+    network.completion.expire(network.now_s + 1.1)
+    assert network.numbers == [0, 5]
+    assert network.check.num_lost == 4
+
+
+def test_the_last_seconds_of_a_key_that_is_silent_now() -> None:
+    """An event of some seconds ago, of which nothing arrives that would show that there was one."""
+    network = Network(completeness=DISPLAY)
+    for _ in range(10):
+        network.publish()
+    network.completion.begin(network.now_s)
+    assert network.completion.due_s == network.now_s
+    network.ask_all()
+    assert network.numbers == [*range(4, 10)]
+    network.arrive(network.publish())
+    assert network.numbers == [*range(4, 11)]
+    assert not network.completion.is_past
+
+
+def test_of_a_silent_key_without_an_answer_the_first_message_is_handed_on_at_once() -> None:
+    network = Network(completeness=DISPLAY)
+    network.completion.begin(network.now_s)
+    network.completion.expire(network.now_s + 1.0)
+    assert network.completion.due_s == math.inf
+    network.arrives(7)
+    assert network.numbers == [7]
+
+
+def test_if_the_last_seconds_take_too_long_their_end_is_there_and_no_gap_follows() -> None:
+    """A plot would begin again at a gap, and show nothing."""
+    network = Network(completeness=DISPLAY)
+    for _ in range(1000):
+        network.publish()
+    network.arrive(network.publish())
+
+    def find(request: HistoryRequest) -> HistoryAnswer:
+        first = int(request.options.get("from", 0))
+        last = min(first + 19, int(request.options.get("to", 1000)))
+        return HistoryAnswer(network.history[first : last + 1], first, last, 1000)
+
+    while network.completion.is_past:
+        network.now_s += 0.05
+        request = network.completion.request()
+        network.completion.answer(request, find(request), network.now_s)
+        assert network.now_s < 101
+    numbers = network.numbers
+    [begin] = [after for before, after in itertools.pairwise(numbers) if after != before + 1]
+    assert 100 < 1000 - begin < 300
+    assert numbers[-1] == 1000
+    assert network.check.num_lost == 0

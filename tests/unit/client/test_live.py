@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gateway.client import queued_reception
 from gateway.client.client import GatewayAddress
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.live_frames import ClockDifference, Frame
 from gateway.client.live_join import MAX_WAIT_S
 from gateway.client.live_stream import Live, live
@@ -173,6 +174,9 @@ def test_a_message_that_cannot_be_decoded_is_a_gap() -> None:
     channel, message = ones(MARKERS, 1)
     data.feed([parameters(xml()), ones(MARKERS, 0), (channel, message[:-1]), ones(MARKERS, 2)])
     assert [(each.sequence, each.gap) for each in data.frames(2)] == [(0, 0), (2, 1)]
+    channel, message = ones(MARKERS, 5)
+    data.feed([(channel, message[:-1]), ones(MARKERS, 6)])
+    assert [(each.sequence, each.gap) for each in data.frames(1)] == [(6, 3)]
 
 
 def test_a_program_that_is_too_slow_loses_the_oldest_and_is_warned_once(
@@ -188,6 +192,22 @@ def test_a_program_that_is_too_slow_loses_the_oldest_and_is_warned_once(
     assert [each.gap for each in data.frames(3)] == [2, 0, 0]
     assert len(warned) == 1
     assert data.num_dropped == 9
+
+
+def test_a_complete_program_that_is_too_slow_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queued_reception, "MAX_WAITING", 8)
+    history = [message for _, message in (ones(MARKERS, number) for number in range(30))]
+
+    def answer(_series: object, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
+        first = int(request.options["from"])
+        last = min(int(request.options["to"]), first + 2)
+        return HistoryAnswer(history[first : last + 1], first, last, len(history) - 1)
+
+    data = Fed()
+    data._reception.complete(answer, lambda *_: [], COMPLETE)
+    data.feed([parameters(xml()), *(ones(MARKERS, number) for number in range(30))])
+    assert [(each.sequence, each.gap) for each in data.frames(30)] == [(number, 0) for number in range(30)]
+    assert data.num_dropped == 0
 
 
 def test_the_newest_frame_needs_no_queue() -> None:
@@ -218,6 +238,14 @@ def test_a_version_that_a_gateway_uses_again_means_the_parameters_of_its_time() 
     data.feed([parameters(xml("old"), 1), parameters(xml("new"), 1, utime=START_UTIME + 1_000_000)])
     data.feed([ones(MARKERS, 0, 1), ones(MARKERS, 200, 1)])
     assert [each.markers.labels for each in data.frames(2)] == [("old",), ("new",)]
+
+
+def test_parameters_that_come_later_with_a_version_known_by_then_count() -> None:
+    data = Fed()
+    data.feed([parameters(xml("old"), 1), ones(MARKERS, 0, 1)])
+    assert data.frames(1)[0].markers.labels == ("old",)
+    data.feed([parameters(xml("new"), 1, utime=START_UTIME + 1_000_000), ones(MARKERS, 200, 1)])
+    assert data.frames(1)[0].markers.labels == ("new",)
 
 
 @pytest.mark.parametrize("ahead", [MARKERS, ANALOG])

@@ -3,6 +3,7 @@
 import pytest
 
 from gateway.client import queued_reception
+from gateway.client.queued_reception import Arrival, DescribedSource, QueuedSeries
 from gateway.display.live import NUM_EVENTS, LiveComponent, LiveData
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
@@ -108,7 +109,8 @@ def test_messages_that_nobody_decodes_are_skipped_and_counted(monkeypatch: pytes
 def test_a_message_of_the_wrong_length_is_counted() -> None:
     component = LiveComponent(MARKERS)
     _, whole = frame(MARKERS, [ONE])
-    component.update([(whole, 0), (whole[:-1], 0), (whole[:45], 0)], None)
+    series = QueuedSeries(DescribedSource("lab", "MOCAP_LAB"), "3d", "MOCAP_LAB_3D")
+    component.update([Arrival(series, each, 0, 0) for each in (whole, whole[:-1], whole[:45])], None)
     assert component.num_malformed == 2
     assert component.newest_items["x"].tolist() == [1]
 

@@ -28,6 +28,7 @@ def read_all(history: MessageHistory, key: str, wanted: WantedMessages) -> list[
     while (found := history.find(key, wanted)) is not None:
         assert sum(map(len, found.messages)) <= MAX_ANSWER_BYTES or len(found.messages) == 1
         numbers += [sequence_of(each) for each in found.messages]
+        assert found.last <= found.newest
         end = found.newest if wanted.last is None else min(wanted.last, found.newest)
         if found.last >= end:
             break
@@ -92,6 +93,14 @@ def test_old_messages_are_dropped_after_the_time_and_beyond_the_memory() -> None
     # 100 messages fit; a block is a 32nd of the memory, or a message more.
     assert 1000 - 100 <= found.oldest <= 1000 - 100 + 8
     assert history.overview["num_bytes"] == (1000 - found.oldest) * 1000
+
+
+def test_a_message_that_is_longer_than_an_answer_may_be_is_an_answer() -> None:
+    history = MessageHistory(Clock())
+    history.set_limits(5.0, 1 << 20)
+    for sequence in range(3):
+        history.add("3d", message(sequence, size=MAX_ANSWER_BYTES + 1))
+    assert read_all(history, "3d", WantedMessages(0)) == [0, 1, 2]
 
 
 def test_nothing_is_kept_without_limits_or_after_forgetting() -> None:

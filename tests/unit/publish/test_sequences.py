@@ -122,11 +122,13 @@ class Disk(ToyOutput):
         self.recorded = MessageHistory()
         self.recorded.set_limits(1e9, 1 << 30)
         self.code = ""
+        self.part: FoundMessages | None = None
+        """What it has read until now, if it is slow."""
 
     async def recorded_messages(self, _source: str, key: str, wanted: WantedMessages) -> FoundMessages | None:
         if self.code:
             raise QueryError("the disk fails", code=self.code)
-        return self.recorded.find(key, wanted)
+        return self.part or self.recorded.find(key, wanted)
 
     def oldest_recorded(self, _source: str, key: str) -> tuple[int, int] | None:
         keys = self.recorded.overview["keys"]
@@ -161,6 +163,11 @@ async def test_what_is_older_than_the_memory_comes_from_the_disk_up_to_what_is_i
     _, (_, _, oldest, _) = await numbers(WantedMessages(0), "paced")
     assert oldest > 0
     assert fan_out.history_overview["keys"]["3d"]["oldest"] == 0
+    disk.part = FoundMessages([], 2, 3, 0, 7)
+    assert await numbers(WantedMessages(2)) == ([], (2, 3, 0, 9))
+    disk.part = FoundMessages([], 4, 3, 0, 7)
+    assert await numbers(WantedMessages(None, 0)) == ([], (4, 3, 0, 9))
+    assert (await numbers(WantedMessages(4)))[0] == [8, 9]  # there is nothing more on the disk
     disk.code = "disk"
     assert (await numbers(WantedMessages(2)))[0] == [8, 9]
     disk.code = "busy"

@@ -9,7 +9,7 @@ import pytest
 import rtc3d
 
 from gateway.client import reception
-from gateway.client.completion import HistoryAnswer, HistoryRequest
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
@@ -109,7 +109,7 @@ def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
     """Otherwise, a replay would take the refilled messages for a clock that was set back."""
     may_answer = threading.Event()
 
-    def ask(series: RecordedSeries, request: HistoryRequest) -> HistoryAnswer:
+    def ask(series: RecordedSeries, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
         assert may_answer.wait(60)
         first = 0 if request.known is None else request.known[0]
         assert request.last is not None
@@ -117,7 +117,7 @@ def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
         found = [new(number) for number in range(first, request.last + 1)]
         return HistoryAnswer(found, first, request.last, 9)
 
-    recorded.recording.complete(ask, None)
+    recorded.recording.complete(ask, lambda *_: [], COMPLETE)
     recorded.describe("lab")
     for number in range(10):
         if number not in range(2, 7):

@@ -5,14 +5,19 @@ import time
 
 import pytest
 
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
+from gateway.client.reception import Series
 from gateway.display.live import LiveData, LiveSource
 from gateway.display.top import facts
 from gateway.display.top.pages import PAGES, TWO_GATEWAYS, Page, event_time
 from gateway.display.top.table import laid_out, sorted_by
+from gateway.errors import QueryError
 from gateway.messages.decode import json_text
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
 from tests.support.statuses import count, loss, output, stream
+from tests.support.takes import frame
+from tests.support.waiting import wait_until
 from tests.unit.display.live_lab import Lab
 
 
@@ -50,6 +55,27 @@ def test_the_overview_says_that_two_gateways_have_one_name() -> None:
         lab.send_ones("3d", number, 1)
         lab.send_ones("3d", 5000 + number, 1)
     assert TWO_GATEWAYS in shown("overview", lab.source)
+
+
+def test_what_was_refilled_and_what_stays_lost() -> None:
+    """It says whether a recording on this computer would be complete."""
+    lab = Lab()
+
+    def ask(series: Series, _request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
+        if series.key != "3d":
+            raise QueryError("the gateway keeps no such messages", code="disabled")
+        kept = [frame(ComponentType.MARKERS, [(1, 2, 3, 0.1)], number)[1] for number in (7, 8)]
+        return HistoryAnswer(kept, 1, 8, 9)
+
+    lab.live.complete(ask, lambda *_: [], COMPLETE)
+    for number in (0, 9):
+        for key in ("3d", "analog"):
+            lab.send_ones(key, number, 1)
+    wait_until(lambda: all(series.check.num_lost for series in lab.live.all_series))
+    titles, _, note, *rows = shown("overview", lab.source)
+    assert "lost refilled" in titles
+    assert note == "gaps are not filled: the gateway keeps no such messages"
+    assert [row.split()[:4] for row in rows] == [["3d", "0.0", "6", "2"], ["analog", "0.0", "8", "0"]]
 
 
 def test_markers_that_are_seen_least_come_first() -> None:

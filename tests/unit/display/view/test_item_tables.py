@@ -91,7 +91,7 @@ ANALOG = """<Analog><Channels>2</Channels><Channel><Label>EMG</Label><Unit>V</Un
 
 
 def values(source: LiveSource, channel: Channel) -> list[tuple[list[int], list[float]]]:
-    found = samples(channel, source.components[channel.key])
+    found = samples(channel, source.components[channel.key].batch)
     return [(utimes.tolist(), values.tolist()) for utimes, values in found]
 
 

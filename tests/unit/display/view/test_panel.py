@@ -9,8 +9,11 @@ import viser
 
 from gateway.display.view import panel as view_panel
 from gateway.display.view.panel import Panel
-from gateway.display.view.plots import MAX_PLOTS
+from gateway.display.view.plots import MAX_PLOTS, RecentRows
+from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
+from gateway.takes.files.component_rows import decode_rows
+from tests.support.takes import frame
 from tests.unit.display.live_lab import Lab, wait
 
 Show = Callable[[], None]
@@ -74,9 +77,10 @@ def test_a_stop_is_said_at_once_and_texts_change_rarely(
             return ""
 
         monkeypatch.setattr(view_panel, name, count)
+    begin_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: begin_s)
     lab.send_markers(True)
     panel.update(lab.live.update())
-    begin_s = time.monotonic()
     for picture in range(60):
         now_s = begin_s + picture / 30
         monkeypatch.setattr(time, "monotonic", lambda now_s=now_s: now_s)
@@ -106,6 +110,33 @@ def test_a_spike_is_in_the_plot_of_its_channel(panel: Panel, lab: Lab, show: Sho
     _, lowest, highest = plots._plots["lab analog 2: channel 2 (mV)"].handle.data
     assert np.nanmin(lowest) == -50
     assert np.nanmax(highest) == 99
+
+
+def test_a_plot_that_is_added_shows_the_last_10_s_at_once(panel: Panel, lab: Lab, show: Show) -> None:
+    """Whoever opens a plot has just seen something happen."""
+    end_utime = now_utime()
+    for age_s in range(15, -1, -1):
+        lab.send(ComponentType.ANALOG, [0.0, age_s], utime=end_utime - age_s * 500_000)
+        show()
+    title = "lab analog 2: channel 2 (mV)"
+    panel._plots._add.value = title  # type: ignore[misc]
+    show()
+    times_s, lowest, _ = panel._plots._plots[title].handle.data
+    assert lowest[np.isfinite(lowest)].tolist() == [*range(15, -1, -1)]
+    assert times_s[-1] - times_s[0] == pytest.approx(7.5, abs=0.1)
+
+
+def test_what_is_kept_for_plots_is_bounded_by_time_and_bytes() -> None:
+    messages = [
+        frame(ComponentType.ANALOG, [1.0], number, utime=number * 1_000_000)[1] for number in range(30)
+    ]
+    batches = [decode_rows(ComponentType.ANALOG, [message]) for message in messages]
+    recent = RecentRows()
+    for batch in batches:
+        recent.take(batch, 10**9)
+    assert [each.heads["sequence"][0] for each in recent.batches] == [*range(19, 30)]
+    recent.take(batches[-1], 3 * len(messages[0]))
+    assert len(recent.batches) == 3
 
 
 def test_a_first_plot_is_chosen_when_the_channels_are_known_and_stays_removed(

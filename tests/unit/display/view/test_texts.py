@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gateway.display.live import Percentiles
+from gateway.display.statistics import Percentiles
 from gateway.display.view.scene import sphere_around, up_axis_of
 from gateway.display.view.scene_items import MAX_M, UpAxis, on_floor, positions_in_metres
 from gateway.display.view.texts import (

@@ -7,6 +7,7 @@ import logging
 import resource
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,11 +16,13 @@ import pytest
 from gateway.errors import OutputError, QueryError
 from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
+from gateway.messages.history import WantedMessages
 from gateway.outputs.contract import ServerParameters, encode_parameters
 from gateway.outputs.takes import disk as disk_calls
-from gateway.outputs.takes import disk as disk_module
+from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
+from gateway.outputs.takes.segment_index import read_planned
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import SourceDescription
@@ -229,6 +232,44 @@ async def test_a_disk_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest
     assert [path.name for path in lab.path("").glob("*.lcmlog")] == ["run.lcmlog"]
 
 
+async def test_messages_on_a_disk_that_hangs_are_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who asks for them may ask again; nobody waits for long, and nothing is read for those who gave up."""
+    monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
+    responds = threading.Event()
+    num_reads = 0
+
+    def read(*arguments: Any) -> Any:
+        nonlocal num_reads
+        num_reads += 1
+        responds.wait()
+        return read_planned(*arguments)
+
+    monkeypatch.setattr(segments, "read_planned", read)
+    async with recording_lab(tmp_path, keep_last_s=60.0) as lab:
+        message = lab.publish()
+        await lab.output.storage.written()
+        ask = partial(lab.output.recorded_messages, "lab", "3d", WantedMessages(0, None, 0))
+        refused = await asyncio.gather(*(ask() for _ in range(20)), return_exceptions=True)
+        assert [getattr(each, "code", None) for each in refused] == ["busy"] * 20
+        late = [each for each in refused if "did not respond" in str(each)]
+        assert len(late) == disk_calls.MAX_HISTORY_READS
+        with pytest.raises(QueryError, match="too many subscribers"):
+            await ask()
+        responds.set()
+        await wait_until_async(lambda: lab.output.storage._num_history_reads == 0)
+        found = await ask()
+        assert found is not None
+        assert (found.messages, num_reads) == ([message], 2)
+        lab.output.storage.started_writer().call(responds.clear)
+        lab.output.storage.started_writer().call(responds.wait)
+        with pytest.raises(QueryError, match="did not respond") as refusal:
+            await lab.output.recorded_messages("lab", "3d", WantedMessages(0))
+        assert refusal.value.code == "busy"
+        responds.set()
+
+
 async def until_problem(lab: RecordingLab, text: str) -> None:
     await wait_until_async(lambda: text in lab.output.health().problem)
 
@@ -360,7 +401,7 @@ def test_a_problem_of_the_disk_and_its_end_are_logged_once(
 ) -> None:
     """Without the second line, a reader of the log takes the problem for a present one."""
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(disk_module, "HOLD_S", 0.0)
+    monkeypatch.setattr(disk_calls, "HOLD_S", 0.0)
     disk = Disk()
     for call in (disk.succeeded, *[lambda: disk.failed(Path("/takes"), FULL)] * 3, *[disk.succeeded] * 2):
         call()

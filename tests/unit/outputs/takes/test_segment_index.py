@@ -165,3 +165,32 @@ async def test_a_segment_that_somebody_removes_costs_only_its_messages(tmp_path:
         sorted((tmp_path / ".rolling" / "lab").iterdir())[1].unlink()
         found = await found_in(lab, "3d", 5)
         assert [sequence_of(each) for each in found.messages] == [*range(5, 10), *range(20, 40)]
+
+
+class SlowClock(Clock):
+    """Each look at it takes ``step_s``."""
+
+    step_s = 0.0
+
+    def __call__(self) -> float:
+        self.now_s += self.step_s
+        return self.now_s
+
+
+@pytest.mark.parametrize(("look_s", "max_read_bytes"), [(0.7 * segment_index.MAX_READ_S, 10**9), (0.0, 3000)])
+async def test_one_answer_reads_little_of_a_slow_disk_or_of_a_large_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look_s: float, max_read_bytes: int
+) -> None:
+    """Otherwise, a subscriber would give up one long answer after the other, and never get a message."""
+    monkeypatch.setattr(segment_index, "STRETCH_BYTES", 1000)
+    monkeypatch.setattr(segment_index, "MAX_READ_BYTES", max_read_bytes)
+    clock = SlowClock()
+    async with still_lab(tmp_path, clock, keep_last_s=600.0) as lab:
+        for number in range(20):
+            lab.publishers["3d"].publish(message(number, markers=20))
+            await lab.output.storage.written()
+        clock.step_s = look_s
+        found = await found_in(lab, "3d", 0)
+        assert [sequence_of(each) for each in found.messages] == [*range(found.last + 1)]
+        assert 0 < len(found.messages) < 10
+        assert [sequence_of(each) for each in await read_all(lab, "3d", WantedMessages(0))] == [*range(20)]

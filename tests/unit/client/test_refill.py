@@ -1,0 +1,105 @@
+"""The threads that request what is missing, with a reception and a gateway of the test."""
+
+import math
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
+from gateway.client.refill import Refill
+from gateway.messages.encode import PREFIX
+from gateway.messages.sequence_check import SequenceCheck
+from tests.support.waiting import wait_until
+
+
+def message(sequence: int) -> bytes:
+    return bytes(8) + PREFIX.pack(1000 + sequence, 0, sequence, 1, 0)
+
+
+class Series:
+    """The series of a subscriber that the refill needs to know."""
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.check = SequenceCheck()
+
+
+class Subscriber:
+    """A subscriber to ``num_series`` of one source. Answers have ``answer_size`` messages."""
+
+    def __init__(self, num_series: int, answer_size: int) -> None:
+        self.lock = threading.Lock()
+        self.num_looks = 0
+        self.rooms: Sequence[bool] = ()
+        """What the first looks for room find; later ones find some."""
+        self.asked: list[Series] = []
+        self.handed_on: list[int] = []
+        self.series: Any = [Series("lab") for _ in range(num_series)]
+        self._answer_size = answer_size
+        self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE)  # type: ignore[arg-type] # only has_room
+        self.completions = [self.refill.add(each, self._hand_on) for each in self.series]
+
+    @property
+    def has_room(self) -> bool:
+        self.num_looks += 1
+        return self.num_looks > len(self.rooms) or self.rooms[self.num_looks - 1]
+
+    def failed(self, defect: Exception) -> None:
+        pytest.fail(repr(defect))
+
+    def _hand_on(self, message: bytes) -> None:
+        self.handed_on.append(PREFIX.unpack_from(message, 8)[2])
+
+    def _ask(self, series: Series, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
+        self.asked.append(series)
+        first = int(request.options["from"])
+        last = min(first + self._answer_size - 1, int(request.options["to"]))
+        return HistoryAnswer([message(number) for number in range(first, last + 1)], first, last, 99)
+
+    def arrives(self, number: int) -> None:
+        """A message of each series arrives. The caller holds the lock."""
+        for series, completion in zip(self.series, self.completions, strict=True):
+            completion.receive(message(number), number, 1000 + number, 1, 0.0)
+            if completion.due_s < math.inf:
+                self.refill.check(series)
+
+
+def test_no_series_is_refilled_far_ahead_of_the_others() -> None:
+    """Otherwise, the others would be too old for the history by the time that it is their turn."""
+    subscriber = Subscriber(2, answer_size=10)
+    with subscriber.lock:
+        subscriber.arrives(0)
+        subscriber.arrives(60)
+    wait_until(lambda: subscriber.refill.num_incomplete == 0)
+    subscriber.refill.close()
+    assert sorted(subscriber.handed_on) == sorted([*range(61)] * 2)
+    turns = [subscriber.asked.count(series) for series in subscriber.series]
+    assert turns[0] == turns[1] > 5
+    for number in range(0, len(subscriber.asked), 2):
+        assert set(subscriber.asked[number : number + 2]) == set(subscriber.series)
+
+
+def test_nothing_is_requested_while_the_program_has_no_room_for_it() -> None:
+    """What the history brings would push out what the program has not read yet."""
+    subscriber = Subscriber(1, answer_size=100)
+    subscriber.rooms = (False, False, False)
+    with subscriber.lock:
+        subscriber.arrives(0)
+        subscriber.arrives(9)
+    wait_until(lambda: subscriber.asked)
+    assert subscriber.num_looks > len(subscriber.rooms)
+    subscriber.refill.close()
+
+
+def test_a_series_that_has_got_what_was_late_delays_nothing() -> None:
+    """Until the thread has seen it, the series is still among those to look at."""
+    subscriber = Subscriber(1, answer_size=100)
+    with subscriber.lock:
+        subscriber.arrives(0)
+        subscriber.arrives(2)
+        assert subscriber.refill.reached_utime("lab") == 1000  # type: ignore[arg-type] # any source
+        subscriber.arrives(1)
+        assert subscriber.refill.reached_utime("lab") == math.inf  # type: ignore[arg-type]
+    subscriber.refill.close()

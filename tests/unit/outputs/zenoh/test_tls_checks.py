@@ -1,0 +1,57 @@
+"""Why a TLS connection fails, with real routers and certificates of the recipe in docs/how-to/secure.md."""
+
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from gateway.outputs.zenoh.tls_checks import tls_problem
+from tests.support.networks import free_endpoint, free_port, open_zenoh
+from tests.support.secure_zenoh import SecureRouter, make_certificates, open_session, shipped_file
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return two folders with certificates of different authorities."""
+    base = tmp_path_factory.mktemp("certificates")
+    return [make_certificates(base / name) for name in ("ours", "other")]
+
+
+def problem(router: SecureRouter, certificates: Path, host: str = "127.0.0.1") -> str:
+    """Return the problem of a viewer with the certificates of this folder."""
+    text = router.client("viewer", (str(router.certificates), str(certificates)))
+    return tls_problem(f"tls/{host}:{router.port}", zenoh.Config.from_json5(text))
+
+
+def test_each_problem_of_a_certificate_is_named(folders: list[Path]) -> None:
+    ours, other = folders
+    port = free_port()
+    router = SecureRouter(port, ours)
+    text = shipped_file(
+        "zenoh-acl.json5", ("tls/[::]:7447", f"tls/127.0.0.1:{port}"), ("/etc/rtc3d-gateway/tls", str(ours))
+    )
+    with open_session(text):
+        assert problem(router, ours) == ""
+        assert "is not accepted: " in problem(router, other)
+        assert "is not accepted: " in problem(router, ours, "127.0.0.2") or "127.0.0.2" in problem(
+            router, ours, "127.0.0.2"
+        )
+        assert "root_ca_certificate" in problem(router, ours / "missing")
+        mixed = router.client("viewer", (f"{ours}/viewer.", f"{other}/viewer."))
+        found = tls_problem(f"tls/127.0.0.1:{port}", zenoh.Config.from_json5(mixed))
+        assert found.startswith(f"127.0.0.1:{port} refuses this computer's certificate: ")
+    assert (
+        problem(router, ours)
+        == f"127.0.0.1:{port}: Connection refused; start the router, or correct the address"
+    )
+
+
+def test_an_endpoint_without_tls_is_not_tried() -> None:
+    assert tls_problem("tcp/127.0.0.1:1", zenoh.Config()) == ""
+
+
+def test_a_port_that_does_not_speak_tls_is_named(folders: list[Path]) -> None:
+    endpoint = free_endpoint()
+    port = int(endpoint.rpartition(":")[2])
+    with open_zenoh("router", listen=endpoint):
+        assert "does not answer with TLS" in problem(SecureRouter(port, folders[0]), folders[0])
