@@ -33,6 +33,7 @@ _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 _GROUPS: Final = {
     "installation": ("tests/systemd/", "tests/packaging/test_wheel.py"),
     "outages": ("tests/outages/",),
+    "sites": ("tests/hostile/test_sites.py",),
 }
 
 _NEEDS: Final = {
@@ -81,7 +82,8 @@ def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.Abstrac
 class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
     """Runs some groups of tests in one worker each.
 
-    Each test of the installation would boot a machine of its own, and each of the outages needs a core.
+    Each test of the installation would boot a machine of its own, and each of the outages needs a core. Those
+    of two sites share both of them.
     pytest-xdist's own groups have no effect with pytest 9.2.
     """
 

@@ -188,7 +188,11 @@ class ZenohTransport(Transport):
             if absence := self._absence(source, served):
                 raise QueryError(absence, code="no-gateway")
         if left_s == 0:
-            raise reason or limits.no_reply(", ".join(unanswered))
+            raise reason or QueryError(
+                f"nothing answers {', '.join(unanswered)} although a gateway is running; "
+                "the access control of a router may forbid this query",
+                code="timeout",
+            )
         time.sleep(min(RETRY_S, left_s))
 
     def _absence(self, source: str | None, served: Collection[str]) -> str:

@@ -112,6 +112,11 @@ def test_json5_is_zenohs(block: Block) -> None:
     assert zenoh.Config.from_json5(text)
 
 
+@pytest.mark.parametrize("file", sorted(ROOT.glob("config/sites/*")), ids=lambda path: path.name)
+def test_the_files_for_sites_are_what_a_program_takes(file: Path) -> None:
+    assert load(file).sources if file.suffix == ".yaml" else zenoh.Config.from_file(str(file))
+
+
 @pytest.mark.parametrize(("place", "words"), [pytest.param(*each, id=each[0]) for each in OURS])
 def test_commands_have_these_subcommands_and_options(place: str, words: tuple[str, ...]) -> None:
     command = typer.main.get_command(app)

@@ -35,7 +35,7 @@ def test_pages_can_be_tried() -> None:
     """Other tests run the commands of the pages secure and service."""
     servers = {"first-principles", "wavefront", "several-servers"}
     outputs = {"lcm", "ros2", "rtc3d-clients", "vrpn", "lsl", "foxglove"}
-    assert servers | outputs | {"router", "replay", "troubleshoot"} <= set(PAGES)
+    assert servers | outputs | {"router", "two-sites", "lecture-hall", "replay", "troubleshoot"} <= set(PAGES)
 
 
 @pytest.fixture

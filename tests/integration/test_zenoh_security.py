@@ -1,4 +1,4 @@
-"""The router and client files in config/, with certificates made by the recipe in docs/how-to/secure.md."""
+"""The router and client files in config/, with certificates made by config/certificates.sh."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -75,7 +75,7 @@ def test_no_page_is_wider_than_a_phone(site: Path, new_page: NewPage) -> None:
 def test_the_button_copies_a_block_as_it_is_in_the_source(site: Path, new_page: NewPage) -> None:
     page = new_page(permissions=["clipboard-read", "clipboard-write"])
     page.goto((site / "how-to/secure.html").as_uri())
-    block = page.locator(".language-sh", has_text="openssl x509")
+    block = page.locator(".language-text", has_text="table inet rtc3d_lcm")
     block.hover()
     block.locator("button").first.click()
     expect(page.locator(".md-dialog")).to_contain_text("Copied to clipboard")

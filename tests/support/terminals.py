@@ -122,7 +122,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def terminals(folder: Path) -> Iterator[dict[str, Terminal]]:
-    terminals = {name: Terminal(folder) for name in ("terminal 1", "terminal 2", "terminal 3", "terminal 4")}
+    terminals = {f"terminal {number}": Terminal(folder) for number in range(1, 6)}
     yield terminals
     for terminal in terminals.values():
         if terminal.is_busy:
