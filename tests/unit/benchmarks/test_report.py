@@ -9,16 +9,19 @@ from hypothesis import strategies as st
 
 from benchmarks import report
 from benchmarks.report import Pair, Table, percentile, rendered
+from benchmarks.suite import GATEWAY, SITES, Suite
 
 
-def test_the_document_has_the_figures_of_the_results() -> None:
-    document = report.DOCUMENT.read_text()
-    assert rendered(document, report.sections(report.load(report.RESULTS))) == document
+@pytest.mark.parametrize("suite", [GATEWAY, SITES], ids=lambda suite: suite.package)
+def test_the_document_has_the_figures_of_the_results(suite: Suite) -> None:
+    document = suite.document.read_text()
+    assert rendered(document, suite.sections(report.load(suite.results))) == document
 
 
-def test_the_document_has_markers_for_every_part() -> None:
-    document = report.DOCUMENT.read_text()
-    for name in ("goals", "machine", *report.PARTS):
+@pytest.mark.parametrize("suite", [GATEWAY, SITES], ids=lambda suite: suite.package)
+def test_the_document_has_markers_for_every_part(suite: Suite) -> None:
+    document = suite.document.read_text()
+    for name in ("goals", "machine", *suite.parts):
         assert rendered(document, {name: [Table("A title", ["a"], [["12345"]])]}) != document, name
 
 

@@ -1,0 +1,121 @@
+"""Native subscribers of one site: many sessions in a few processes, which count what they receive and miss."""
+
+import json
+import subprocess
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import IO, Any, Final, Self
+
+from benchmarks.processes import ROOT, tree_cpu_s, zenoh_session_config
+from benchmarks.sites.network import Namespace
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+
+PROGRAM: Final = ROOT / "build" / "sites" / "release" / "site-subscriber"
+ALL_KEYS: Final = ("mocap/*/*",)
+"""The key expressions of a subscriber to everything except poses of single tools."""
+
+_PER_PROCESS: Final = 32
+_END_S: Final = 10.0
+
+
+Reports = dict[str, dict[str, Any]]
+"""What one session has received, by key, as the program reports it."""
+
+
+@dataclass
+class Received:
+    """What one or more sessions have received on some keys."""
+
+    messages: int = 0
+    message_bytes: int = 0
+    missing: int = 0
+    """Gaps in ``sequence``; what a later message has not shown to be missing does not count."""
+    not_newer: int = 0
+    longest_silence_ms: float = 0.0
+    ages_us: Counter[float] = field(default_factory=Counter)
+    """How old each message was when it arrived, since ``utime``: upper edges of a histogram, and counts."""
+    ages_before_us: Counter[float] = field(default_factory=Counter)
+    """How old the newest message had become when the next one arrived."""
+
+    def add(self, report: dict[str, Any]) -> None:
+        """Add what the program reports about one key."""
+        self.messages += report["messages"]
+        self.message_bytes += report["message_bytes"]
+        self.missing += report["missing"]
+        self.not_newer += report["not_newer"]
+        self.longest_silence_ms = max(self.longest_silence_ms, report["longest_silence_us"] / 1000)
+        self.ages_us.update(dict(report["ages_us"]))
+        self.ages_before_us.update(dict(report["ages_before_us"]))
+
+
+def percentile_ms(ages_us: Counter[float], per_cent: float) -> float:
+    """Return the smallest age that ``per_cent`` % do not exceed, in ms; at most 4.4 % too large."""
+    left = ages_us.total() * per_cent / 100
+    for age_us, count in sorted(ages_us.items()):
+        left -= count
+        if left <= 0:
+            return age_us / 1000
+    return 0.0
+
+
+class Subscribers:
+    """A context in which ``count`` sessions subscribe to ``keys`` through the router of their site."""
+
+    def __init__(self, site: Namespace, endpoint: str, count: int, keys: Sequence[str]) -> None:
+        config = json.dumps(zenoh_session_config("client", connect=[endpoint]))
+        self._commands = [
+            site.command(str(PROGRAM), config, str(min(_PER_PROCESS, count - first)), *keys)
+            for first in range(0, count, _PER_PROCESS)
+        ]
+
+    def __enter__(self) -> Self:
+        self._processes = [
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603
+            for command in self._commands
+        ]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._processes:
+            _pipe(process.stdin).close()
+        for process in self._processes:
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def cpu_s(self) -> float:
+        """Return the CPU time of all sessions, in s."""
+        return sum(tree_cpu_s(process.pid) for process in self._processes)
+
+    def take(self) -> list[Reports]:
+        """Return what each session has received of each key since the last call."""
+        for process in self._processes:
+            _pipe(process.stdin).write("\n")
+            _pipe(process.stdin).flush()
+        sessions: list[Reports] = []
+        for process in self._processes:
+            line = _pipe(process.stdout).readline()
+            if not line:
+                raise RuntimeError("a subscriber has ended; its error is above")
+            sessions += json.loads(line)
+        return sessions
+
+
+def _pipe(stream: IO[str] | None) -> IO[str]:
+    if stream is None:
+        raise RuntimeError("the process has no pipe")
+    return stream
+
+
+def received(sessions: Iterable[Reports], source: str = "") -> Received:
+    """Return the sum of what sessions have received of the components of one source, or of all."""
+    total = Received()
+    for session in sessions:
+        for key, report in session.items():
+            _, name, component = key.rsplit("/", 2)
+            if component in COMPONENTS_BY_KEY and source in ("", name):
+                total.add(report)
+    return total
