@@ -230,7 +230,7 @@ def zenoh_session_config(
 
 
 def router(file: Path, config: dict[str, Any], inside: Sequence[str] = ()) -> Program:
-    """Return a Zenoh router; ``router_kind`` names the program. Writes its configuration to ``file`` (.json5).
+    """Return a Zenoh router; writes its configuration to ``file``. ``router_kind`` names the program.
 
     ``inside`` precedes the command, such as a command that enters a network namespace.
     """

@@ -3,12 +3,13 @@
     site A ── to_link ⇄ to_a ── link ── to_b ⇄ to_link ── site B
     10.1.0.1           10.1.0.2        10.2.0.2           10.2.0.1
 
-Site A is the namespace that the benchmark runs in, which tests/with-netns has made for it. The link forwards IP
-packets. It can limit their rate, lose all of them, and delay them.
+Site A is the namespace that the benchmark runs in, which tests/with-netns has made for it. The link forwards
+IP packets. It can limit their rate, lose all of them, and delay them.
 """
 
 import contextlib
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -27,6 +28,9 @@ SITE_DEVICE: Final = "to_link"
 
 _QUEUE_MS: Final = 50
 """How much of a limited link's rate waits in its queue, as in a small router; what is more is dropped."""
+
+_LISTEN: Final = "0A"
+"""The state of a listening socket in /proc/net/tcp."""
 
 _BURST_BYTES: Final = 10_000
 _DELAY_DEVICE: Final = "delay"
@@ -50,6 +54,11 @@ class Namespace:
         )
         if done.returncode:
             raise RuntimeError(f"{line}: {done.stderr.strip()}")
+
+    def listens(self, port: int) -> bool:
+        """Return whether a program of this namespace accepts connections on a port of IPv4."""
+        sockets = Path(f"/proc/{self.pid}/net/tcp").read_text()
+        return re.search(rf":{port:04X} 00000000:0000 {_LISTEN} ", sockets) is not None
 
 
 class Network:
@@ -94,7 +103,7 @@ class Network:
         stack.enter_context(Program(self._link.command(*program), environment=PLAIN_PYTHON))
 
     def bytes_to_b(self) -> int:
-        """Return how many bytes the link has delivered to site B, with the headers of Ethernet, IP and TCP."""
+        """Return how many bytes the link has delivered to site B, with all headers."""
         for line in Path(f"/proc/{self._link.pid}/net/dev").read_text().splitlines():
             name, _, counters = line.partition(":")
             if name.strip() == "to_b":
@@ -123,7 +132,7 @@ class Network:
 
 @contextlib.contextmanager
 def _new_namespace() -> Iterator[Namespace]:
-    """Return a context in which a new network namespace exists. It ends with this process, however that ends."""
+    """Return a context in which a network namespace exists. It ends with this process at the latest."""
     command = ["unshare", "--net", "cat"]  # cat ends with its input
     with subprocess.Popen(command, stdin=subprocess.PIPE) as holder:  # noqa: S603 - found through PATH
         name = Path(f"/proc/{holder.pid}/comm")

@@ -1,7 +1,9 @@
-"""Native subscribers of one site: many sessions in a few processes, which count what they receive and miss."""
+"""Native subscribers: many sessions in a few processes, which count what they receive and miss."""
 
+import contextlib
 import json
 import subprocess
+import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +19,7 @@ ALL_KEYS: Final = ("mocap/*/*",)
 
 _PER_PROCESS: Final = 32
 _END_S: Final = 10.0
+_QUIET_S: Final = 1.0
 
 
 Reports = dict[str, dict[str, Any]]
@@ -78,7 +81,8 @@ class Subscribers:
 
     def __exit__(self, *_: object) -> None:
         for process in self._processes:
-            _pipe(process.stdin).close()
+            with contextlib.suppress(BrokenPipeError):  # it has ended early
+                _pipe(process.stdin).close()
         for process in self._processes:
             try:
                 process.wait(_END_S)
@@ -90,10 +94,17 @@ class Subscribers:
         """Return the CPU time of all sessions, in s."""
         return sum(tree_cpu_s(process.pid) for process in self._processes)
 
+    def look(self) -> list[Reports]:
+        """Return what each session has received of each key since ``take``."""
+        return self._ask("look")
+
     def take(self) -> list[Reports]:
-        """Return what each session has received of each key since the last call."""
+        """Return the same as ``look``, and start to count again."""
+        return self._ask("take")
+
+    def _ask(self, request: str) -> list[Reports]:
         for process in self._processes:
-            _pipe(process.stdin).write("\n")
+            _pipe(process.stdin).write(f"{request}\n")
             _pipe(process.stdin).flush()
         sessions: list[Reports] = []
         for process in self._processes:
@@ -102,6 +113,17 @@ class Subscribers:
                 raise RuntimeError("a subscriber has ended; its error is above")
             sessions += json.loads(line)
         return sessions
+
+    def wait_for(self, messages: int) -> list[Reports]:
+        """Wait until all sessions have this many messages of components, or none arrive for a second.
+
+        Return the same as ``take``.
+        """
+        before = -1
+        while before < (now := received(self.look()).messages) < messages:
+            before = now
+            time.sleep(_QUIET_S)
+        return self.take()
 
 
 def _pipe(stream: IO[str] | None) -> IO[str]:
@@ -115,7 +137,11 @@ def received(sessions: Iterable[Reports], source: str = "") -> Received:
     total = Received()
     for session in sessions:
         for key, report in session.items():
-            _, name, component = key.rsplit("/", 2)
-            if component in COMPONENTS_BY_KEY and source in ("", name):
+            if is_component(key) and source in ("", key.split("/")[-2]):
                 total.add(report)
     return total
+
+
+def is_component(key: str) -> bool:
+    """Return whether messages of a component have this key; it may be one of several sources."""
+    return key.rpartition("/")[2] in COMPONENTS_BY_KEY

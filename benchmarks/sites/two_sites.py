@@ -41,9 +41,10 @@ class Site:
     router: Program = field(init=False)
 
     def start_router(self) -> None:
-        """Start the router of this site."""
+        """Start the router of this site, and wait until programs can connect to it."""
         file = self.folder / "router.json5"
         self.router = processes.router(file, self.router_config, self.namespace.command()).__enter__()
+        processes.wait_until(lambda: self.namespace.listens(_PORT), "the router listens")
 
     def kill_router(self) -> None:
         """Kill the router, as a power cut does."""

@@ -3,8 +3,8 @@
 //!     site-subscriber CONFIG SESSIONS KEY...
 //!
 //! CONFIG is Zenoh's configuration in JSON, the same for all sessions. Each session subscribes to the key
-//! expressions KEY. For each line on standard input, the program prints a line of JSON and starts to count
-//! again. It ends with its input.
+//! expressions KEY. For each line on standard input, the program prints a line of JSON: what each
+//! session has received of each key. After the line `take`, it starts to count again. It ends with its input.
 //!
 //! The messages are those of the gateway (docs/reference/messages.md): `utime` is at byte 8 and `sequence` at
 //! byte 24, both big-endian. Keys of parameters carry no such message and are left out.
@@ -14,7 +14,7 @@ use std::io::{BufRead, Write};
 use std::sync::{Arc, Mutex};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 use zenoh::Wait;
 use zenoh::sample::Sample;
 
@@ -72,9 +72,8 @@ impl Stream {
         self.received_us = now_us;
     }
 
-    /// Return the report, and start to count again.
-    fn take(&mut self) -> Value {
-        let report = json!({
+    fn report(&self) -> Value {
+        json!({
             "messages": self.messages,
             "message_bytes": self.message_bytes,
             "first": self.first,
@@ -84,7 +83,10 @@ impl Stream {
             "longest_silence_us": self.longest_silence_us,
             "ages_us": histogram(&self.ages),
             "ages_before_us": histogram(&self.ages_before),
-        });
+        })
+    }
+
+    fn start_again(&mut self) {
         *self = Stream {
             known: self.known,
             newest: self.newest,
@@ -92,7 +94,6 @@ impl Stream {
             received_us: self.received_us,
             ..Stream::default()
         };
-        report
     }
 }
 
@@ -155,19 +156,19 @@ fn main() -> zenoh::Result<()> {
     }
     let mut output = std::io::stdout().lock();
     for line in std::io::stdin().lock().lines() {
-        line?;
-        let reports: Vec<Value> = sessions_and_streams
-            .iter()
-            .map(|(_, streams)| {
-                let mut streams = streams.lock().expect("no panic while locked");
-                streams
-                    .iter_mut()
-                    .map(|(key, stream)| (key.clone(), stream.take()))
-                    .collect::<serde_json::Map<_, _>>()
-                    .into()
-            })
-            .collect();
-        writeln!(output, "{}", Value::from(reports))?;
+        let take = line? == "take";
+        let reports = sessions_and_streams.iter().map(|(_, streams)| {
+            let mut streams = streams.lock().expect("no panic while locked");
+            let report: Map<String, Value> = streams
+                .iter()
+                .map(|(key, each)| (key.clone(), each.report()))
+                .collect();
+            if take {
+                streams.values_mut().for_each(Stream::start_again);
+            }
+            Value::from(report)
+        });
+        writeln!(output, "{}", Value::from_iter(reports))?;
         output.flush()?;
     }
     for (session, _) in &sessions_and_streams {
