@@ -240,9 +240,9 @@ def router(file: Path, config: dict[str, Any], inside: Sequence[str] = ()) -> Pr
     return Program([*inside, sys.executable, "-m", "benchmarks.python_router", str(file)])
 
 
-def router_config(listen: str, connect: Sequence[str] = ()) -> dict[str, Any]:
+def router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> dict[str, Any]:
     """Return the configuration of a router that finds no others, but connects to these."""
-    config = zenoh_session_config("router", listen=[listen], connect=connect)
+    config = zenoh_session_config("router", listen=listen, connect=connect)
     del config["scouting"]["gossip"]  # routers need it for peers
     return config
 

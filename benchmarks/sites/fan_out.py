@@ -58,7 +58,7 @@ def _run(workload: Workload, on_a: int, on_b: int, frames: int) -> dict[str, Any
         sites.b.subscribers(on_b) as subscribers_b,
     ):
         both = (subscribers_a, subscribers_b)
-        _connect(sender, both)
+        connect(sender, both)
 
         def used_s() -> dict[str, float]:
             return {
@@ -91,7 +91,7 @@ def _run(workload: Workload, on_a: int, on_b: int, frames: int) -> dict[str, Any
     }
 
 
-def _connect(sender: Worker, both: Sequence[Subscribers]) -> None:
+def connect(sender: Worker, both: Sequence[Subscribers]) -> None:
     """Send frames until all sessions have received all components, and let them start to count from zero."""
 
     def connected() -> bool:

@@ -1,7 +1,7 @@
 """Two sites and the link between them: three network namespaces on this machine.
 
     site A ── to_link ⇄ to_a ── link ── to_b ⇄ to_link ── site B
-    10.1.0.1           10.1.0.2        10.2.0.2           10.2.0.1
+    192.0.2.10         192.0.2.1       198.51.100.1       198.51.100.10
 
 Site A is the namespace that the benchmark runs in, which tests/with-netns has made for it. The link forwards
 IP packets. It can limit their rate, lose all of them, and delay them.
@@ -18,10 +18,10 @@ from typing import Final, Self
 
 from benchmarks.processes import PLAIN_PYTHON, Program, wait_until
 
-A_ADDRESS: Final = "10.1.0.1"
-B_ADDRESS: Final = "10.2.0.1"
-_LINK_TO_A: Final = "10.1.0.2"
-_LINK_TO_B: Final = "10.2.0.2"
+A_ADDRESS: Final = "192.0.2.10"
+B_ADDRESS: Final = "198.51.100.10"
+_LINK_TO_A: Final = "192.0.2.1"
+_LINK_TO_B: Final = "198.51.100.1"
 
 SITE_DEVICE: Final = "to_link"
 """The interface of each site on the link."""
@@ -73,8 +73,8 @@ class Network:
             self.b = stack.enter_context(_new_namespace())
             self._link = stack.enter_context(_new_namespace())
             stack.callback(self.a.run, f"ip link delete {SITE_DEVICE}")
-            self._connect(self.a, A_ADDRESS, "to_a", _LINK_TO_A, "10.2.0.0/24")
-            self._connect(self.b, B_ADDRESS, "to_b", _LINK_TO_B, "10.1.0.0/24")
+            self._connect(self.a, A_ADDRESS, "to_a", _LINK_TO_A, "198.51.100.0/24")
+            self._connect(self.b, B_ADDRESS, "to_b", _LINK_TO_B, "192.0.2.0/24")
             self._link.run("sysctl --quiet --write net.ipv4.ip_forward=1")
             if self._delay_ms:
                 self._add_delay(stack)

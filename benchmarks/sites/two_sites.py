@@ -16,8 +16,12 @@ from benchmarks.sites.network import A_ADDRESS, Namespace, Network
 from benchmarks.sites.subscribers import ALL_KEYS, Subscribers
 
 _PORT: Final = 7447
+_LINK_PORT: Final = 7448
 ENDPOINT: Final = f"tcp/127.0.0.1:{_PORT}"
 """The router, for all programs of its own site."""
+
+_LINK_BUFFER_BYTES: Final = 65_536
+"""What waits in the socket of the link is sent before anything newer: 64 kB take 0.26 s at 2 Mbit/s."""
 
 _COMMAND_S: Final = 60.0  # catches what hangs
 
@@ -99,10 +103,10 @@ class TwoSites:
         with contextlib.ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rtc3d-sites-")))
             self.network = stack.enter_context(self._network)
-            listen = f"tcp/0.0.0.0:{_PORT}"
+            link = f"tcp/{A_ADDRESS}:{_LINK_PORT}"
             configs = {
-                "a": _router_config(listen) | self._a_settings,
-                "b": _router_config(listen, [f"tcp/{A_ADDRESS}:{_PORT}"]),
+                "a": _router_config([ENDPOINT, f"{link}#so_sndbuf={_LINK_BUFFER_BYTES}"]) | self._a_settings,
+                "b": _router_config([ENDPOINT], [link]),
             }
             namespaces = {"a": self.network.a, "b": self.network.b}
             sites: dict[str, Site] = {}
@@ -119,7 +123,7 @@ class TwoSites:
         self._stack.close()
 
 
-def _router_config(listen: str, connect: Sequence[str] = ()) -> dict[str, Any]:
+def _router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> dict[str, Any]:
     """Return the configuration of a router that soon notices a dead link, and soon connects again."""
     config = processes.router_config(listen, connect)
     config["connect"]["retry"] = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
