@@ -99,8 +99,8 @@ def tables(result: dict[str, Any]) -> list[Table]:
         "messages that differ",
     ]
     note = (
-        f"The dense workload at {RATE_HZ} Hz. The link is too slow for {result['slow_s']:g} s; then, it has room for "
-        f"{result['room_s']:g} s, at the end of which both recorders are stopped. 100 % is what the link carries "
+        f"The dense workload at {RATE_HZ} Hz. The link is too slow for {result['slow_s']:g} s. Then, it has "
+        f"room for {result['room_s']:g} s, and both recorders are stopped. 100 % is what the link carries "
         "without a limit."
     )
     return [Table(TITLE, columns, rows, note)]
