@@ -89,8 +89,8 @@ def tables(result: dict[str, Any]) -> list[Table]:
     ]
     rates = ", ".join(f"{key} {rate:g} Hz" for key, rate in result["rates_hz"].items())
     note = (
-        f"For {result['seconds']:g} s; the link has a delay of {DELAY_MS:g} ms. The gateway publishes the lab "
-        f"workload at {RATE_HZ} Hz; the router of site A leaves out frames. Received: {rates}, with "
+        f"For {result['seconds']:g} s; the link has a delay of {DELAY_MS:g} ms. The gateway publishes the "
+        f"lab workload at {RATE_HZ} Hz; the router of site A leaves out frames. Received: {rates}, with "
         f"{result['link_mbit_per_s']:.2f} Mbit/s on the link."
     )
     return [Table(TITLE, ["what", *names.values()], rows, note)]
