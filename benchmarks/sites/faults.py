@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from benchmarks import processes
 from benchmarks.processes import Program
-from benchmarks.report import Progress
-from benchmarks.sites.recorder import Recorder
+from benchmarks.report import Goal, Progress, Table
+from benchmarks.sites.recorder import Recorder, figures_text
 from benchmarks.sites.subscribers import Reports, is_component, received
 from benchmarks.sites.two_sites import Ended, Site, TwoSites
 from benchmarks.workloads import LAB
@@ -122,7 +122,7 @@ class _Laboratories:
                 "says": " ".join(query.output.split()),
             },
             "subscribers": {
-                f"{source} on {name}": _seen(reports, source)
+                f"{source} on {name.upper()}": _seen(reports, source)
                 for name, reports in seen.items()
                 for source in ("a", "b")
             },
@@ -188,9 +188,85 @@ def _kill_gateway(laboratories: _Laboratories, plan: _Plan) -> Ended:
     return query
 
 
+_FLOWS: Final = ("a on A", "a on B", "b on A", "b on B")
+_UNDISTURBED: Final = {
+    "link cut": ("a on A", "b on B"),
+    "router A killed": ("b on B",),
+    "router B killed": ("a on A",),
+    "gateway B killed": ("a on A", "a on B"),
+}
+"""What does not depend on what is faulty."""
+
 _FAULTS: Final = {
     "link cut": _cut_link,
     "router A killed": _kill_router("a"),
     "router B killed": _kill_router("b"),
     "gateway B killed": _kill_gateway,
 }
+
+
+def tables(result: dict[str, Any]) -> list[Table]:
+    """Return the tables of the result."""
+    rows = []
+    queries = []
+    for row in result["rows"]:
+        rows.append(
+            [
+                row["fault"],
+                *(f"{row['subscribers'][name]['silence_ms'] / 1000:.1f}" for name in _FLOWS),
+                *(figures_text(recording) for recording in row["recordings"]),
+                str(row["different"]),
+            ]
+        )
+        query = row["query"]
+        queries.append([row["fault"], f"{query['took_s']:.1f}", str(query["status"]), query["says"]])
+    columns = [
+        "fault",
+        *(f"{name}, s" for name in _FLOWS),
+        "recorder on A",
+        "recorder on B",
+        "messages that differ",
+    ]
+    note = (
+        f"Each site has a source at {_RATE_HZ} Hz. “a on B” is the longest silence of the source of site A at "
+        f"a subscriber on site B. The link is cut for {result['cut_s']:g} s. Each router is killed and started "
+        f"again after {result['away_s']:g} s or more, {result['kills']} times, and the gateway of site B once."
+    )
+    return [
+        Table(TITLE, columns, rows, note),
+        Table(
+            "The slowest query for parameters during each fault",
+            ["fault", "time, s", "exit status", "what it prints"],
+            queries,
+        ),
+    ]
+
+
+def goals(result: dict[str, Any]) -> list[Goal]:
+    """Return whether recordings are complete, queries end in time, and the other site notices nothing."""
+    rows = result["rows"]
+    complete = sum(recording["complete"] for row in rows for recording in row["recordings"])
+    different = sum(row["different"] for row in rows)
+    slowest_s = max(row["query"]["took_s"] for row in rows)
+    others = [row["subscribers"][flow] for row in rows for flow in _UNDISTURBED[row["fault"]]]
+    missed, silence_ms = sum(each["missed"] for each in others), max(each["silence_ms"] for each in others)
+    return [
+        Goal(
+            "faults: recordings on both sites",
+            "complete and equal",
+            f"{complete} of {2 * len(rows)} complete, {different} messages differ",
+            complete == 2 * len(rows) and not different,
+        ),
+        Goal(
+            "faults: queries fail with a sentence",
+            f"within {GOAL_QUERY_S:g} s",
+            f"within {slowest_s:.1f} s",
+            slowest_s <= GOAL_QUERY_S and all(row["query"]["says"] for row in rows),
+        ),
+        Goal(
+            "faults: what a site without the fault misses of its own source",
+            "nothing",
+            f"{missed} messages, silent for {silence_ms / 1000:.1f} s at most",
+            not missed,
+        ),
+    ]

@@ -94,6 +94,12 @@ class Recorder:
         )
 
 
+def figures_text(figures: dict[str, Any]) -> str:
+    """Return whether a recording is complete, and how much of it came from the history."""
+    is_complete = "complete" if figures["complete"] else f"**{figures['gaps']} missing**"
+    return f"{is_complete}, {figures['refilled']} refilled"
+
+
 def _refilled(summary: str) -> int:
     """Return the sum of the column "refilled" of the table."""
     rows = re.findall(r"Hz +([\d-]+) +[\d-]+ +[\d-]+$", summary, re.MULTILINE)

@@ -7,7 +7,7 @@ from benchmarks import processes
 from benchmarks.processes import Worker
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.sites.fan_out import RATE_HZ, connect
-from benchmarks.sites.recorder import Recorder
+from benchmarks.sites.recorder import Recorder, figures_text
 from benchmarks.sites.subscribers import percentile_ms, received
 from benchmarks.sites.two_sites import TwoSites
 from benchmarks.workbench import GATEWAY
@@ -69,6 +69,7 @@ def _run(share: float, slow_s: float, room_s: float) -> dict[str, Any]:
     return {
         "needed_mbit_per_s": round(needed_bits_per_s / 1e6, 2),
         "lost_on_a": frames * _COMPONENTS - received(at_a).messages,
+        "silence_on_a_ms": round(received(at_a).longest_silence_ms),
         "missed_on_b": at_b.missing,
         "age_ms": {f"p{each:g}": round(percentile_ms(slow.ages_us, each), 1) for each in (50, 99)},
         "recordings": [each.figures() for each in recordings],
@@ -82,9 +83,10 @@ def tables(result: dict[str, Any]) -> list[Table]:
         [
             f"{row['share']:.0%}, {row['share'] * row['needed_mbit_per_s']:.1f} Mbit/s",
             str(row["lost_on_a"]),
+            f"{row['silence_on_a_ms']}",
             str(row["missed_on_b"]),
             f"{row['age_ms']['p50']:.0f} / {row['age_ms']['p99']:.0f}",
-            *(_recording_text(recording) for recording in row["recordings"]),
+            *(figures_text(recording) for recording in row["recordings"]),
             str(row["different"]),
         ]
         for row in result["rows"]
@@ -92,6 +94,7 @@ def tables(result: dict[str, Any]) -> list[Table]:
     columns = [
         "rate of the link",
         "lost on A",
+        "longest silence on A, ms",
         "missed on B",
         "age on B meanwhile, ms, p50 / p99",
         "recorder on A",
@@ -104,12 +107,6 @@ def tables(result: dict[str, Any]) -> list[Table]:
         "without a limit."
     )
     return [Table(TITLE, columns, rows, note)]
-
-
-def _recording_text(recording: dict[str, Any]) -> str:
-    """Return whether a recording is complete, and how much of it came from the history."""
-    is_complete = "complete" if recording["complete"] else f"**{recording['gaps']} missing**"
-    return f"{is_complete}, {recording['refilled']} refilled"
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:

@@ -47,7 +47,6 @@ class Received:
         self.message_bytes += report["message_bytes"]
         self.missing += report["missing"]
         self.not_newer += report["not_newer"]
-        self.longest_silence_ms = max(self.longest_silence_ms, report["longest_silence_us"] / 1000)
         self.ages_us.update(dict(report["ages_us"]))
         self.ages_before_us.update(dict(report["ages_before_us"]))
 
@@ -139,6 +138,9 @@ def received(sessions: Iterable[Reports], source: str = "") -> Received:
         for key, report in session.items():
             if is_component(key) and source in ("", key.split("/")[-2]):
                 total.add(report)
+                if not key.endswith("/event"):  # events are rare
+                    silence_ms = report["longest_silence_us"] / 1000
+                    total.longest_silence_ms = max(total.longest_silence_ms, silence_ms)
     return total
 
 

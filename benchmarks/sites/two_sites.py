@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple, Self
 
 from benchmarks import processes
 from benchmarks.processes import Program, zenoh_session_config
-from benchmarks.sites.network import A_ADDRESS, Namespace, Network
+from benchmarks.sites.network import A_ADDRESS, SITE_DEVICE, Namespace, Network
 from benchmarks.sites.subscribers import ALL_KEYS, Subscribers
 
 _PORT: Final = 7447
@@ -123,9 +123,25 @@ class TwoSites:
         self._stack.close()
 
 
+_QUERIES_ON_THE_LINK: Final[dict[str, Any]] = {
+    "id": "queries on the link",
+    "interfaces": [SITE_DEVICE],
+    "flows": ["egress"],
+    "messages": ["query"],
+    "key_exprs": ["**"],
+    "overwrite": {"priority": "interactive_low", "congestion_control": "drop"},
+}
+"""Gives queries a queue of their own, and drops them if it is full.
+
+Otherwise, a query waits in the queue of the messages, which is full while the link is cut. Meanwhile, the router
+delivers nothing to anybody on its site.
+"""
+
+
 def _router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> dict[str, Any]:
     """Return the configuration of a router that soon notices a dead link, and soon connects again."""
     config = processes.router_config(listen, connect)
     config["connect"]["retry"] = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
     config["transport"]["link"] = {"tx": {"lease": 2000}}
+    config["qos"] = {"network": [_QUERIES_ON_THE_LINK]}
     return config
