@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks import processes
-from benchmarks.processes import Worker, cpu_s
+from benchmarks import plots, processes
+from benchmarks.processes import ROOT, Worker, cpu_s
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.sites.subscribers import Subscribers, is_component, percentile_ms, received
 from benchmarks.sites.two_sites import TwoSites
@@ -17,6 +17,7 @@ from benchmarks.workloads import DENSE, LAB, Paced, Sent, Workload, send
 TITLE: Final = "Subscribers on two sites"
 RATE_HZ: Final = 200
 WORKLOADS: Final = {"lab": LAB, "dense": DENSE}
+PLOT: Final = ROOT / "docs" / "scale.svg"
 GOAL_CPU: Final = 1.5
 _COMPONENTS: Final = 5
 _FIRST_FRAMES: Final = 20
@@ -46,7 +47,10 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
         progress.step(f"{name}, {on_a} + {on_b} subscribers", number / len(runs))
         row = _run(WORKLOADS[name], on_a, on_b, round(lasting_s * RATE_HZ))
         rows.append({"workload": name, "on_a": on_a, "on_b": on_b, **row})
-    return {"seconds": lasting_s, "rows": rows}
+    result = {"seconds": lasting_s, "rows": rows}
+    if not quick:
+        draw(result)
+    return result
 
 
 def _run(workload: Workload, on_a: int, on_b: int, frames: int) -> dict[str, Any]:
@@ -188,3 +192,20 @@ def _times_one(result: dict[str, Any], row: dict[str, Any]) -> float:
         if each["workload"] == row["workload"] and (each["on_a"], each["on_b"]) == (1, 0)
     ]
     return float(row["cpu_us_per_frame"] / one["cpu_us_per_frame"])
+
+
+def draw(result: dict[str, Any]) -> None:
+    """Write the plot in the document: the cores that each kind of process uses."""
+    figure, panels = plots.new_figure(len(WORKLOADS))
+    for axes, workload in zip(panels, WORKLOADS, strict=True):
+        rows = [row for row in result["rows"] if row["workload"] == workload]
+        counts = [row["on_a"] + row["on_b"] for row in rows]
+        for name, colour in zip(
+            ("gateway", "router A", "router B", "subscribers"), plots.COLOURS, strict=True
+        ):
+            axes.plot(counts, [row["cores"][name] for row in rows], "o-", color=colour, label=name)
+        plots.label_subscribers(axes, counts)
+        axes.set_title(f"{workload}, {RATE_HZ} Hz", loc="left")
+    panels[0].set_ylabel("cores used")
+    panels[0].legend(frameon=False)
+    plots.save(figure, PLOT)

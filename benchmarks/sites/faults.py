@@ -228,9 +228,10 @@ def tables(result: dict[str, Any]) -> list[Table]:
         "messages that differ",
     ]
     note = (
-        f"Each site has a source at {_RATE_HZ} Hz. “a on B” is the longest silence of the source of site A at "
-        f"a subscriber on site B. The link is cut for {result['cut_s']:g} s. Each router is killed and started "
-        f"again after {result['away_s']:g} s or more, {result['kills']} times, and the gateway of site B once."
+        f"Each site has a source at {_RATE_HZ} Hz. “a on B” is the longest silence of the source of site A "
+        f"at a subscriber on site B. The link is cut for {result['cut_s']:g} s. Each router is killed "
+        f"{result['kills']} times and started again after at least {result['away_s']:g} s; so is the gateway "
+        "of site B, once."
     )
     return [
         Table(TITLE, columns, rows, note),

@@ -99,9 +99,9 @@ def _top(site: Site, wanted: int) -> Ended:
         site.command("top", "--json"), cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None  # noqa: S101 - for mypy
-        for line in process.stdout:
-            shown = Ended(0, time.monotonic() - began_s, line)
-            if _named(shown) == wanted or shown.took_s > _TOP_S:
+        while True:
+            shown = Ended(0, time.monotonic() - began_s, process.stdout.readline())
+            if _named(shown) == wanted or not shown.output or shown.took_s > _TOP_S:
                 break
         process.send_signal(signal.SIGINT)
     return shown

@@ -3,19 +3,29 @@
 import re
 import signal
 import subprocess
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 from benchmarks import processes
 from benchmarks.processes import ROOT
 from benchmarks.sites.two_sites import Site
-from gateway.messages.history import sequence_of
+from gateway.messages.history import sequence_of, utime_of
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.reader import TakeReader
 
 _END_S: Final = 30.0
+_EDGE_US: Final = 500_000
+"""How long after its first message a recording may still lack others, and before its last one."""
+
+
+class _Message(NamedTuple):
+    utime: int
+    sequence: int
+    content: int
+    """The hash of the message."""
 
 
 @dataclass(frozen=True)
@@ -25,29 +35,39 @@ class Recording:
     status: int
     """The exit status: 0 if ``record`` says that the recording is complete."""
     summary: str
+    """The table that ``record`` prints, and what is missing."""
     refilled: int
     """How many messages came from the history of the gateway, as ``record`` says."""
-    messages: dict[tuple[str, str, int], dict[int, int]]
-    """The hash of each message by its ``sequence``, for each source, component and run of its gateway.
-
-    They are read from the file, so they do not depend on what ``record`` says.
-    """
+    messages: dict[tuple[str, str], list[_Message]]
+    """The messages of each source and component, in order; read from the file, whatever ``record`` says."""
 
     def gaps(self) -> int:
-        """Return how many numbers are missing between the first and the last of each source and component."""
-        return sum(1 + max(each) - min(each) - len(each) for each in self.messages.values())
+        """Return how many numbers are missing. Where they begin again, a gateway was restarted."""
+        steps = (
+            now.sequence - before.sequence
+            for series in self.messages.values()
+            for before, now in pairwise(series)
+        )
+        return sum(step - 1 for step in steps if step > 0)
 
     def differs_from(self, other: Self) -> int:
         """Return how many messages of the time that both recorded are missing in one, or are different."""
-        count = 0
-        for key in self.messages.keys() | other.messages.keys():
-            one, two = self.messages.get(key, {}), other.messages.get(key, {})
-            if not one or not two:
-                count += len(one) + len(two)
-                continue
-            both = range(max(min(one), min(two)), min(max(one), max(two)) + 1)
-            count += sum(one.get(number) != two.get(number) for number in both)
-        return count
+        utimes = [
+            [message.utime for series in each.messages.values() for message in series]
+            for each in (self, other)
+        ]
+        first = max(map(min, utimes)) + _EDGE_US
+        last = min(map(max, utimes)) - _EDGE_US
+        both = (
+            {
+                (key, message)
+                for key, series in each.messages.items()
+                for message in series
+                if first <= message.utime <= last
+            }
+            for each in (self, other)
+        )
+        return len(set.symmetric_difference(*both))
 
     def figures(self) -> dict[str, Any]:
         """Return what the results have of it."""
@@ -57,6 +77,7 @@ class Recording:
             "messages": sum(map(len, self.messages.values())),
             "gaps": gaps,
             "refilled": self.refilled,
+            **({"says": self.summary} if self.status else {}),
         }
 
 
@@ -89,9 +110,7 @@ class Recorder:
         """Stop it as Ctrl-C does, and return what it has recorded."""
         self._process.send_signal(signal.SIGINT)
         summary, _ = self._process.communicate(timeout=_END_S)
-        return Recording(
-            self._process.returncode, summary, _refilled(summary), _hashes_by_sequence(self._file)
-        )
+        return Recording(self._process.returncode, summary, _refilled(summary), _messages(self._file))
 
 
 def figures_text(figures: dict[str, Any]) -> str:
@@ -106,19 +125,13 @@ def _refilled(summary: str) -> int:
     return sum(int(each) for each in rows if each != "-")
 
 
-def _hashes_by_sequence(file: Path) -> dict[tuple[str, str, int], dict[int, int]]:
-    found: dict[tuple[str, str, int], dict[int, int]] = {}
-    runs: Counter[tuple[str, str]] = Counter()
-    newest: dict[tuple[str, str], int] = {}
+def _messages(file: Path) -> dict[tuple[str, str], list[_Message]]:
+    found: dict[tuple[str, str], list[_Message]] = defaultdict(list)
     for batches in TakeReader(file).batches():
         for batch in batches:
-            if batch.key not in COMPONENTS_BY_KEY:
-                continue
-            key = (batch.source, batch.key)
-            for message in batch.messages:
-                sequence = sequence_of(message)
-                if sequence <= newest.get(key, -1):  # messages are in order, unless the numbers began again
-                    runs[key] += 1
-                newest[key] = sequence
-                found.setdefault((*key, runs[key]), {})[sequence] = hash(message)
+            if batch.key in COMPONENTS_BY_KEY:
+                found[batch.source, batch.key] += [
+                    _Message(utime_of(message), sequence_of(message), hash(message))
+                    for message in batch.messages
+                ]
     return found

@@ -133,8 +133,8 @@ _QUERIES_ON_THE_LINK: Final[dict[str, Any]] = {
 }
 """Gives queries a queue of their own, and drops them if it is full.
 
-Otherwise, a query waits in the queue of the messages, which is full while the link is cut. Meanwhile, the router
-delivers nothing to anybody on its site.
+Otherwise, a query waits in the queue of the messages, which is full while the link is cut. Meanwhile, the
+router delivers nothing to anybody on its site.
 """
 
 
