@@ -2,20 +2,13 @@
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLOURS: Final = ("#1f6fb4", "#d1702a", "#3c8d40", "#8a5aa8")
-_STYLE: Final[dict[str, Any]] = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "rtc3d",  # the same figures give the same file
-}
 
 
 def new_figure(panels: int = 1) -> "tuple[Figure, list[Axes]]":
@@ -23,7 +16,15 @@ def new_figure(panels: int = 1) -> "tuple[Figure, list[Axes]]":
     import matplotlib as mpl  # noqa: PLC0415 - not needed by the tests
     from matplotlib.figure import Figure  # noqa: PLC0415 - as above
 
-    mpl.rcParams.update(_STYLE)
+    mpl.rcParams.update(
+        {
+            "font.size": 10,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "svg.fonttype": "none",
+            "svg.hashsalt": "rtc3d",  # the same figures give the same file
+        }
+    )
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     return figure, list(figure.subplots(1, panels, sharey=True, squeeze=False)[0])
 
