@@ -104,7 +104,7 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         if self._process.poll() is None:
             self._process.kill()
-            self._process.wait()
+            self._process.communicate()
 
     def stop(self) -> Recording:
         """Stop it as Ctrl-C does, and return what it has recorded."""

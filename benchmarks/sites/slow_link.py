@@ -37,11 +37,12 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     rows = []
     for number, share in enumerate(shares):
         progress.step(f"{share:.0%} of the rate that is needed", number / len(shares))
-        rows.append({"share": share, **_run(share, slow_s, room_s)})
+        rows.append({"share": share, **run(share, slow_s, room_s)})
     return {"slow_s": slow_s, "room_s": room_s, "rows": rows}
 
 
-def _run(share: float, slow_s: float, room_s: float) -> dict[str, Any]:
+def run(share: float, slow_s: float, room_s: float) -> dict[str, Any]:
+    """Return what a link loses that has ``share`` of its rate for ``slow_s``, and room for ``room_s``."""
     frames = round((_BEFORE_S + slow_s + room_s) * RATE_HZ)
     with (
         Worker(send, DENSE, [GATEWAY]) as sender,

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -66,14 +67,16 @@ class Subscribers:
 
     def __init__(self, site: Namespace, endpoint: str, count: int, keys: Sequence[str]) -> None:
         config = json.dumps(zenoh_session_config("client", connect=[endpoint]))
+        python = [sys.executable, "-m", "benchmarks.sites.python_subscriber"]
+        program = [str(PROGRAM)] if PROGRAM.exists() else python
         self._commands = [
-            site.command(str(PROGRAM), config, str(min(_PER_PROCESS, count - first)), *keys)
+            site.command(*program, config, str(min(_PER_PROCESS, count - first)), *keys)
             for first in range(0, count, _PER_PROCESS)
         ]
 
     def __enter__(self) -> Self:
         self._processes = [
-            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603
+            subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)  # noqa: S603
             for command in self._commands
         ]
         return self
@@ -88,6 +91,7 @@ class Subscribers:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+            _pipe(process.stdout).close()
 
     def cpu_s(self) -> float:
         """Return the CPU time of all sessions, in s."""
