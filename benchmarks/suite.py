@@ -1,4 +1,4 @@
-"""Suites of benchmarks: the parts of each, and the command that measures them and updates their document."""
+"""Suites of benchmarks: the parts of each, and the command that measures them and updates their documents."""
 
 import argparse
 import importlib
@@ -17,16 +17,17 @@ from benchmarks.report import Table
 
 @dataclass(frozen=True)
 class Suite:
-    """Benchmarks that one command runs and one document shows."""
+    """Benchmarks that one command runs."""
 
     package: str
     parts: tuple[str, ...]
     """The parts in order; each is a module of the package."""
-    document: Path
+    documents: tuple[Path, ...]
+    """Each shows the sections for which it has markers."""
 
     @property
     def results(self) -> Path:
-        """The file of the results that the document shows."""
+        """The file of the results that the documents show."""
         return ROOT / self.package.replace(".", "/") / "results.json"
 
     @property
@@ -62,14 +63,14 @@ GATEWAY: Final = Suite(
         "queries",
         "replay",
     ),
-    ROOT / "docs" / "performance.md",
+    (ROOT / "docs" / "performance.md",),
 )
 """What the gateway costs in addition to Zenoh and LCM."""
 
 SITES: Final = Suite(
     "benchmarks.sites",
     ("fan_out", "slow_link", "faults", "gateways", "display"),
-    ROOT / "docs" / "scale.md",
+    (ROOT / "docs" / "scale.md", ROOT / "docs" / "reliability.md"),
 )
 """Two sites, each with a router, and the link between them."""
 
@@ -104,5 +105,6 @@ def run(suite: Suite, prepare: Callable[[], None] = lambda: None) -> int:
         for table in sections.get(name, []):
             table.show(Console())
     if not options.quick:
-        suite.document.write_text(report.rendered(suite.document.read_text(), sections))
+        for document in suite.documents:
+            document.write_text(report.rendered(document.read_text(), sections))
     return 0
