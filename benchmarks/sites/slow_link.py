@@ -58,18 +58,20 @@ def run(share: float, slow_s: float, room_s: float) -> dict[str, Any]:
         sender.send(Paced(GATEWAY, frames, RATE_HZ))
         with recorder_a, recorder_b:
             time.sleep(_BEFORE_S)
+            before = received(subscriber_a.take())
             subscriber_b.take()
             sites.network.limit(share * _NEEDED_BITS_PER_S)
             time.sleep(slow_s)
             slow = received(subscriber_b.look())
             sites.network.limit(None)
             sender.reply()
-            at_a = subscriber_a.wait_for(frames * _COMPONENTS)
+            expected = frames * _COMPONENTS - before.messages
+            at_a = received(subscriber_a.wait_for(expected))
             recordings = recorder_a.stop(), recorder_b.stop()
             at_b = received(subscriber_b.take())
     return {
-        "lost_on_a": frames * _COMPONENTS - received(at_a).messages,
-        "silence_on_a_ms": round(received(at_a).longest_silence_ms),
+        "lost_on_a": expected - at_a.messages + before.missing,
+        "silence_on_a_ms": round(at_a.longest_silence_ms),
         "missed_on_b": at_b.missing,
         "age_ms": {f"p{each:g}": round(percentile_ms(slow.ages_us, each), 1) for each in (50, 99)},
         "recordings": [each.figures() for each in recordings],
