@@ -129,19 +129,23 @@ _QUERIES_ON_THE_LINK: Final[dict[str, Any]] = {
     "flows": ["egress"],
     "messages": ["query"],
     "key_exprs": ["**"],
-    "overwrite": {"priority": "interactive_low", "congestion_control": "drop"},
+    "overwrite": {"priority": "background", "congestion_control": "drop"},
 }
-"""Gives queries a queue of their own, and drops them if it is full.
+"""Gives queries, and with them their replies, a queue of their own, and drops them if it is full.
 
-Otherwise, a query waits in the queue of the messages, which is full while the link is cut. Meanwhile, the
-router delivers nothing to anybody on its site.
+Otherwise, they wait in the queue of the messages while the link is cut or too slow. Meanwhile, the router
+delivers nothing to anybody on its site.
 """
+
+_FRAGMENTS_WAIT_US: Final = 2000
+"""How long a reply of more than one batch waits for the link before it is dropped."""
 
 
 def _router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> dict[str, Any]:
     """Return the configuration of a router that soon notices a dead link, and soon connects again."""
     config = processes.router_config(listen, connect)
     config["connect"]["retry"] = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
-    config["transport"]["link"] = {"tx": {"lease": 2000}}
+    drop = {"max_wait_before_drop_fragments": _FRAGMENTS_WAIT_US}
+    config["transport"]["link"] = {"tx": {"lease": 2000, "queue": {"congestion_control": {"drop": drop}}}}
     config["qos"] = {"network": [_QUERIES_ON_THE_LINK]}
     return config
