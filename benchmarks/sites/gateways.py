@@ -100,7 +100,8 @@ def _top(site: Site, wanted: int) -> Ended:
     ) as process:
         assert process.stdout is not None  # noqa: S101 - for mypy
         while True:
-            shown = Ended(0, time.monotonic() - began_s, process.stdout.readline())
+            line = process.stdout.readline()
+            shown = Ended(0, time.monotonic() - began_s, line)
             if _named(shown) == wanted or not shown.output or shown.took_s > _TOP_S:
                 break
         process.send_signal(signal.SIGINT)
