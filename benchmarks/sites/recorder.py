@@ -18,7 +18,7 @@ from gateway.takes.files.reader import TakeReader
 
 _END_S: Final = 30.0
 _EDGE_US: Final = 500_000
-"""How long after its first message a recording may still lack others, and before its last one."""
+"""How long before its last message a recording may lack others."""
 
 
 class _Message(NamedTuple):
@@ -51,13 +51,15 @@ class Recording:
         return sum(step - 1 for step in steps if step > 0)
 
     def differs_from(self, other: Self) -> int:
-        """Return how many messages of the time that both recorded are missing in one, or are different."""
-        utimes = [
-            [message.utime for series in each.messages.values() for message in series]
-            for each in (self, other)
-        ]
-        first = max(map(min, utimes)) + _EDGE_US
-        last = min(map(max, utimes)) - _EDGE_US
+        """Return how many messages of the time that both recorded are missing in one, or are different.
+
+        It begins when both have the first message of each series: before, neither can know what is missing.
+        """
+        recordings = (self, other)
+        first = max(series[0].utime for each in recordings for series in each.messages.values())
+        last = min(
+            max(series[-1].utime for series in each.messages.values()) - _EDGE_US for each in recordings
+        )
         both = (
             {
                 (key, message)
@@ -65,7 +67,7 @@ class Recording:
                 for message in series
                 if first <= message.utime <= last
             }
-            for each in (self, other)
+            for each in recordings
         )
         return len(set.symmetric_difference(*both))
 
