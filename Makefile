@@ -17,7 +17,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
-    screenshots fuzz soak stops hiroz mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
+    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -247,6 +247,24 @@ bench: .venv/bench build/compiled/complete zenohd
 
 bench-quick: .venv/bench build/compiled/complete
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
+
+# Measure two sites with a router each, and the link between them, and write benchmarks/sites/results.json and
+# docs/scale.md. This takes half an hour and needs an idle machine, ip, tc and nsenter (Debian: iproute2, util-linux).
+# PARTS as above. bench-sites-quick takes three minutes and does not change the document.
+SITES := $(COMPILED) tests/with-netns $(BIN)/python -m benchmarks.sites
+
+bench-sites: .venv/bench build/compiled/complete zenohd build/sites/release/site-subscriber
+	$(SITES) $(PARTS)
+
+bench-sites-quick: .venv/installed build/compiled/complete build/sites/release/site-subscriber
+	$(SITES) --quick $(PARTS)
+
+# The subscribers of two sites. Without cargo, they run in Python, which a few dozen of them keep busy.
+SUBSCRIBER := benchmarks/sites/subscriber
+
+build/sites/release/site-subscriber: $(addprefix $(SUBSCRIBER)/,Cargo.toml Cargo.lock main.rs)
+	cargo build --release --locked --quiet --manifest-path $(SUBSCRIBER)/Cargo.toml --target-dir build/sites \
+	|| echo 'site-subscriber not built: the benchmarks use Python subscribers'
 
 .venv/bench: .venv/installed
 	$(BIN)/pip install --quiet --group bench

@@ -140,7 +140,8 @@ class Bench:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rtc3d-bench-")))
             self._endpoints: dict[str, Endpoints] = {}
             self._router = _endpoint(free_port())
-            stack.enter_context(processes.router(self._router))
+            config = processes.router_config([self._router])
+            stack.enter_context(processes.router(folder / "router.json5", config))
             self.sender = stack.enter_context(Worker(send, DENSE, [RELAY, *_names()]))
             self.programs: dict[str, Program] = {}
             self.peers: dict[str, Worker] = {}

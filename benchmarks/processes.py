@@ -186,10 +186,13 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str] | None =
     return done.stdout
 
 
-def gateway(file: Path, settings: dict[str, Any]) -> Program:
-    """Return the gateway as users run it; writes ``settings`` to the configuration ``file``."""
+def gateway(file: Path, settings: dict[str, Any], inside: Sequence[str] = ()) -> Program:
+    """Return the gateway as users run it; writes ``settings`` to the configuration ``file``.
+
+    ``inside`` as in ``router``.
+    """
     file.write_text(yaml.safe_dump(settings))
-    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "error"]
+    command = [*inside, sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "error"]
     return Program(command, measured=True)
 
 
@@ -226,13 +229,22 @@ def zenoh_session_config(
     }
 
 
-def router(endpoint: str) -> contextlib.AbstractContextManager[object]:
-    """Return a context in which a Zenoh router listens at ``endpoint``; ``router_kind`` names the program."""
-    if not ZENOHD.exists():
-        return Worker(_python_router, endpoint)
-    return Program(
-        [str(ZENOHD), "--listen", endpoint, "--no-multicast-scouting"], environment={"RUST_LOG": "error"}
-    )
+def router(file: Path, config: dict[str, Any], inside: Sequence[str] = ()) -> Program:
+    """Return a Zenoh router; writes its configuration to ``file``. ``router_kind`` names the program.
+
+    ``inside`` precedes the command, such as a command that enters a network namespace.
+    """
+    file.write_text(json.dumps(config))
+    if ZENOHD.exists():
+        return Program([*inside, str(ZENOHD), "--config", str(file)], environment={"RUST_LOG": "error"})
+    return Program([*inside, sys.executable, "-m", "benchmarks.python_router", str(file)])
+
+
+def router_config(listen: Sequence[str], connect: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the configuration of a router that finds no others, but connects to these."""
+    config = zenoh_session_config("router", listen=listen, connect=connect)
+    del config["scouting"]["gossip"]  # routers need it for peers
+    return config
 
 
 def router_kind() -> str:
@@ -240,16 +252,6 @@ def router_kind() -> str:
     return (
         "zenohd" if ZENOHD.exists() else "a Python session in mode router (`make zenohd` builds the real one)"
     )
-
-
-def _python_router(endpoint: str) -> Iterator[None]:
-    import zenoh  # noqa: PLC0415 - only this process opens a session
-
-    config = zenoh_session_config("router", listen=[endpoint])
-    config["scouting"].pop("gossip")
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))):
-        while True:
-            yield None
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:

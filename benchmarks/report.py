@@ -1,6 +1,5 @@
-"""The parts of the benchmarks, and their results: in a file, on the terminal, and in docs/performance.md."""
+"""The results of benchmarks: goals, tables, progress, and the file with all figures."""
 
-import importlib
 import json
 import math
 import os
@@ -15,32 +14,13 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from benchmarks.processes import ROOT, router_kind
 from gateway import version_text
-
-DOCUMENT: Final = ROOT / "docs" / "performance.md"
-RESULTS: Final = ROOT / "benchmarks" / "results.json"
-QUICK_RESULTS: Final = ROOT / "benchmarks" / "results-quick.json"
-
-PARTS: Final = (
-    "own_cost",
-    "outputs",
-    "ceiling",
-    "latency",
-    "loss",
-    "resources",
-    "scale",
-    "queries",
-    "replay",
-    "history",
-)
-"""The parts of the benchmarks, in order; each is a module."""
 
 
 @dataclass(frozen=True)
@@ -164,22 +144,6 @@ def machines_table(results: dict[str, Any]) -> Table:
         parts.setdefault(tuple(result["machine"].get(name, "") for name in names), []).append(part)
     rows = [[name, *(values[at] for values in parts)] for at, name in enumerate(names)]
     return Table("Machine", ["parts", *(", ".join(each) for each in parts.values())], rows)
-
-
-def part(name: str) -> ModuleType:
-    """Return the module of a part, with ``expected_s``, ``measure``, ``tables`` and ``goals``."""
-    return importlib.import_module(f"benchmarks.{name}")
-
-
-def sections(results: dict[str, Any]) -> dict[str, list[Table]]:
-    """Return the tables of each part that has results, and of the sections "machine" and "goals"."""
-    measured: dict[str, Any] = {name: results[name] for name in PARTS if name in results}
-    goals = [goal for name, result in measured.items() for goal in part(name).goals(result)]
-    return {
-        "machine": [machines_table(measured)],
-        "goals": [goals_table(goals)],
-        **{name: part(name).tables(result) for name, result in measured.items()},
-    }
 
 
 def rendered(document: str, sections: dict[str, list[Table]]) -> str:

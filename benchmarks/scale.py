@@ -3,6 +3,7 @@
 import statistics
 from typing import Any, Final
 
+from benchmarks import plots
 from benchmarks.processes import ROOT
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workbench import GATEWAY, Workbench
@@ -17,7 +18,6 @@ _CONNECTIONS: Final = {
     "LCM": (False, False),
 }
 _PER_PROCESS: Final = 16
-_COLOURS: Final = ("#1f6fb4", "#d1702a", "#3c8d40")
 
 
 def _counts(connection: str, quick: bool) -> list[int]:
@@ -140,24 +140,15 @@ def _times_one(result: dict[str, Any], row: dict[str, Any]) -> float:
 
 def draw(result: dict[str, Any]) -> None:
     """Write the plot in the document."""
-    import matplotlib as mpl  # noqa: PLC0415 - not needed by the tests
-    from matplotlib.figure import Figure  # noqa: PLC0415 - as above
-
-    mpl.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False})
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
-    axes = figure.subplots()
-    for connection, colour in zip(_CONNECTIONS, _COLOURS, strict=True):
+    figure, [axes] = plots.new_figure()
+    for connection, colour in zip(_CONNECTIONS, plots.COLOURS, strict=False):
         rows = [row for row in result["rows"] if row["connection"] == connection]
         counts = [row["subscribers"] for row in rows]
         costs = [row["cpu_us_per_frame"] for row in rows]
         axes.plot(counts, [statistics.median(each) for each in costs], "o-", color=colour, label=connection)
         axes.fill_between(counts, list(map(min, costs)), list(map(max, costs)), color=colour, alpha=0.15)
-    axes.set_xscale("log", base=2)
-    ticks = sorted({row["subscribers"] for row in result["rows"]})
-    axes.set_xticks(ticks, [str(tick) for tick in ticks])
-    axes.set_ylim(bottom=0)
-    axes.set(xlabel="subscribers", ylabel="gateway's CPU time per frame (µs)")
+    plots.label_subscribers(axes, [row["subscribers"] for row in result["rows"]])
+    axes.set_ylabel("gateway's CPU time per frame (µs)")
     axes.set_title(f"CPU time by number of subscribers: lab workload, {result['rate_hz']:g} Hz", loc="left")
-    axes.grid(axis="y", color="0.9")
     axes.legend(frameon=False)
-    figure.savefig(PLOT, dpi=130)
+    plots.save(figure, PLOT)

@@ -73,7 +73,8 @@ class Workbench:
             endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in (*_BOTH, "router")}
             self.lcm_urls = {GATEWAY: lcm_url(7670), RELAY: lcm_url(7680)}
             if self.routed:
-                stack.enter_context(processes.router(endpoints["router"]))
+                config = processes.router_config([endpoints["router"]])
+                stack.enter_context(processes.router(folder / "router.json5", config))
             for name in _BOTH:
                 if name in self.clients:
                     self.programs[name] = stack.enter_context(self._program(name, folder, endpoints))

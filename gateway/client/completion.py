@@ -30,7 +30,7 @@ PATIENCE_S: Final = 60.0
 """How long requests that bring nothing are repeated: as long as a gateway keeps messages by default."""
 
 NOBODY_S: Final = 3.0
-"""The same if nobody takes the requests: the gateway is one of an earlier version, or is gone."""
+"""The same if messages arrive and nobody takes the requests: the gateway is one of an earlier version."""
 
 _MIN_REPLY_S: Final = 0.05
 
@@ -323,7 +323,9 @@ class Completion:
         if request.run != self._run or self._passes_on:
             return
         if code in RETRY_CODES:
-            patience_s = self._nobody_s if code == "no-gateway" else PATIENCE_S
+            # While nothing arrives, the connection is lost, and the gateway may have never got the request.
+            is_connected = now_s - self._heard_s <= _SILENCE_S
+            patience_s = self._nobody_s if code == "no-gateway" and is_connected else PATIENCE_S
             if self._is_ending and not self._is_missing and code not in BUSY_CODES:
                 patience_s = 0.0
             if not self._repeat(now_s, has_helped=False, patience_s=patience_s) and code == "no-gateway":

@@ -9,17 +9,21 @@ from hypothesis import strategies as st
 
 from benchmarks import report
 from benchmarks.report import Pair, Table, percentile, rendered
+from benchmarks.suite import GATEWAY, SITES, Suite
 
 
-def test_the_document_has_the_figures_of_the_results() -> None:
-    document = report.DOCUMENT.read_text()
-    assert rendered(document, report.sections(report.load(report.RESULTS))) == document
+@pytest.mark.parametrize("suite", [GATEWAY, SITES], ids=lambda suite: suite.package)
+def test_the_documents_have_the_figures_of_the_results(suite: Suite) -> None:
+    sections = suite.sections(report.load(suite.results))
+    for document in suite.documents:
+        assert rendered(document.read_text(), sections) == document.read_text()
 
 
-def test_the_document_has_markers_for_every_part() -> None:
-    document = report.DOCUMENT.read_text()
-    for name in ("goals", "machine", *report.PARTS):
-        assert rendered(document, {name: [Table("A title", ["a"], [["12345"]])]}) != document, name
+@pytest.mark.parametrize("suite", [GATEWAY, SITES], ids=lambda suite: suite.package)
+def test_the_documents_have_markers_for_every_part(suite: Suite) -> None:
+    documents = "".join(document.read_text() for document in suite.documents)
+    for name in ("goals", "machine", *suite.parts):
+        assert rendered(documents, {name: [Table("A title", ["a"], [["12345"]])]}) != documents, name
 
 
 def test_only_the_sections_between_markers_are_replaced() -> None:

@@ -272,17 +272,33 @@ def test_requests_that_bring_nothing_are_repeated_for_a_bounded_time(code: str, 
     network.arrives(0)
     network.arrives(9)
     start_s = network.completion.due_s
+    number = 9
     while network.completion.due_s < math.inf:
         network.now_s = network.completion.due_s
         network.completion.fail(network.completion.request(), code, "", network.now_s)
+        number += 1
+        network.arrives(number)
     assert network.now_s == pytest.approx(start_s + patience_s, abs=0.2)
-    assert network.numbers == [0, 9]
+    assert network.numbers == [0, *range(9, number + 1)]
     assert network.check.num_lost == 8
     # The next gap: nobody was there the last time, so one request is enough until there is an answer.
-    network.arrives(19)
+    network.arrives(number + 10)
     network.now_s = network.completion.due_s
     network.completion.fail(network.completion.request(), code, "", network.now_s)
     assert (network.completion.due_s == math.inf) == (code == "no-gateway")
+
+
+def test_requests_without_a_connection_do_not_end_soon() -> None:
+    """A router that is restarted again and again takes no requests for longer than NOBODY_S."""
+    network = Network()
+    network.arrives(0)
+    network.arrives(9)
+    start_s = network.now_s
+    while network.now_s < start_s + 2 * NOBODY_S:
+        network.now_s = network.completion.due_s
+        network.completion.fail(network.completion.request(), "no-gateway", "", network.now_s)
+    assert network.completion.due_s < math.inf
+    assert network.numbers == [0]
 
 
 def test_patience_begins_again_after_a_time_without_connection() -> None:

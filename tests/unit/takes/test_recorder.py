@@ -311,7 +311,7 @@ def test_what_is_no_message_of_the_series_is_left_out_and_counted(recorded: Reco
 def test_sources_and_keys_are_bounded(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names come from the network and must not fill the memory."""
     monkeypatch.setattr(reception, "MAX_SERIES", 50)
-    found = [recorded.recording.source(f"s{number}", f"S{number}", is_known=True) for number in range(300)]
+    found = [recorded.recording.source(f"s{number}", f"S{number}", is_known=True) for number in range(200)]
     sources = [source for source in found if source is not None]
     assert len(sources) == len(recorded.recording.sources) == MAX_SOURCES
     keys = [(source, f"6d/{number}") for source in sources[:2] for number in range(40)]
