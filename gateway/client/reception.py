@@ -178,7 +178,8 @@ MAX_SOURCES: Final = 128
 MAX_SERIES: Final = 4096
 """The most sources, and keys of all sources together: 20 gateways with 5 sources each fit.
 
-Names come from the network."""
+Names come from the network.
+"""
 
 MAX_XML_BYTES: Final = 16 * 1024 * 1024
 
