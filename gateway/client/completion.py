@@ -318,13 +318,16 @@ class Completion:
         self._check.skip(number)
         self._skip_to(number)
 
-    def fail(self, request: HistoryRequest, code: str, text: str, now_s: float) -> None:
-        """Take the error of a request: the code of the gateway, or no-gateway if nobody takes requests."""
+    def fail(
+        self, request: HistoryRequest, code: str, text: str, now_s: float, *, is_connected: bool = True
+    ) -> None:
+        """Take the error of a request: the code of the gateway, or no-gateway if nobody takes requests.
+
+        Unless the subscriber ``is_connected``, the gateway may have never got the request.
+        """
         if request.run != self._run or self._passes_on:
             return
         if code in RETRY_CODES:
-            # While nothing arrives, the connection is lost, and the gateway may have never got the request.
-            is_connected = now_s - self._heard_s <= _SILENCE_S
             patience_s = self._nobody_s if code == "no-gateway" and is_connected else PATIENCE_S
             if self._is_ending and not self._is_missing and code not in BUSY_CODES:
                 patience_s = 0.0

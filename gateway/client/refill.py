@@ -28,6 +28,9 @@ The arguments are the source, the number of these seconds, and how many seconds 
 QueryError.
 """
 
+_SILENT_S: Final = 2.5
+"""If nothing of a source has arrived for so long, not even its status, the connection is lost."""
+
 _WAIT_S: Final = 0.05
 """When to look again whether the program can take more messages."""
 
@@ -144,7 +147,8 @@ class Refill:
             with self._changed:
                 now_s = time.monotonic()
                 if answer is None:
-                    completion.fail(request, code, text, now_s)
+                    is_connected = now_s - (series.source.heard_s or now_s) <= _SILENT_S
+                    completion.fail(request, code, text, now_s, is_connected=is_connected)
                 else:
                     completion.answer(request, answer, now_s)
 

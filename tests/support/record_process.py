@@ -42,8 +42,13 @@ class RecordProcess:
         self.process = process
         self._stderr = stderr
 
+    def has_reported(self, text: str) -> bool:
+        """Whether this was printed on stderr."""
+        return text in self._stderr.read_text()
+
     def wait_for(self, text: str) -> None:
-        wait_until(lambda: text in self._stderr.read_text())
+        """Wait until this was printed on stderr."""
+        wait_until(lambda: self.has_reported(text))
 
     def limit_files(self, num_bytes: int) -> None:
         """Let the kernel refuse longer files, as on a full disk."""

@@ -1,5 +1,6 @@
 """``record`` as a program of its own, beside a gateway or a publisher of the test, on real Zenoh and LCM."""
 
+import itertools
 import os
 import pty
 import re
@@ -167,7 +168,14 @@ def test_gaps_two_gateways_and_hostile_publishers_are_reported(tmp_path: Path, p
     names = ("lab/3d", "lab/status", "lab/parameters", "lab/6d/x", "lab/6d/x/y/z", "l%b/3d", "x" * 200)
     with recording_of(publisher, path) as record:
         publisher.publish("lab", *range(500, 600), *range(605, 700), *range(703, 720))
-        record.wait_for("8 messages were lost on the way")
+        # While anything arrives, a request that nobody answers says that there is no history.
+        numbers = itertools.count()
+
+        def has_reported_the_loss() -> bool:
+            publisher.publish("lab", next(numbers), key="force")
+            return record.has_reported("8 messages were lost on the way")
+
+        wait_until(has_reported_the_loss)
         for number in range(40):
             publisher.publish("twice", 1000 + number, 50 + number)
         record.wait_for("two gateways publish the source twice")

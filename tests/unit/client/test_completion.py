@@ -296,7 +296,9 @@ def test_requests_without_a_connection_do_not_end_soon() -> None:
     start_s = network.now_s
     while network.now_s < start_s + 2 * NOBODY_S:
         network.now_s = network.completion.due_s
-        network.completion.fail(network.completion.request(), "no-gateway", "", network.now_s)
+        network.completion.fail(
+            *(network.completion.request(), "no-gateway", "", network.now_s), is_connected=False
+        )
     assert network.completion.due_s < math.inf
     assert network.numbers == [0]
 

@@ -18,10 +18,16 @@ def message(sequence: int) -> bytes:
     return bytes(8) + PREFIX.pack(1000 + sequence, 0, sequence, 1, 0)
 
 
+class Source:
+    """The source of a subscriber, of which something has arrived just now, or at another time."""
+
+    heard_s: float | None = None
+
+
 class Series:
     """The series of a subscriber that the refill needs to know."""
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: Source) -> None:
         self.source = source
         self.check = SequenceCheck()
 
@@ -36,7 +42,8 @@ class Subscriber:
         """What the first looks for room find; later ones find some."""
         self.asked: list[Series] = []
         self.handed_on: list[int] = []
-        self.series: Any = [Series("lab") for _ in range(num_series)]
+        self.source: Any = Source()
+        self.series: Any = [Series(self.source) for _ in range(num_series)]
         self._answer_size = answer_size
         self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE)  # type: ignore[arg-type] # only has_room
         self.completions = [self.refill.add(each, self._hand_on) for each in self.series]
@@ -99,7 +106,7 @@ def test_a_series_that_has_got_what_was_late_delays_nothing() -> None:
     with subscriber.lock:
         subscriber.arrives(0)
         subscriber.arrives(2)
-        assert subscriber.refill.reached_utime("lab") == 1000  # type: ignore[arg-type] # any source
+        assert subscriber.refill.reached_utime(subscriber.source) == 1000
         subscriber.arrives(1)
-        assert subscriber.refill.reached_utime("lab") == math.inf  # type: ignore[arg-type]
+        assert subscriber.refill.reached_utime(subscriber.source) == math.inf
     subscriber.refill.close()
