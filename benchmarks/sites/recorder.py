@@ -1,7 +1,6 @@
 """``rtc3d-gateway record`` on a site, and what is in its recordings."""
 
 import re
-import signal
 import subprocess
 from collections import defaultdict
 from dataclasses import dataclass
@@ -109,8 +108,8 @@ class Recorder:
             self._process.communicate()
 
     def stop(self) -> Recording:
-        """Stop it as Ctrl-C does, and return what it has recorded."""
-        self._process.send_signal(signal.SIGINT)
+        """Stop it, and return what it has recorded."""
+        self._process.terminate()
         summary, _ = self._process.communicate(timeout=_END_S)
         return Recording(self._process.returncode, summary, _refilled(summary), _messages(self._file))
 
