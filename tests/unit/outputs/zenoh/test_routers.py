@@ -107,7 +107,7 @@ def test_a_router_without_a_gateway_and_without_a_link_explains_why_none_is_foun
 
 
 def test_a_gateway_that_access_control_hides_is_named(routers: Routers) -> None:
-    """The router knows its token. Nothing else tells this from a gateway that is not there."""
+    """The router knows its token. Only that distinguishes it from a gateway that does not run."""
     denied = {"id": "no", "permission": "deny", "flows": ["egress"], "key_exprs": ["mocap/**"]}
     denied["messages"] = ["liveliness_token"]
     rules = {"enabled": True, "default_permission": "allow", "rules": [denied], "subjects": [{"id": "all"}]}
