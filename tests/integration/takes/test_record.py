@@ -5,11 +5,12 @@ import os
 import pty
 import re
 import resource
+import select
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -155,6 +156,20 @@ def publisher() -> Iterator[Publisher]:
     publisher.session.close()
 
 
+def publish_until(publisher: Publisher, condition: Callable[[], object]) -> None:
+    """Publish something else until ``condition`` holds.
+
+    While anything arrives, a request that nobody answers says that there is no history.
+    """
+    numbers = itertools.count()
+
+    def holds() -> object:
+        publisher.publish("lab", next(numbers), key="force")
+        return condition()
+
+    wait_until(holds)
+
+
 @contextmanager
 def recording_of(publisher: Publisher, path: Path, **options: Any) -> Iterator[RecordProcess]:
     with recording(path, "--connect", publisher.endpoint, **options) as record:
@@ -168,14 +183,7 @@ def test_gaps_two_gateways_and_hostile_publishers_are_reported(tmp_path: Path, p
     names = ("lab/3d", "lab/status", "lab/parameters", "lab/6d/x", "lab/6d/x/y/z", "l%b/3d", "x" * 200)
     with recording_of(publisher, path) as record:
         publisher.publish("lab", *range(500, 600), *range(605, 700), *range(703, 720))
-        # While anything arrives, a request that nobody answers says that there is no history.
-        numbers = itertools.count()
-
-        def has_reported_the_loss() -> bool:
-            publisher.publish("lab", next(numbers), key="force")
-            return record.has_reported("8 messages were lost on the way")
-
-        wait_until(has_reported_the_loss)
+        publish_until(publisher, lambda: record.has_reported("lost on the way; 8 so far"))
         for number in range(40):
             publisher.publish("twice", 1000 + number, 50 + number)
         record.wait_for("two gateways publish the source twice")
@@ -223,8 +231,14 @@ def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Pu
         publisher.wait_for_subscriber()
         publisher.publish("lab", *range(10), *range(12, 20))
         shown = ""
-        while not re.search(r"\r.*\d:\d\d  2 kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown):
-            shown += os.read(reading, 65536).decode()
+
+        def has_shown_the_loss() -> object:
+            nonlocal shown
+            if select.select([reading], [], [], 0)[0]:
+                shown += os.read(reading, 65536).decode()
+            return re.search(r"\r.*\d:\d\d  \d+ kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown)
+
+        publish_until(publisher, has_shown_the_loss)
         (tmp_path / "walk.lcmlog").unlink()
         process.send_signal(signal.SIGINT)
         stdout, _ = process.communicate(timeout=120)
