@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
+.PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs site lcm-types examples samples \
     screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -70,6 +70,14 @@ generated: .venv/installed
 # Build the site in build/site; a broken link is an error. (With --quiet, --strict would not count mkdocs' warnings.)
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# Commit the site of this version to the branch gh-pages, beside those of other versions: /1.0/, to which /latest/ leads.
+# `git push origin gh-pages` publishes it.
+site: .venv/installed
+	set -e; version=$$($(BIN)/python -c 'from gateway import __version__; print(__version__.rpartition(".")[0])'); \
+	export PATH=$(abspath $(BIN)):$$PATH NO_MKDOCS_2_WARNING=1; \
+	mike deploy --config-file mkdocs-versions.yml --update-aliases --alias-type redirect $$version latest; \
+	mike set-default --config-file mkdocs-versions.yml latest
 
 # lcm-gen appends to an existing __init__.py, so delete the old files first.
 lcm-types: .venv/installed

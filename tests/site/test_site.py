@@ -1,9 +1,12 @@
-"""The site, opened from its folder in a real browser: searching, reading on a phone, no other host."""
+"""The site in a real browser: searching and reading on a phone, from its folder, and its versions."""
 
 import os
 import sys
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from subprocess import run
+from threading import Thread
 from typing import Final
 
 import pytest
@@ -11,6 +14,7 @@ from playwright.sync_api import Page, expect
 
 from tests.support.browser import NewPage, chromium, new_page
 from tests.support.documents import ROOT
+from tests.support.fresh_clones import clone_into
 
 pytestmark = pytest.mark.chromium
 
@@ -82,3 +86,27 @@ def test_the_button_copies_a_block_as_it_is_in_the_source(site: Path, new_page: 
     copied = page.evaluate("navigator.clipboard.readText()")
     assert copied in (ROOT / "docs/how-to/secure.md").read_text()
     assert copied.count("\n") > 10
+
+
+def test_a_web_server_shows_all_versions_the_newest_first(tmp_path: Path, new_page: NewPage) -> None:
+    clone = tmp_path / "clone"
+    run(["git", "init", "--quiet", str(clone)], check=True)
+    clone_into(clone)
+    with (clone / ".git/config").open("a") as file:
+        file.write("[user]\nname = Release\nemail = release@example.org\n")
+    run(["git", "commit", "--quiet", "--allow-empty", "--message=Release"], cwd=clone, check=True)
+    make = ["make", "--assume-old=.venv/installed", f"BIN={Path(sys.executable).parent}", "site"]
+    for version in ("1.0.2", "1.1.0"):
+        (clone / "gateway/__init__.py").write_text(f'__version__ = "{version}"\n')
+        run(make, cwd=clone, env=os.environ | {"MAKEFLAGS": ""}, check=True)
+    site = tmp_path / "site"
+    run(["git", "worktree", "add", "--quiet", str(site), "gh-pages"], cwd=clone, check=True)
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=site)) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        page = new_page()
+        page.goto(f"http://127.0.0.1:{server.server_port}/latest/how-to/record.html")
+        page.wait_for_url("**/1.1/how-to/record.html")
+        page.get_by_role("button", name="Select version").focus()
+        page.get_by_role("link", name="1.0", exact=True).click()
+        page.wait_for_url("**/1.0/", wait_until="networkidle")
+        server.shutdown()
