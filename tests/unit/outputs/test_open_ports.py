@@ -18,6 +18,7 @@ from gateway.outputs.open_ports import (
     reach_of,
 )
 from gateway.outputs.registry import OUTPUTS
+from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.support.needs import need
 from tests.support.networks import free_port
 
@@ -121,7 +122,7 @@ def test_lcm_lists_where_it_sends_and_where_requests_arrive() -> None:
 def zenoh_ports(**config: Any) -> list[tuple[str, str, int, str, str]]:
     """Return where Zenoh's ports are and what protects them; scouting is off unless ``config`` has it."""
     config = {"scouting": {"multicast": {"enabled": False}}} | config
-    ports = OUTPUTS["zenoh"].open_ports(OUTPUTS["zenoh"].settings(config=config), [LAB])
+    ports = OUTPUTS["zenoh"].open_ports(ZenohSettings(config=config), [LAB])
     return [(port.protocol, port.host, port.port, port.encryption, port.authentication) for port in ports]
 
 
@@ -157,7 +158,7 @@ def test_zenoh_lists_its_endpoints_with_what_they_ask_of_those_who_connect() -> 
 
 def test_zenoh_lists_the_ports_of_scouting_which_a_password_does_not_protect() -> None:
     """Zenoh asks only those for a password who connect to it, not those that it finds."""
-    nobody = {"listen": {"endpoints": []}}
+    nobody: dict[str, Any] = {"listen": {"endpoints": []}}
     found, answers = ("udp", "224.0.0.224", 7446), ("udp", ALL_IPV4, 0)
     on: dict[str, Any] = {"scouting": {"multicast": {}}}
     password = {"auth": {"usrpwd": {"dictionary_file": "/etc/zenohd/users"}}}
