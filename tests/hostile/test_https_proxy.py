@@ -9,6 +9,7 @@ import json
 import socket
 import ssl
 import subprocess
+import urllib.request
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
@@ -19,10 +20,11 @@ import pytest
 
 from tests.support.browser import NewPage, chromium, new_page
 from tests.support.configurations import write_config
+from tests.support.documents import blocks
 from tests.support.gateway_process import program
 from tests.support.needs import need_programs
 from tests.support.networks import free_endpoint, free_port, zenoh_keys
-from tests.support.secure_zenoh import Change, make_certificates, shipped_file
+from tests.support.secure_zenoh import Change, make_certificates, replace_all, shipped_file
 from tests.support.waiting import wait_until
 from tests.view.view_process import view_process
 
@@ -283,6 +285,37 @@ def test_a_slow_handshake_and_a_slow_request_end(tmp_path: Path, servers: Server
         with impatient.tls.wrap_socket(connection, server_hostname=NAME) as slow:
             slow.sendall(b"GET / HTTP/1.1\r\nHost:")
             assert slow.recv(1) == b""
+
+
+def test_prometheus_scrapes_with_the_job_of_the_guide(proxy: Proxy, tmp_path: Path) -> None:
+    need_programs("prometheus", packages="prometheus")
+    [job] = [
+        block.text for block in blocks("docs/how-to/secure.md", "yaml") if "scrape_configs" in block.text
+    ]
+    (tmp_path / "password").write_text(PASSWORD)
+    changes = (
+        ("/etc/prometheus/rtc3d-gateway.password", str(tmp_path / "password")),
+        ("/etc/prometheus/lab-ca.crt", str(proxy.folder / "tls/ca.crt")),
+        ("capture.lab:9465", f"{NAME}:{proxy.ports.metrics}"),
+    )
+    (tmp_path / "prometheus.yml").write_text(f"global: {{scrape_interval: 1s}}\n{replace_all(job, *changes)}")
+    address = f"{NAME}:{free_port()}"
+    options = ("--config.file=prometheus.yml", "--storage.tsdb.path=data", f"--web.listen-address={address}")
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(["prometheus", *options], cwd=tmp_path, **quiet) as prometheus:  # type: ignore[call-overload]
+
+        def is_up() -> bool:
+            try:
+                with urllib.request.urlopen(f"http://{address}/api/v1/query?query=up") as reply:
+                    results = json.load(reply)["data"]["result"]
+            except OSError:  # it does not listen yet, or is not ready
+                return False
+            return [result["value"][1] for result in results] == ["1"]
+
+        try:
+            wait_until(is_up)
+        finally:
+            prometheus.terminate()
 
 
 @pytest.mark.chromium
