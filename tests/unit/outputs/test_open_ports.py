@@ -49,6 +49,15 @@ def test_other_addresses_are_reached_from_the_networks_of_their_interfaces() -> 
     assert (reach, "cannot be resolved" in text) == (Reach.EVERY_NETWORK, True)
 
 
+def test_a_name_counts_as_reachable_if_one_of_its_addresses_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the name of this computer, which /etc/hosts often has at a loopback address, too."""
+    found = [
+        (socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 0)) for address in ("127.0.1.1", "192.0.2.5")
+    ]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    assert reached("lab-pc") == (Reach.ONE_NETWORK, "the network of eth0")
+
+
 def test_a_multicast_group_is_reached_where_it_is_joined() -> None:
     group = "239.255.76.67"
     assert reached(group)[0] is Reach.EVERY_NETWORK
@@ -114,7 +123,7 @@ def test_lcm_lists_where_it_sends_and_where_requests_arrive() -> None:
     sending = [("udp", LCM_GROUP, 7667, Access.PUBLISH), ("udp", ALL_IPV4, 0, Access.NOTHING)]
     url = f"udpm://{LCM_GROUP}:7667?ttl=0"
     assert opened("lcm", [LAB], url=url) == [*sending, ("udp", LCM_GROUP, 7668, Access.READ)]
-    assert opened("lcm", [CONTROLLED], url=url)[-1] == ("udp", LCM_GROUP, 7668, Access.CONTROL)
+    assert opened("lcm", [LAB, CONTROLLED], url=url)[-1] == ("udp", LCM_GROUP, 7668, Access.CONTROL)
     assert opened("lcm", [CONTROLLED], url=url, queries=False) == sending
     assert opened("lcm", [CONTROLLED], url="tcpq://192.0.2.1:7700") == []
 
