@@ -9,17 +9,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.config.settings import Settings
+from gateway.doctor.reach import Reach, interface_names, ports_in_use, reach_of
 from gateway.logs.safe_text import safe_json
 from gateway.outputs.findings import Check, Finding, Result
-from gateway.outputs.open_ports import (
-    Access,
-    OpenPort,
-    Reach,
-    interface_names,
-    ports_in_use,
-    reach_of,
-    web_port,
-)
+from gateway.outputs.open_ports import Access, OpenPort, web_port
 from gateway.outputs.registry import OUTPUTS
 
 VIEW_PORT: Final = 8080

@@ -109,6 +109,9 @@ def test_a_gateway_with_every_output_opens_the_listed_ports_and_no_other(
         assert Counter(found(process.pid)) == Counter(places[False])
         [lsl_process] = children(process.pid)
         everywhere = {"0.0.0.0": "::"}  # noqa: S104 - LSL binds both
-        assert {(kind, everywhere.get(at, at), port) for kind, at, port in found(lsl_process)} == set(
-            places[True]
+        wait_until(  # a port of each stream, and streams appear one after the other
+            lambda: (
+                {(kind, everywhere.get(at, at), port) for kind, at, port in found(lsl_process)}
+                == set(places[True])
+            )
         )

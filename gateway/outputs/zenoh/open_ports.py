@@ -47,15 +47,13 @@ def _listen_ports(config: zenoh.Config) -> Iterator[OpenPort]:
     has_password = json.loads(config.get_json("transport/auth/usrpwd"))["dictionary_file"]
     for endpoint in endpoints(config, "listen"):
         name, _, rest = endpoint.partition("/")
-        host, _, port = re.split("[?#]", rest)[0].rpartition(":")
         if name not in _PROTOCOLS:  # such as unixsock-stream
             continue
         encryption, certificates = _tls(config) if name in _ENCRYPTED else _Protection()
         words = [certificates, "password" if has_password else ""]
         yield OpenPort(
             _PROTOCOLS[name],
-            host.strip("[]"),
-            int(port),
+            *_host_and_port(re.split("[?#]", rest)[0]),
             Access.PUBLISH,
             "peers subscribe, query, and publish under every key",
             _LISTEN_REMEDY,
@@ -86,14 +84,20 @@ def _scouting_ports(config: zenoh.Config) -> Iterator[OpenPort]:
         authentication=authentication,
     )
     if not is_client:
-        group, _, port = (scouting["address"] or _SCOUTING_ADDRESS).rpartition(":")
+        group, port = _host_and_port(scouting["address"] or _SCOUTING_ADDRESS)
         yield answers._replace(
-            host=group.strip("[]"),
-            port=int(port),
+            host=group,
+            port=port,
             purpose="Zenoh peers find the gateway and connect, or it connects to them",
             interface=(scouting["interface"] or "auto").replace("auto", ""),
         )
     yield answers
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    """Split HOST:PORT. Without a port, which Zenoh notices only when it listens, the port is 0."""
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port) if port.isdecimal() else 0
 
 
 def _tls(config: zenoh.Config) -> _Protection:

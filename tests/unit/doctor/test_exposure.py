@@ -9,8 +9,9 @@ import pytest
 
 from gateway.config.settings import MetricsSettings, SourceSettings
 from gateway.doctor.exposure import ExposedPort, exposed_ports, exposure_findings, exposure_json
+from gateway.doctor.reach import Reach
 from gateway.outputs.findings import Finding, Result
-from gateway.outputs.open_ports import Access, OpenPort, Reach
+from gateway.outputs.open_ports import Access, OpenPort
 from gateway.outputs.vrpn.settings import VrpnSettings
 from tests.support.configurations import make_settings
 
