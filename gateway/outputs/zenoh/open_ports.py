@@ -65,7 +65,7 @@ def _listen_ports(config: zenoh.Config) -> Iterator[OpenPort]:
 def _scouting_ports(config: zenoh.Config) -> Iterator[OpenPort]:
     """Yield the ports by which the session finds others and is found; none if it does not search.
 
-    A password protects none of them: the gateway asks for none when it connects to others itself.
+    A password protects none of them: Zenoh asks those who connect for it, and not those to whom it connects.
     """
     scouting = json.loads(config.get_json("scouting/multicast"))
     is_client = mode_of(config) == "client"
