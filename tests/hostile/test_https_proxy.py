@@ -320,16 +320,17 @@ def test_prometheus_scrapes_with_the_job_of_the_guide(proxy: Proxy, tmp_path: Pa
 
 @pytest.mark.chromium
 def test_a_browser_shows_the_view_and_a_page_can_watch_as_foxglove_does(
-    proxy: Proxy, new_page: NewPage
+    tmp_path: Path, servers: Servers, new_page: NewPage
 ) -> None:
-    """The browser asks for the password once. A viewer that has no field for it takes it in the address."""
-    page = new_page(ignore_https_errors=True, http_credentials={"username": USER, "password": PASSWORD})
-    page.goto(f"https://{NAME}:{proxy.ports.view}")
-    page.get_by_text("live", exact=False).first.wait_for(timeout=60_000)
-    address = f"wss://{USER}:{PASSWORD.replace(':', '%3A')}@{NAME}:{proxy.ports.foxglove}"
-    script = """address => new Promise((resolve, reject) => {
-        const socket = new WebSocket(address, ["foxglove.sdk.v1"]);
-        socket.onmessage = event => resolve(event.data);
-        socket.onerror = () => reject("refused");
-    })"""
-    assert json.loads(page.evaluate(script, address))["op"] == "serverInfo"
+    """The shipped limits are enough. A viewer that has no field for a password takes it in the address."""
+    with run_nginx(tmp_path, servers) as proxy:
+        page = new_page(ignore_https_errors=True, http_credentials={"username": USER, "password": PASSWORD})
+        page.goto(f"https://{NAME}:{proxy.ports.view}")
+        page.get_by_text("live", exact=False).first.wait_for(timeout=60_000)
+        address = f"wss://{USER}:{PASSWORD.replace(':', '%3A')}@{NAME}:{proxy.ports.foxglove}"
+        script = """address => new Promise((resolve, reject) => {
+            const socket = new WebSocket(address, ["foxglove.sdk.v1"]);
+            socket.onmessage = event => resolve(event.data);
+            socket.onerror = () => reject("refused");
+        })"""
+        assert json.loads(page.evaluate(script, address))["op"] == "serverInfo"

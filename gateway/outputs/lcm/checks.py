@@ -26,10 +26,8 @@ PAUSE_S: Final = 0.02
 _LARGEST_DATAGRAM: Final = 65_499
 """LCM splits larger messages into several datagrams."""
 
-_PORTS_REMEDY: Final = (
-    "Install the firewall rule, set lcm.queries to false, or switch LCM off: "
-    "docs/how-to/secure.md#lcm-and-ttl0."
-)
+_FIREWALL: Final = "Install the firewall rule, or {}: docs/how-to/secure.md#lcm-and-ttl0."
+"""The remedy for a port; the other choice is filled in."""
 
 _LOOPBACK: Final = {None, "", "127.0.0.1", "::1", "localhost"}
 
@@ -71,15 +69,15 @@ def open_ports(settings: LcmSettings, sources: Sequence[SourceSettings]) -> list
     if destination := multicast_destination(url):
         stays = "messages stay on this computer (ttl=0), but others can send forged ones to it"
         purpose = stays if _ttl(url) == "0" else "everybody receives, and can send forged messages"
-        interface = _interface(url)
-        ports.append(OpenPort("udp", *destination, Access.PUBLISH, purpose, _PORTS_REMEDY, interface))
+        interface, remedy = _interface(url), _FIREWALL.format("switch LCM off")
+        ports.append(OpenPort("udp", *destination, Access.PUBLISH, purpose, remedy, interface))
         unread = "LCM sends from here; nothing that arrives is read"
         ports.append(OpenPort("udp", "0.0.0.0", 0, Access.NOTHING, unread, ""))  # noqa: S104 - not bound here
     url = settings.effective_queries_url
     if settings.queries and (destination := multicast_destination(url)):
         access = control_or(Access.READ, sources)
-        purpose = "requests are answered"
-        ports.append(OpenPort("udp", *destination, access, purpose, _PORTS_REMEDY, _interface(url)))
+        remedy = _FIREWALL.format("set lcm.queries to false")
+        ports.append(OpenPort("udp", *destination, access, "requests are answered", remedy, _interface(url)))
     return ports
 
 
