@@ -34,6 +34,7 @@ _GROUPS: Final = {
     "installation": ("tests/systemd/", "tests/packaging/test_wheel.py"),
     "outages": ("tests/outages/",),
     "sites": ("tests/hostile/test_sites.py",),
+    "proxy": ("tests/hostile/test_https_proxy.py",),
 }
 
 _NEEDS: Final = {

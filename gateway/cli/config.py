@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from gateway.config.loading import Configuration
+    from gateway.doctor.report import Report
     from gateway.outputs.findings import Finding
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
@@ -98,6 +101,16 @@ def doctor(
             "--subscriber", help="Check the way from gateways to this computer; needs no configuration."
         ),
     ] = False,
+    exposure: Annotated[
+        bool,
+        typer.Option(
+            "--exposure", help="List every port, who can reach it and what protects it; connect to nothing."
+        ),
+    ] = False,
+    view: Annotated[
+        str | None,
+        typer.Option(metavar="HOST[:PORT]", help="With --exposure: where `rtc3d-gateway view` listens."),
+    ] = None,
     source: options.SourcesOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="With --subscriber: receive on LCM, not Zenoh.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -114,6 +127,7 @@ def doctor(
 
     Without options, it uses the configuration of the installed service. With --subscriber, it checks what
     reaches this computer from gateways and by which routers; --connect and the like say where they are.
+    With --exposure, the exit status is 1 if others can control recordings or takes without a password.
     """
     options.check_exists("--zenoh-config", where.zenoh_config)
     where.check(lcm=lcm)
@@ -121,6 +135,8 @@ def doctor(
         raise typer.BadParameter("--subscriber needs no configuration: leave out --config and --server")
     if not subscriber and (source or lcm or where != options.AddressOptions(zenoh_config=where.zenoh_config)):
         raise typer.BadParameter("--source, --lcm, --connect, --url and --prefix are for --subscriber")
+    if (exposure and (subscriber or no_connect or where.zenoh_config)) or (view and not exposure):
+        raise typer.BadParameter("--view is for --exposure, which connects to nothing")
     import uvloop
     from rich.console import Console
 
@@ -130,29 +146,46 @@ def doctor(
     set_up_log(LogLevel.DEBUG if verbose else LogLevel.ERROR, LogFormat.TEXT)
     report = Report(Console(quiet=as_json), quiet=quiet)
 
-    if subscriber:
+    to_json: Callable[[], str] = report.as_json
+    if exposure:
+        to_json = _report_exposure(report, configuration_from_options(config, server), view)
+    elif subscriber:
         from gateway.doctor.subscriber_checks import run_subscriber_checks
 
         for finding in run_subscriber_checks(where.address(lcm=lcm), source or (), seconds):
             report.add(finding)
     else:
-        from gateway.doctor.source_checks import CONNECTION
-
-        async def report_findings() -> None:
-            file = chosen_file(config, server)
-            connects = not no_connect
-            findings = _check_configuration(file, server, seconds, where.zenoh_config, connects=connects)
-            async for finding in findings:
-                report.add(finding)
-                if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
-                    print(safe_lines(f"{finding.subject}: {finding.found}"), file=sys.stderr)
-
-        uvloop.run(report_findings())
+        file, connects = chosen_file(config, server), not no_connect
+        findings = _check_configuration(file, server, seconds, where.zenoh_config, connects=connects)
+        uvloop.run(_report_findings(report, findings, as_json=as_json))
     report.end()
     if as_json:
-        print(report.as_json())
+        print(to_json())
     if not report.is_ok:
         raise typer.Exit(1)
+
+
+def _report_exposure(
+    report: "Report", configuration: "Configuration", view: str | None
+) -> "Callable[[], str]":
+    """Report every port of a configuration, and that of the view at HOST[:PORT]; return how to make JSON."""
+    from gateway.doctor.exposure import VIEW_PORT, exposed_ports, exposure_findings, exposure_json
+
+    settings = configuration.settings
+    ports = list(exposed_ports(settings, _host_and_port(view, VIEW_PORT) if view else None))
+    for finding in exposure_findings(settings, ports):
+        report.add(finding)
+    return partial(exposure_json, ports)
+
+
+async def _report_findings(report: "Report", findings: "AsyncIterator[Finding]", *, as_json: bool) -> None:
+    """Report each finding as soon as it is known."""
+    from gateway.doctor.source_checks import CONNECTION
+
+    async for finding in findings:
+        report.add(finding)
+        if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
+            print(safe_lines(f"{finding.subject}: {finding.found}"), file=sys.stderr)
 
 
 async def _check_configuration(
@@ -204,12 +237,12 @@ def configuration_from_options(config: Path | None, server: str | None) -> "Conf
 
     file = chosen_file(config, server)
     if server is not None:
-        return read_server(*_host_and_port(server), settings_type())
+        return read_server(*_host_and_port(server, FIRST_PRINCIPLES_PORT), settings_type())
     return read(file, settings_type())
 
 
-def _host_and_port(server: str) -> tuple[str, int]:
-    """Split HOST, HOST:PORT or [IPV6]:PORT; the default port is that of First Principles."""
+def _host_and_port(server: str, default_port: int) -> tuple[str, int]:
+    """Split HOST, HOST:PORT or [IPV6]:PORT."""
     if server.startswith("["):
         host, _, rest = server[1:].partition("]")
         port = rest.removeprefix(":")
@@ -220,7 +253,7 @@ def _host_and_port(server: str) -> tuple[str, int]:
     if not host:
         raise typer.BadParameter(f"{server!r}: the host is missing; give HOST or HOST:PORT")
     if not port:
-        return host, FIRST_PRINCIPLES_PORT
+        return host, default_port
     if not (port.isdecimal() and 0 < int(port) < 65536):
         raise typer.BadParameter(f"{server!r}: the port must be a number from 1 to 65535")
     return host, int(port)

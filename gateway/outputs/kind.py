@@ -10,10 +10,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
-from gateway.config.settings import OutputSettings
+from gateway.config.settings import OutputSettings, SourceSettings
 from gateway.errors import ConfigError
 from gateway.outputs.contract import Output
 from gateway.outputs.findings import Finding, MessageLoad
+from gateway.outputs.open_ports import OpenPort, listening_ports
 
 
 def missing_package(output: str, extra: str, error: ImportError) -> ConfigError:
@@ -126,6 +127,9 @@ class OutputKind:
 
     leaves_host: Callable[[Any], bool] = lambda _settings: True
     """Takes the settings; returns whether messages may leave this computer. The doctor needs it."""
+
+    open_ports: Callable[[Any, Sequence[SourceSettings]], Sequence[OpenPort]] = listening_ports
+    """Takes the settings and all sources; returns every port that the output opens, for the doctor."""
 
     demo: Callable[[bool], DemoSide] | None = None
     """Builds the output for the demo. Takes whether to use the network. Raises OutputError."""

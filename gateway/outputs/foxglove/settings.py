@@ -6,10 +6,11 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from gateway.config.section import expects
-from gateway.config.settings import ListenAddress, OutputSettings
+from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
 from gateway.config.values import Host, Port, Switch
 from gateway.outputs.kind import OutputKind, imported_late
 from gateway.outputs.listen_address import is_loopback
+from gateway.outputs.open_ports import OpenPort, web_port
 
 Origin = Annotated[
     str,
@@ -41,6 +42,10 @@ class FoxgloveSettings(OutputSettings):
         return [ListenAddress(("port",), self.host, self.port)]
 
 
+def _open_ports(settings: FoxgloveSettings, _sources: Sequence[SourceSettings]) -> list[OpenPort]:
+    return [web_port(settings.host, settings.port, "viewers watch everything", "foxglove.host")]
+
+
 FOXGLOVE: Final = OutputKind(
     name="foxglove",
     settings=FoxgloveSettings,
@@ -48,4 +53,5 @@ FOXGLOVE: Final = OutputKind(
     checks=("package", "port"),
     run_checks=imported_late("gateway.outputs.foxglove.checks:check_foxglove"),
     leaves_host=lambda settings: not is_loopback(settings.host),
+    open_ports=_open_ports,
 )

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 from typing import Final
 from urllib.parse import parse_qs
 
+from gateway.config.settings import SourceSettings
 from gateway.errors import OutputError
 from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.lcm.connection import (
     MULTICAST_SCHEMES,
+    multicast_destination,
     multicast_interface,
     multicast_problem,
     open_lcm,
@@ -16,12 +18,16 @@ from gateway.outputs.lcm.connection import (
     split_url,
 )
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.open_ports import Access, OpenPort, control_or
 
 PAUSE_S: Final = 0.02
 """The longest time that a subscriber may pause without losing a message."""
 
 _LARGEST_DATAGRAM: Final = 65_499
 """LCM splits larger messages into several datagrams."""
+
+_FIREWALL: Final = "Install the firewall rule, or {}: docs/how-to/secure.md#lcm-and-ttl0."
+"""The remedy for a port; the other choice is filled in."""
 
 _LOOPBACK: Final = {None, "", "127.0.0.1", "::1", "localhost"}
 
@@ -54,6 +60,33 @@ def leaves_host(settings: LcmSettings) -> bool:
     if scheme in MULTICAST_SCHEMES:
         return _ttl(url) != "0"
     return scheme == "tcpq" and split_url(url).hostname not in _LOOPBACK
+
+
+def open_ports(settings: LcmSettings, sources: Sequence[SourceSettings]) -> list[OpenPort]:
+    """Return the multicast group that the output sends to, the port it sends from, and that of requests."""
+    url = settings.effective_url
+    ports = []
+    if destination := multicast_destination(url):
+        stays = "messages stay on this computer (ttl=0), but others can send forged ones to it"
+        purpose = stays if _ttl(url) == "0" else "everybody receives, and can send forged messages"
+        interface, remedy = _interface(url), _FIREWALL.format("switch LCM off")
+        ports.append(OpenPort("udp", *destination, Access.PUBLISH, purpose, remedy, interface))
+        unread = "LCM sends from here; nothing that arrives is read"
+        ports.append(OpenPort("udp", "0.0.0.0", 0, Access.NOTHING, unread, ""))  # noqa: S104 - not bound here
+    url = settings.effective_queries_url
+    if settings.queries and (destination := multicast_destination(url)):
+        access = control_or(Access.READ, sources)
+        remedy = _FIREWALL.format("set lcm.queries to false")
+        ports.append(OpenPort("udp", *destination, access, "requests are answered", remedy, _interface(url)))
+    return ports
+
+
+def _interface(url: str) -> str:
+    """Return the network interface on which LCM joins the group of ``url``; "" if there is none now."""
+    try:
+        return multicast_interface(url) or ""
+    except OSError:
+        return ""
 
 
 def _ttl(url: str) -> str:

@@ -132,5 +132,6 @@ LCM: Final = OutputKind(
     checks=("route", "requests", "buffers"),
     run_checks=imported_late("gateway.outputs.lcm.checks:check_lcm"),
     leaves_host=imported_late("gateway.outputs.lcm.checks:leaves_host"),
+    open_ports=imported_late("gateway.outputs.lcm.checks:open_ports"),
     demo=imported_late("gateway.outputs.lcm.subscriber:demo"),
 )

@@ -1,13 +1,15 @@
 """The section ``lsl`` of the configuration, and the output in the registry."""
 
+from collections.abc import Sequence
 from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
 from gateway.config.section import expects
-from gateway.config.settings import OutputSettings
+from gateway.config.settings import OutputSettings, SourceSettings
 from gateway.config.values import Switch
 from gateway.outputs.kind import OutputKind, imported_late
+from gateway.outputs.open_ports import Access, OpenPort
 
 
 def _absolute_path(text: str) -> str:
@@ -37,11 +39,26 @@ class LslSettings(OutputSettings):
     """How many seconds of samples liblsl keeps for a receiver that is too slow; it loses older ones."""
 
 
+_SEARCH_PORT: Final = 16571
+"""liblsl's default. A file lsl_api.cfg can have another one."""
+
+
+def _open_ports(_settings: LslSettings, _sources: Sequence[SourceSettings]) -> list[OpenPort]:
+    remedy = "LSL listens everywhere. Keep others out with a firewall: docs/how-to/lsl.md#who-can-reach-it."
+    streams = "receivers read streams: a port of each stream, from 16572 on or any free one"
+    return [
+        OpenPort("udp", "::", _SEARCH_PORT, Access.READ, "receivers search for streams", remedy),
+        OpenPort("tcp", "::", 0, Access.READ, streams, remedy),
+        OpenPort("udp", "::", 0, Access.READ, "receivers compare clocks", remedy),
+    ]
+
+
 LSL: Final = OutputKind(
     name="lsl",
     settings=LslSettings,
     create=imported_late("gateway.outputs.lsl.output:LslOutput"),
     checks=("opens", "found", "gateway"),
     run_checks=imported_late("gateway.outputs.lsl.checks:check_lsl"),
+    open_ports=_open_ports,
 )
 """Its ports are open on every network interface."""

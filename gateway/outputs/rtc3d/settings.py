@@ -6,10 +6,11 @@ from typing import Annotated, Final, Self
 from pydantic import Field, PlainSerializer, model_validator
 
 from gateway.config.section import expects, validation_error
-from gateway.config.settings import ListenAddress, OutputSettings
+from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
 from gateway.config.values import Host, Port, SourceName, Switch
 from gateway.outputs.kind import OutputKind, imported_late
 from gateway.outputs.listen_address import is_loopback
+from gateway.outputs.open_ports import FIREWALL, Access, OpenPort, control_or
 
 DEFAULT_MAX_CLIENTS: Final = 128
 
@@ -58,6 +59,20 @@ class Rtc3dSettings(OutputSettings):
         return self
 
 
+def _open_ports(settings: Rtc3dSettings, sources: Sequence[SourceSettings]) -> list[OpenPort]:
+    return [
+        OpenPort(
+            "tcp",
+            settings.host,
+            port,
+            control_or(Access.READ, [source for source in sources if source.name == name]),
+            f"RTC3D clients read everything of {name}",
+            FIREWALL,
+        )
+        for name, port in settings.ports.items()
+    ]
+
+
 RTC3D: Final = OutputKind(
     name="rtc3d",
     settings=Rtc3dSettings,
@@ -65,4 +80,5 @@ RTC3D: Final = OutputKind(
     checks=("sources", "ports"),
     run_checks=imported_late("gateway.outputs.rtc3d.output:check_rtc3d"),
     leaves_host=lambda settings: not is_loopback(settings.host),
+    open_ports=_open_ports,
 )

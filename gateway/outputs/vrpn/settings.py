@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from typing import Annotated, Final
 
 from gateway.config.section import expects
-from gateway.config.settings import ListenAddress, OutputSettings
+from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
 from gateway.config.values import Host, Port, Switch
 from gateway.outputs.kind import OutputKind, imported_late
 from gateway.outputs.listen_address import is_loopback
+from gateway.outputs.open_ports import FIREWALL, Access, OpenPort
 from gateway.outputs.vrpn.trackers import TrackerNames
 
 DEFAULT_VRPN_PORT: Final = 3883
@@ -34,6 +35,14 @@ class VrpnSettings(OutputSettings):
         return [ListenAddress(("port",), self.host, self.port)]
 
 
+def _open_ports(settings: VrpnSettings, _sources: Sequence[SourceSettings]) -> list[OpenPort]:
+    purposes = {"tcp": "clients read poses", "udp": "clients ask to be connected to, and then read poses"}
+    return [
+        OpenPort(protocol, settings.host, settings.port, Access.READ, purpose, FIREWALL)
+        for protocol, purpose in purposes.items()
+    ]
+
+
 VRPN: Final = OutputKind(
     name="vrpn",
     settings=VrpnSettings,
@@ -41,4 +50,5 @@ VRPN: Final = OutputKind(
     checks=("port", "access"),
     run_checks=imported_late("gateway.outputs.vrpn.output:check_vrpn"),
     leaves_host=lambda settings: not is_loopback(settings.host),
+    open_ports=_open_ports,
 )

@@ -134,5 +134,6 @@ ZENOH: Final = OutputKind(
     checks=("link", "routers", "gateway"),
     run_checks=imported_late("gateway.outputs.zenoh.checks:check_zenoh"),
     leaves_host=imported_late("gateway.outputs.zenoh.checks:leaves_host"),
+    open_ports=imported_late("gateway.outputs.zenoh.open_ports:open_ports"),
     demo=imported_late("gateway.outputs.zenoh.subscriber:demo"),
 )
