@@ -224,12 +224,13 @@ def export(
     source: options.SourceOption = None,
     from_s: options.FromOption = None,
     to_s: options.ToOption = None,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Write a bag of ROS 2 (.mcap).")] = False,
     quiet: options.NoProgressOption = False,
 ) -> None:
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
-    job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
+    job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s, is_for_ros2=ros2)
     with progress_bar(quiet=quiet, counts_bytes=False) as job.progress:
         paths = export_take(job)
     for note in job.notes:

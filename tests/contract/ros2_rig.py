@@ -12,8 +12,8 @@ from gateway.outputs.contract import Output
 from gateway.outputs.ros2.output import Ros2Output
 from gateway.outputs.ros2.settings import Ros2Settings
 from tests.contract.frame_rigs import FrameRig, Received
+from tests.support import ros_messages as ros
 from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
-from tests.unit.outputs.ros2 import ros_messages as ros
 
 STALLED = """
 import sys, zenoh

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import zenoh
 
+from gateway.messages.ros2 import ROS_TYPES
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.ros2.messages import ROS_TYPES
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.service.gateway import Gateway

@@ -7,8 +7,8 @@ from typing import Final
 import zenoh
 
 from gateway.descriptions.labels import printable
+from gateway.messages.ros2 import NO_HASH, ROS_TYPES
 from gateway.outputs.findings import Check, Finding, MessageLoad, as_sentence, failing_first
-from gateway.outputs.ros2.messages import NO_HASH, ROS_TYPES
 from gateway.outputs.ros2.output import REMEDY, client_config
 from gateway.outputs.ros2.settings import ROS2, Ros2Settings
 from gateway.outputs.ros2.topic import NODE_NAME, SeenEntity, full_name, seen_entity, tokens_of

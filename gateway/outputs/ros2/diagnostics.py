@@ -10,9 +10,8 @@ import zenoh
 from gateway.errors import OutputError
 from gateway.logs.failures import DefectLog
 from gateway.messages.decode import decode
+from gateway.messages.ros2 import DiagnosticStatus, diagnostic_array, ros_stamp
 from gateway.messages.source_report import LossReport, OutputReport, SourceReport, StreamReport, source_report
-from gateway.outputs.ros2 import messages
-from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
 from gateway.outputs.ros2.source import Sender
 from gateway.outputs.ros2.topic import RosTopic
 from gateway.outputs.zenoh.config import zenoh_reason
@@ -75,7 +74,7 @@ class DiagnosticsPublisher:
         try:
             previous, self._previous = self._previous, source_report(decode(message))
             statuses = diagnostics_of(self._previous, previous, self._names())
-            self._topic.put(diagnostic_array(messages.stamp(self._previous.utime), statuses), time.time_ns())
+            self._topic.put(diagnostic_array(ros_stamp(self._previous.utime), statuses), time.time_ns())
         except zenoh.ZError as error:
             logger.debug("ros2: publishing diagnostics: %s", zenoh_reason(error))
         except Exception as defect:  # noqa: BLE001 - the sending thread continues

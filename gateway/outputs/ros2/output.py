@@ -13,12 +13,13 @@ from typing import Final
 import zenoh
 
 from gateway.logs.losses import Losses
+from gateway.messages.ros2 import DIAGNOSTIC_ARRAY, TF_MESSAGE
+from gateway.messages.ros2_names import MAX_PART_CHARS, TF, ros_name
 from gateway.messages.topics import Topic, unique_name
 from gateway.outputs.contract import FramePublisher, OutputHealth, Publisher, ServerParameters
 from gateway.outputs.frame_output import FrameOutput, in_this_loop
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
-from gateway.outputs.ros2.messages import DIAGNOSTIC_ARRAY, TF_MESSAGE
-from gateway.outputs.ros2.settings import MAX_PART_CHARS, Ros2Settings, ros_name
+from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.outputs.zenoh.config import zenoh_config
@@ -79,7 +80,7 @@ class Ros2Output(FrameOutput):
         self.settings: Ros2Settings = settings
         self._router = router_session(settings.connect, self._declare_in_thread)
         self._sender: WorkerThread | None = None  # from start to close
-        self._tf = RosTopic("/tf", TF_MESSAGE, self._on_tf_wanted)
+        self._tf = RosTopic(TF, TF_MESSAGE, self._on_tf_wanted)
         self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
         self._node: RosNode | None = None  # only in the sending thread
         self._names: dict[str, str] = {}  # by source, also those that are gone

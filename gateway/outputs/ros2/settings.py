@@ -1,12 +1,6 @@
-"""The section ``ros2`` of the configuration, and the output in the registry.
-
-A topic consists of parts between slashes: ASCII letters, digits and single underscores, without a digit or an
-underscore at the beginning. (A part with a leading underscore is hidden from ``ros2 topic list``.)
-"""
+"""The section ``ros2`` of the configuration, and the output in the registry."""
 
 import re
-import unicodedata
-from collections.abc import Sequence
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field
@@ -14,47 +8,13 @@ from pydantic import AfterValidator, Field
 from gateway.config.section import expects
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
-from gateway.messages.topics import unique_name
+from gateway.messages.ros2_names import DEFAULT_NAMESPACE
 from gateway.outputs.kind import OutputKind, imported_late
-
-_MAX_LABEL_CHARS: Final = 48
-MAX_PART_CHARS: Final = 63
-"""How much of a label is kept, and the maximum length of a part, with a noun and a number.
-
-ROS accepts topics of at most 247 characters.
-"""
 
 MAX_NAMESPACE_CHARS: Final = 100
 
 NAMESPACE: Final = re.compile("[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*(/[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*)*")
 """What a namespace may be, without slashes at both ends."""
-
-
-def ros_name(text: str, noun: str) -> str:
-    """Return ``text`` as a part of a topic; ``noun`` begins it if it has no letter at its beginning.
-
-    "Left Foot" becomes Left_Foot, "2nd" with the noun tool becomes tool_2nd, "é" becomes e.
-    """
-    plain = "".join(each for each in unicodedata.normalize("NFKD", text) if not unicodedata.combining(each))
-    name = re.sub("[^A-Za-z0-9]+", "_", plain).strip("_")[:_MAX_LABEL_CHARS].rstrip("_")
-    if name and name[0].isdigit():
-        return f"{noun}_{name}"
-    return name or noun
-
-
-def unique_ros_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:
-    """Return a different part of a topic for each of the labels.
-
-    A name that an earlier label has gets _2, _3, …. A label without any usable character is called by its
-    position, such as tool_3.
-    """
-    names: dict[str, None] = {}
-    for position, label in enumerate(labels, start=1):
-        name = ros_name(label, noun)
-        if name == noun:
-            name = f"{noun}_{position}"
-        names[unique_name(name, names, MAX_PART_CHARS)] = None
-    return tuple(names)
 
 
 DEFAULT_ROUTER: Final = "tcp/127.0.0.1:7447"
@@ -106,7 +66,7 @@ class Ros2Settings(OutputSettings):
     domain_id: Annotated[int, Field(strict=True, ge=0, le=232), expects("a whole number from 0 to 232")] = 0
     """The domain: ROS_DOMAIN_ID of the computers with ROS."""
 
-    namespace: Namespace = "mocap"
+    namespace: Namespace = DEFAULT_NAMESPACE
     """The namespace of the node and its topics, for example /mocap/lab/markers."""
 
     connect: RouterEndpoint = DEFAULT_ROUTER

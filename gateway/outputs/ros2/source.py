@@ -20,9 +20,7 @@ from gateway.errors import OutputError
 from gateway.logs.failures import DefectLog
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
-from gateway.outputs.contract import ServerParameters
-from gateway.outputs.ros2 import messages
-from gateway.outputs.ros2.messages import (
+from gateway.messages.ros2 import (
     FLOAT_ARRAY,
     POINT_CLOUD,
     POSE_STAMPED,
@@ -34,9 +32,18 @@ from gateway.outputs.ros2.messages import (
     TransformNames,
     pack_pose,
     pack_wrench,
+    ros_stamp,
     tf_message,
 )
-from gateway.outputs.ros2.settings import unique_ros_names
+from gateway.messages.ros2_names import (
+    ANALOG,
+    MARKERS,
+    plate_name,
+    pose_topic,
+    unique_ros_names,
+    wrench_topic,
+)
+from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.session import SessionHolder
@@ -252,9 +259,9 @@ class RosSource:
 
     def _open(self, counts: Mapping[ComponentType, int]) -> None:
         if counts.get(ComponentType.MARKERS):
-            self._markers = self._topic("markers", POINT_CLOUD)
+            self._markers = self._topic(MARKERS, POINT_CLOUD)
         if counts.get(ComponentType.ANALOG):
-            self._analog = self._topic("analog", FLOAT_ARRAY)
+            self._analog = self._topic(ANALOG, FLOAT_ARRAY)
         num_tools = min(counts.get(ComponentType.TOOLS, 0), MAX_TOOLS)
         if num_tools > len(self._tools):
             self._open_tools(num_tools)
@@ -274,7 +281,7 @@ class RosSource:
         labels = describe(ComponentType.TOOLS, self._described_by.parsed, num_tools).labels
         names = unique_ros_names(labels, "tool")
         for name in names[len(self._tools) :]:
-            topic = self._topic(f"{name}/pose", POSE_STAMPED)
+            topic = self._topic(pose_topic(name), POSE_STAMPED)
             transform = TransformNames(self._frame.frame_id, f"{self.name}/{name}")
             self._tools.append(_Tool(topic, transform))
         self._show_names(ComponentType.TOOLS, labels, names)
@@ -282,9 +289,9 @@ class RosSource:
     def _open_plates(self, num_plates: int) -> None:
         force = self._described_by.parsed.force
         plates = force.plates if force else ()
-        names = [f"force_{number}" for number in range(1, num_plates + 1)]
+        names = [*map(plate_name, range(1, num_plates + 1))]
         for index in range(len(self._plates), num_plates):
-            topic = self._topic(f"{names[index]}/wrench", WRENCH_STAMPED)
+            topic = self._topic(wrench_topic(names[index]), WRENCH_STAMPED)
             newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
             self._plates.append(_Plate(topic, newtons, newton_metres))
         labels = describe(ComponentType.FORCE, self._described_by.parsed, num_plates).labels
@@ -326,7 +333,7 @@ class RosSource:
         if refused is not self._skipped:
             self._skip(refused)
         self._use(parameters)
-        ros_stamp = messages.stamp(stamp.capture_utime)
+        time_stamp = ros_stamp(stamp.capture_utime)
         now_ns = time.time_ns()
         for index, layout in enumerate(frame.layout.components):
             kind = layout.type
@@ -335,11 +342,11 @@ class RosSource:
             if kind in _LENGTH_COMPONENTS and self._frame.metres_per_unit is None:
                 self._count_unknown_unit(kind)
             elif kind is ComponentType.TOOLS:
-                self._send_tools(frame.component(index), ros_stamp, now_ns)
+                self._send_tools(frame.component(index), time_stamp, now_ns)
             elif kind is ComponentType.MARKERS and self._markers is not None and self._markers.wanted:
-                self._send_markers(self._markers, frame.component(index), ros_stamp, now_ns)
+                self._send_markers(self._markers, frame.component(index), time_stamp, now_ns)
             elif kind is ComponentType.FORCE:
-                self._send_forces(frame.component(index), ros_stamp, now_ns)
+                self._send_forces(frame.component(index), time_stamp, now_ns)
             elif kind is ComponentType.ANALOG and self._analog is not None and self._analog.wanted:
                 self._send_analog(self._analog, frame.component(index), now_ns)
 

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import xxhash
 import zenoh
 
-from gateway.outputs.ros2.messages import RosType
+from gateway.messages.ros2 import RosType
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.session import declare_publisher, has_subscribers

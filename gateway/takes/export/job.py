@@ -25,6 +25,9 @@ FORMATS: Final = {
 }
 """The module and the function that write the files of a job, by the extension of its ``out``."""
 
+ROS2_FORMATS: Final = {".mcap": ("rosbag", "export_rosbag")}
+"""The same for ROS 2."""
+
 _INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
 _MAX_NAMED: Final = 10
 
@@ -32,14 +35,16 @@ _MAX_NAMED: Final = 10
 def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     extension = job.out.suffix.lower()
-    if extension not in FORMATS:
-        raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
-    module, function = FORMATS[extension]
+    formats = ROS2_FORMATS if job.is_for_ros2 else FORMATS
+    if extension not in formats:
+        kind = "no extension of a bag of ROS 2" if job.is_for_ros2 else "no known extension"
+        raise SelectionError(f"{job.out} has {kind}; choose {join_or(formats)}")
+    module, function = formats[extension]
     with job.files:
         try:
             write = getattr(import_module(f"gateway.takes.export.{module}"), function)
         except ImportError as error:
-            if module != "mcap":
+            if extension != ".mcap":
                 raise
             raise TakeError(
                 f"{job.out} cannot be written without foxglove-sdk; install it: {_INSTALL}"
@@ -53,8 +58,9 @@ class ExportJob:
     """What to export, and where it goes.
 
     ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
-    the take. ``progress`` is called with what is being done, how much of it is done, and how much there is
-    (0: that is not known). ``notes`` are sentences about what was changed or left out.
+    the take. ``is_for_ros2`` makes the file a bag of ROS 2. ``progress`` is called with what is being done,
+    how much of it is done, and how much there is (0: that is not known). ``notes`` are sentences about what
+    was changed or left out.
     """
 
     take: Path
@@ -62,6 +68,7 @@ class ExportJob:
     source: str | None = None
     from_s: float | None = None
     to_s: float | None = None
+    is_for_ros2: bool = False
     progress: Callable[[str, int, int], None] = lambda *_: None
     notes: list[str] = field(default_factory=list)
     files: NewFiles = field(default_factory=NewFiles)

@@ -64,10 +64,8 @@ def export_mcap(job: ExportJob) -> None:
                 sources[name].attach_parameters(message, file)
             elif name in sources and key in COMPONENTS_BY_KEY and first <= utime < stop:
                 sources[name].write(key, message, file)
-        for name, source in take.sources.items():
-            details = {key: text for key, text in source.details._asdict().items() if text}
-            about = {"server": source.server, "gateway_version": source.gateway_version, **details}
-            file.write_metadata(name, about)
+        for source in take.sources.values():
+            file.write_metadata(source)
     if not file.num_messages:
         raise nothing_to_export(job, "frames")
     for name, exported in sources.items():
@@ -154,15 +152,16 @@ class _SourceExport:
 class McapFile:
     """An MCAP file in chunks compressed by zstd. The end of the block writes its index.
 
-    The file itself stays open. Its errors are raised by the next call, and at the end of the block.
+    The file itself stays open. Its errors are raised by the next call, and at the end of the block. The
+    ``profile`` of a bag of ROS 2 is "ros2".
     """
 
-    def __init__(self, file: IO[bytes]) -> None:
+    def __init__(self, file: IO[bytes], profile: str = "") -> None:
         self.num_messages = 0
         self._file = _WatchedFile(file)
         self._context = foxglove.Context()
         self._channels: dict[Topic, foxglove.Channel] = {}
-        options = MCAPWriteOptions(compression=MCAPCompression.Zstd)
+        options = MCAPWriteOptions(compression=MCAPCompression.Zstd, profile=profile)
         self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
 
     def __enter__(self) -> Self:
@@ -198,9 +197,11 @@ class McapFile:
         self.num_messages += 1
         self._file.raise_error()
 
-    def write_metadata(self, name: str, content: dict[str, str]) -> None:
-        """Add a table of texts."""
-        self._writer.write_metadata(name, content)
+    def write_metadata(self, source: TakeSource) -> None:
+        """Add a table with the server of a source, and what the take says about it."""
+        details = {key: text for key, text in source.details._asdict().items() if text}
+        about = {"server": source.server, "gateway_version": source.gateway_version, **details}
+        self._writer.write_metadata(source.name, about)
 
     def attach(self, utime: int, name: str, media_type: str, data: bytes) -> None:
         """Add a file in the file. ``utime`` is its time in µs since 1970."""

@@ -41,7 +41,7 @@ def export_csv(job: ExportJob) -> None:
     """Write a file for each component of each source; if its labels change, one for each set of labels."""
     take = job.open_take(components=())
     files: dict[_Layout, IO[bytes]] = {}
-    for name, key, series in _parts(job, take):
+    for name, key, series in parts_of(job, take):
         for run in series.runs():
             layout = (name, key, _columns(key, run))
             if layout not in files:
@@ -63,7 +63,7 @@ def export_csv(job: ExportJob) -> None:
     job.note_malformed(take)
 
 
-def _parts(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
+def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
     """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
     reader = TakeReader(job.take)
     first, stop = job.utimes(take)

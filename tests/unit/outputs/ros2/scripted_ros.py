@@ -10,15 +10,15 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.logs.losses import Losses
+from gateway.messages.ros2 import TF_MESSAGE
 from gateway.outputs.contract import OutputHealth, ServerParameters
-from gateway.outputs.ros2.messages import TF_MESSAGE
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosTopic
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
+from tests.support import ros_messages as ros
 from tests.support.ros_lab import ALL, stamp
 from tests.support.statuses import amounts
-from tests.unit.outputs.ros2 import ros_messages as ros
 
 
 def cause_of(publish: Callable[..., None], *arguments: object) -> str:

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from gateway.messages.ros2 import NO_HASH, POSE_STAMPED
 from gateway.outputs.findings import Result
 from gateway.outputs.ros2.checks import check_ros2, leaves_host
-from gateway.outputs.ros2.messages import NO_HASH, POSE_STAMPED
 from gateway.outputs.ros2.settings import ROS2, Ros2Settings
 from tests.support.networks import free_endpoint
 from tests.support.ros_lab import RosLab, ros_lab

@@ -5,16 +5,16 @@ from typing import Any
 import pytest
 import rtc3d
 
+from gateway.messages.ros2 import DiagnosticStatus
 from gateway.messages.source_report import source_report
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import IgnoringPublisher
 from gateway.outputs.ros2 import diagnostics as diagnostics_module
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher, diagnostics_of
-from gateway.outputs.ros2.messages import DiagnosticStatus
 from gateway.rtc3d.parameters import Plate
+from tests.support import ros_messages as ros
 from tests.support import statuses
 from tests.support.ros_lab import UTIME, parameters
-from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.unit.outputs.ros2.scripted_ros import cause_of
 from tests.unit.outputs.ros2.test_output import Output
 

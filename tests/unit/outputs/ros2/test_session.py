@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 import zenoh
 
-from gateway.outputs.ros2.messages import POINT_CLOUD
+from gateway.messages.ros2 import POINT_CLOUD
 from gateway.outputs.ros2.output import client_config
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.topic import RosNode, RosTopic, gid_of

@@ -13,8 +13,8 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.ros2.source import MAX_PLATES, MAX_TOOLS
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
 from gateway.rtc3d.parameters import ForceChannel, Plate
+from tests.support import ros_messages as ros
 from tests.support.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, tools_frame
-from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.unit.outputs.ros2.scripted_ros import Source, cause_of
 
 MARKERS, TOOLS, ANALOG, FORCE, _ = WIRE_ORDER

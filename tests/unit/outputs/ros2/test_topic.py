@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from gateway.outputs.ros2.messages import HUMBLE, ROS_TYPES, TF_MESSAGE, RosType
-from gateway.outputs.ros2.settings import MAX_PART_CHARS, ros_name, unique_ros_names
+from gateway.messages.ros2 import HUMBLE, ROS_TYPES, TF_MESSAGE, RosType
+from gateway.messages.ros2_names import MAX_PART_CHARS, ros_name, unique_ros_names
 from gateway.outputs.ros2.topic import Node, QoS, SeenEntity, attachment, data_key, gid_of, seen_entity
 
 STRING = RosType(

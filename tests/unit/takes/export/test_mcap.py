@@ -36,6 +36,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.mcap import McapFile
+from gateway.takes.files.take import TakeSource
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -374,7 +375,7 @@ def test_a_full_disk_is_its_own_error_whatever_is_written() -> None:
     uses: list[Callable[[McapFile], object]] = [
         lambda file: file.attach(START_UTIME, "large", "application/xml", bytes(2_000_000)),
         lambda file: file.write(message),
-        lambda file: file.write_metadata("lab", {"server": "192.0.2.20:3020"}),
+        lambda file: file.write_metadata(TakeSource("lab", "192.0.2.20:3020")),
         lambda _file: None,
     ]
     for use in uses:

@@ -7,9 +7,10 @@ length (uint32) and its items.
 A test compares the hashes with those that rosbags computes from the definitions (REP 2011). They are the same
 in all distributions since Iron.
 
-The stamps are the results of ``cdr.stamp``. All positions are in metres.
+The stamps are the results of ``ros_stamp``. All positions are in metres.
 """
 
+import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Self
@@ -27,7 +28,7 @@ _UINT32_STRUCT: Final = struct.Struct("<I")
 _STAMP: Final = struct.Struct("<iI")
 
 
-def stamp(utime: int) -> bytes:
+def ros_stamp(utime: int) -> bytes:
     """Return a builtin_interfaces/Time for a time in µs since the Unix epoch, moved into its range."""
     seconds, microseconds = divmod(utime, 1_000_000)
     return _STAMP.pack(max(-MAX_STAMP_S - 1, min(seconds, MAX_STAMP_S)), 1000 * microseconds)
@@ -154,6 +155,35 @@ MAX_LABEL_BYTES: Final = 16 * 1024
 """Longer labels of channels are left out, because they are in every message."""
 
 
+def _rows(*parts: bytes | Array) -> list[bytes]:
+    """Return messages of equal size from their parts: bytes that all have, and arrays with a row for each."""
+    blocks = [
+        np.frombuffer(part, np.uint8) if isinstance(part, bytes) else _bytes_of_rows(part) for part in parts
+    ]
+    num_rows = next(len(block) for block in blocks if block.ndim > 1)
+    ends = np.cumsum([block.shape[-1] for block in blocks]).tolist()
+    table = np.empty((num_rows, ends[-1]), np.uint8)
+    for start, stop, block in zip([0, *ends], ends, blocks, strict=False):
+        table[:, start:stop] = block
+    content, size = table.tobytes(), ends[-1]
+    return [content[start : start + size] for start in range(0, len(content), size)]
+
+
+def _bytes_of_rows(rows: Array) -> Array:
+    """Return the bytes of each row, shape (rows, bytes)."""
+    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+    return np.ascontiguousarray(rows).reshape(-1).view(np.uint8).reshape(len(rows), row_bytes)
+
+
+def ros_stamps(utimes: Array) -> Array:
+    """Return the stamps of times in µs since the Unix epoch, shape (times, 8), uint8; see ``ros_stamp``."""
+    seconds, microseconds = np.divmod(utimes, 1_000_000)
+    stamps = np.empty(len(utimes), [("sec", "<i4"), ("nanosec", "<u4")])
+    stamps["sec"] = np.clip(seconds, -MAX_STAMP_S - 1, MAX_STAMP_S)
+    stamps["nanosec"] = 1000 * microseconds
+    return _bytes_of_rows(stamps)
+
+
 class StampedEncoder:
     """Encodes geometry_msgs/PoseStamped and WrenchStamped of one frame."""
 
@@ -163,6 +193,10 @@ class StampedEncoder:
     def encode(self, stamp: bytes, content: bytes) -> bytes:
         """Return a message with the result of ``pack_pose`` or ``pack_wrench``."""
         return b"%b%b%b%b" % (ENCAPSULATION, stamp, self._frame_id, content)
+
+    def encode_rows(self, stamps: Array, values: Array) -> list[bytes]:
+        """Return a message for each row of ``values``: a wrench or a pose, shape (rows, 6) or (rows, 7)."""
+        return _rows(ENCAPSULATION, stamps, self._frame_id, values.astype("<f8"))
 
 
 class TransformNames:
@@ -219,6 +253,17 @@ class CloudEncoder:
         self._floats[:, 3] = reliabilities
         return b"".join((ENCAPSULATION, stamp, self._layout, self._points.tobytes(), bytes([is_dense])))
 
+    def encode_rows(self, stamps: Array, positions: Array, reliabilities: Array) -> list[bytes]:
+        """Return a message for each row of ``positions``, shape (rows, n, 3); see ``encode``."""
+        points = np.tile(self._points, (len(positions), 1))
+        floats = points.view("<f4").reshape(*points.shape, self._floats.shape[1])
+        with np.errstate(over="ignore"):
+            floats[..., :3] = positions
+        floats[..., :3][np.isnan(positions).any(axis=2)] = np.nan
+        floats[..., 3] = reliabilities
+        is_dense = np.isfinite(floats[..., :3]).all(axis=(1, 2))
+        return _rows(ENCAPSULATION, stamps, self._layout, points, is_dense[:, None])
+
 
 class AnalogEncoder:
     """Encodes std_msgs/Float32MultiArray with one value per channel.
@@ -238,6 +283,10 @@ class AnalogEncoder:
     def encode(self, values: Array) -> bytes:
         """Return a message with ``values``, shape (num_channels,)."""
         return b"%b%b%b" % (ENCAPSULATION, self._layout, values.astype("<f4").tobytes())
+
+    def encode_rows(self, values: Array) -> list[bytes]:
+        """Return a message for each row of ``values``, shape (rows, num_channels)."""
+        return _rows(ENCAPSULATION, self._layout, values.astype("<f4"))
 
 
 class DiagnosticStatus(NamedTuple):

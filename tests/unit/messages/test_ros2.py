@@ -1,26 +1,34 @@
 """Each message byte by byte, compared with what ROS 2 has written, and rosbags with random contents."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gateway.outputs.ros2 import messages
-from gateway.outputs.ros2.messages import (
+from gateway.messages.ros2 import (
+    DIAGNOSTIC_ARRAY,
+    ENCAPSULATION,
+    ROS_TYPES,
     AnalogEncoder,
     CloudEncoder,
     DiagnosticStatus,
+    RosType,
     StampedEncoder,
     TransformNames,
     diagnostic_array,
     pack_pose,
     pack_wrench,
+    ros_stamp,
+    ros_stamps,
     tf_message,
 )
-from tests.unit.outputs.ros2 import ros_messages as ros
+from gateway.messages.ros2_definitions import definition
+from tests.support import ros_messages as ros
 
 STAMP = bytes(8)
 
@@ -41,8 +49,8 @@ poses = st.tuples(*7 * [doubles])
     ],
 )
 def test_a_stamp_is_moved_into_its_range(utime: int, stamp: str) -> None:
-    assert messages.stamp(utime)[:4] == bytes.fromhex(stamp)[:4]
-    assert int.from_bytes(messages.stamp(utime)[4:], "little") < 1_000_000_000
+    assert ros_stamp(utime)[:4] == bytes.fromhex(stamp)[:4]
+    assert int.from_bytes(ros_stamp(utime)[4:], "little") < 1_000_000_000
 
 
 def test_a_text_with_nul_or_half_a_character_is_still_one_text() -> None:
@@ -63,7 +71,7 @@ def test_a_cloud_has_its_numbers_in_the_order_of_its_fields() -> None:
     assert not message.is_dense
 
 
-REAL_STAMP = messages.stamp(1_700_000_000_000_001)
+REAL_STAMP = ros_stamp(1_700_000_000_000_001)
 REAL_POSE = pack_pose(0.1, -2, 3, 0, 0.6, 0, 0.8)
 
 
@@ -91,7 +99,7 @@ REAL_POSE = pack_pose(0.1, -2, 3, 0, 0.6, 0, 0.8)
         pytest.param(
             b"%b%b%b%b"
             % (
-                messages.ENCAPSULATION,
+                ENCAPSULATION,
                 REAL_STAMP,
                 TransformNames("hall-2", "hall-2/Left_Foot").later,
                 REAL_POSE,
@@ -145,7 +153,7 @@ def test_messages_equal_those_of_real_ros(ours: bytes, theirs: str) -> None:
 
 @given(utimes, texts, st.tuples(*6 * [doubles]))
 def test_wrenches_equal_those_of_rosbags(utime: int, frame_id: str, wrench: tuple[float, ...]) -> None:
-    ours = StampedEncoder(frame_id).encode(messages.stamp(utime), pack_wrench(*wrench))
+    ours = StampedEncoder(frame_id).encode(ros_stamp(utime), pack_wrench(*wrench))
     assert ours == ros.encoded(ros.wrench_stamped(utime, frame_id, wrench))
 
 
@@ -154,7 +162,7 @@ def test_transforms_equal_those_of_rosbags(
     utime: int, frame_id: str, children: list[tuple[str, tuple[float, ...]]]
 ) -> None:
     ours = tf_message(
-        messages.stamp(utime),
+        ros_stamp(utime),
         [(TransformNames(frame_id, child), pack_pose(*pose)) for child, pose in children],
     )
     assert ours == ros.encoded(ros.tf_message(utime, frame_id, children))
@@ -164,7 +172,7 @@ def test_transforms_equal_those_of_rosbags(
 def test_clouds_equal_those_of_rosbags(utime: int, frame_id: str, markers: list[tuple[float, ...]]) -> None:
     values = np.array(markers, dtype=np.float64).reshape(-1, 4)
     ours = CloudEncoder(frame_id, len(markers)).encode(
-        messages.stamp(utime), values[:, :3].copy(), values[:, 3].astype(np.float32)
+        ros_stamp(utime), values[:, :3].copy(), values[:, 3].astype(np.float32)
     )
     cloud = ros.decoded(ours, "sensor_msgs/msg/PointCloud2")
     assert ros.encoded(cloud) == ours
@@ -196,6 +204,39 @@ def test_channels_equal_those_of_rosbags(channels: list[tuple[str, float]]) -> N
     assert np.array_equal(array.data, values.astype("<f4"), equal_nan=True)
 
 
+@given(st.lists(utimes, max_size=4), texts, st.data())
+def test_rows_are_the_messages_of_each_row(utimes: list[int], frame_id: str, data: st.DataObject) -> None:
+    """A bag has whole blocks of messages that are published one by one."""
+
+    def numbers(*shape: int, width: Literal[32, 64] = 64) -> npt.NDArray[np.float64]:
+        count = math.prod(shape)
+        return np.array(data.draw(st.lists(st.floats(width=width), min_size=count, max_size=count))).reshape(
+            shape
+        )
+
+    stamps, times = ros_stamps(np.array(utimes, np.int64)), [*map(ros_stamp, utimes)]
+    wrenches = numbers(len(utimes), 6)
+    stamped = StampedEncoder(frame_id)
+    assert stamped.encode_rows(stamps, wrenches) == [
+        stamped.encode(stamp, pack_wrench(*wrench)) for stamp, wrench in zip(times, wrenches, strict=True)
+    ]
+    clouds = numbers(len(utimes), 2, 4, width=32)
+    cloud = CloudEncoder(frame_id, 2)
+    assert cloud.encode_rows(stamps, clouds[..., :3], clouds[..., 3]) == [
+        cloud.encode(stamp, each[:, :3], each[:, 3]) for stamp, each in zip(times, clouds, strict=True)
+    ]
+    channels = AnalogEncoder(["a", "b", "c"])
+    values = numbers(len(utimes), 3, width=32)
+    assert channels.encode_rows(values) == [channels.encode(each) for each in values]
+
+
+@pytest.mark.parametrize("ros_type", [each for each in ROS_TYPES if each is not DIAGNOSTIC_ARRAY])
+def test_the_definitions_have_the_hashes_of_ros(ros_type: RosType) -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition(ros_type), ros_type.name))
+    assert store.hash_rihs01(ros_type.name) == ros_type.type_hash
+
+
 @pytest.mark.parametrize(("label", "is_kept"), [("é" * 8192, True), ("é" * 8192 + "x", False)])
 def test_labels_that_are_too_long_are_left_out(label: str, is_kept: bool) -> None:
     """They are in every message; 16 KiB count in UTF-8."""
@@ -213,7 +254,7 @@ statuses = st.lists(
 
 @given(utimes, statuses)
 def test_diagnostics_equal_those_of_rosbags(utime: int, statuses: list[DiagnosticStatus]) -> None:
-    ours = diagnostic_array(messages.stamp(utime), statuses)
+    ours = diagnostic_array(ros_stamp(utime), statuses)
     theirs: Any = ros.message(
         "diagnostic_msgs/msg/DiagnosticArray",
         header=ros.header(utime, ""),

@@ -1,0 +1,68 @@
+"""The names of topics of ROS 2.
+
+A topic consists of parts between slashes: ASCII letters, digits and single underscores, without a digit or an
+underscore at the beginning. (A part with a leading underscore is hidden from ``ros2 topic list``.)
+"""
+
+import re
+import unicodedata
+from collections.abc import Sequence
+from typing import Final
+
+from gateway.messages.topics import unique_name
+
+DEFAULT_NAMESPACE: Final = "mocap"
+
+TF: Final = "/tf"
+MARKERS: Final = "markers"
+ANALOG: Final = "analog"
+"""The topics of markers and channels, below that of their source."""
+
+_MAX_LABEL_CHARS: Final = 48
+MAX_PART_CHARS: Final = 63
+"""How much of a label is kept, and the maximum length of a part, with a noun and a number.
+
+ROS accepts topics of at most 247 characters.
+"""
+
+
+def ros_name(text: str, noun: str) -> str:
+    """Return ``text`` as a part of a topic; ``noun`` begins it if it has no letter at its beginning.
+
+    "Left Foot" becomes Left_Foot, "2nd" with the noun tool becomes tool_2nd, "é" becomes e.
+    """
+    plain = "".join(each for each in unicodedata.normalize("NFKD", text) if not unicodedata.combining(each))
+    name = re.sub("[^A-Za-z0-9]+", "_", plain).strip("_")[:_MAX_LABEL_CHARS].rstrip("_")
+    if name and name[0].isdigit():
+        return f"{noun}_{name}"
+    return name or noun
+
+
+def unique_ros_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:
+    """Return a different part of a topic for each of the labels.
+
+    A name that an earlier label has gets _2, _3, …. A label without any usable character is called by its
+    position, such as tool_3.
+    """
+    names: dict[str, None] = {}
+    for position, label in enumerate(labels, start=1):
+        name = ros_name(label, noun)
+        if name == noun:
+            name = f"{noun}_{position}"
+        names[unique_name(name, names, MAX_PART_CHARS)] = None
+    return tuple(names)
+
+
+def pose_topic(tool: str) -> str:
+    """Return the topic of a tool, below that of its source; ``tool`` is one of ``unique_ros_names``."""
+    return f"{tool}/pose"
+
+
+def plate_name(number: int) -> str:
+    """Return the name of a force plate, counted from 1."""
+    return f"force_{number}"
+
+
+def wrench_topic(plate: str) -> str:
+    """Return the topic of a force plate, below that of its source."""
+    return f"{plate}/wrench"

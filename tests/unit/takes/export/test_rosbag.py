@@ -1,0 +1,132 @@
+"""Export to a bag of ROS 2, read by the package ``rosbags``."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from gateway.errors import SelectionError, TakeError
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import ForceChannel, Parameters, Parameters6D, ParametersForce, Plate, Tool
+from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes import open_take
+from gateway.takes.export.job import ExportJob
+from tests.support.takes import START_UTIME, frame, parameters, scene_messages
+from tests.unit.takes.export.exported import NAN, export_messages, labelled
+
+SCENE = SyntheticScene(markers=3, tools=2, analog=3, plates=2, rate_hz=100, analog_rate_hz=200)
+TYPES = {
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/mocap/lab/markers": "sensor_msgs/msg/PointCloud2",
+    "/mocap/lab/Tool_1/pose": "geometry_msgs/msg/PoseStamped",
+    "/mocap/lab/Tool_2/pose": "geometry_msgs/msg/PoseStamped",
+    "/mocap/lab/analog": "std_msgs/msg/Float32MultiArray",
+    "/mocap/lab/force_1/wrench": "geometry_msgs/msg/WrenchStamped",
+    "/mocap/lab/force_2/wrench": "geometry_msgs/msg/WrenchStamped",
+}
+
+
+class Bag:
+    """What rosbags reads: the type of each topic, and its messages with their times in ns."""
+
+    def __init__(self, path: Path) -> None:
+        self.messages: defaultdict[str, list[tuple[int, Any]]] = defaultdict(list)
+        with AnyReader([path]) as reader:
+            self.types = {each.topic: each.msgtype for each in reader.connections}
+            for connection, time_ns, raw in reader.messages():
+                message = reader.deserialize(raw, connection.msgtype)
+                self.messages[connection.topic].append((time_ns, message))
+
+
+def export(folder: Path, *messages: Any, **options: Any) -> tuple[Bag, ExportJob]:
+    job = export_messages(folder, messages, "out.mcap", is_for_ros2=True, **options)
+    return Bag(folder / "out.mcap"), job
+
+
+def triple(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def test_a_bag_has_the_values_of_the_take_in_the_units_of_ros(tmp_path: Path) -> None:
+    bag, job = export(tmp_path, parameters(SCENE.parameters), *scene_messages(SCENE, 20))
+    lab = open_take(tmp_path / "take.lcmlog").sources["lab"]
+    assert bag.types == TYPES
+    assert lab.markers is not None
+    assert lab.tools is not None
+    assert lab.analog is not None
+    assert lab.forces is not None
+    clouds = bag.messages["/mocap/lab/markers"]
+    points = np.stack([np.frombuffer(cloud.data, "<f4").reshape(-1, 5)[:, :3] for _, cloud in clouds])
+    assert np.allclose(points, lab.markers.positions / 1000, rtol=1e-6, equal_nan=True)
+    assert [time_ns for time_ns, _ in clouds] == (1000 * lab.markers.capture_utime).tolist()
+    stamps = [message.header.stamp for _, message in clouds]
+    assert [10**9 * stamp.sec + stamp.nanosec for stamp in stamps] == [time_ns for time_ns, _ in clouds]
+    poses = [message.pose for _, message in bag.messages["/mocap/lab/Tool_2/pose"]]
+    is_visible = lab.tools.is_visible[:, 1]
+    assert np.allclose([triple(pose.position) for pose in poses], lab.tools.positions[is_visible, 1] / 1000)
+    turned = [(*triple(pose.orientation), pose.orientation.w) for pose in poses]
+    assert np.allclose(turned, lab.tools.quaternions_xyzw[is_visible, 1])
+    transforms = [message.transforms for _, message in bag.messages["/tf"]]
+    assert [len(each) for each in transforms] == lab.tools.is_visible.sum(axis=1).tolist()
+    names = [(each.header.frame_id, each.child_frame_id) for each in transforms[0]]
+    assert names == [("lab", "lab/Tool_1"), ("lab", "lab/Tool_2")]
+    assert np.array_equal(
+        [message.data for _, message in bag.messages["/mocap/lab/analog"]], lab.analog.values
+    )
+    loads = [message.wrench for _, message in bag.messages["/mocap/lab/force_2/wrench"]]
+    values = [(*triple(load.force), *triple(load.torque)) for load in loads]
+    plates = SCENE.parameters.force
+    assert plates is not None
+    factors = [1.0] * 3 + [1e-3 if plates.plates[1].channels[3].unit == "Nmm" else 1.0] * 3
+    assert np.allclose(values, lab.forces.values[:, 1] * factors)
+    assert not job.notes
+
+
+def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
+    tools = Parameters(tools=Parameters6D(100.0, tuple(Tool(str(n), f"t{n}") for n in range(2))))
+    seen, lost = (1.0, 0.0, 0.0, 0.0, 10.0, 20.0, 30.0, 0.5), (NAN,) * 8
+    messages = [
+        frame(ComponentType.TOOLS, [seen, lost], 0),
+        frame(ComponentType.TOOLS, [lost, lost], 1),
+        frame(ComponentType.MARKERS, [(1.0, 2.0, 3.0, 0.0), (NAN, 2.0, 3.0, 0.0)], 0),
+        frame(ComponentType.FORCE, [(1.0, 2.0, 3.0, 4.0, 5.0, NAN)], 0),
+        frame(ComponentType.EVENT, [(1, 0, 0, 0, 0)], 0),
+        frame(ComponentType.ANALOG, [1.0], 0, utime=-START_UTIME),
+    ]
+    bag, job = export(tmp_path, parameters(tools), *messages)
+    assert {topic: len(found) for topic, found in bag.messages.items()} == {
+        "/mocap/lab/t0/pose": 1,
+        "/tf": 1,
+        "/mocap/lab/markers": 1,
+    }
+    points = np.frombuffer(bag.messages["/mocap/lab/markers"][0][1].data, "<f4").reshape(-1, 5)
+    assert np.array_equal(points[:, 0], np.array([1e-3, NAN], np.float32), equal_nan=True)
+    assert "events of lab were left out: 1" in job.notes
+    assert "messages from before 1970 or after 2106 in analog of lab were left out: 1" in job.notes
+
+
+def test_units_of_plates_are_converted_and_unknown_lengths_left_out(tmp_path: Path) -> None:
+    units = ("kN", "kN", "kN", "Nmm", "Nmm", "Nmm")
+    channels = tuple(ForceChannel(str(n), f"c{n}", unit) for n, unit in enumerate(units))
+    plate = Parameters(force=ParametersForce((Plate("1", channels=channels),)))
+    load = frame(ComponentType.FORCE, [(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)], 0)
+    bag, _ = export(tmp_path, parameters(plate), load)
+    [(_, message)] = bag.messages["/mocap/lab/force_1/wrench"]
+    assert triple(message.wrench.force) == (1000.0, 2000.0, 3000.0)
+    assert triple(message.wrench.torque) == pytest.approx((4e-3, 5e-3, 6e-3))
+    (tmp_path / "out.mcap").unlink()
+    _, job = export(
+        tmp_path, labelled("a", unit="furlong"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)]), load
+    )
+    assert "markers with the unknown unit 'furlong' of lab were left out: 1" in job.notes
+
+
+def test_a_bag_of_another_format_or_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SelectionError, match=r"no extension of a bag of ROS 2; choose \.mcap"):
+        export_messages(tmp_path, [labelled("a")], "out.c3d", is_for_ros2=True)
+    with pytest.raises(TakeError, match="has no markers, tools, analog channels or forces"):
+        export_messages(tmp_path, [labelled("a")], "out.mcap", is_for_ros2=True)
+    assert not (tmp_path / "out.mcap").exists()
