@@ -15,6 +15,7 @@ from gateway.errors import TakeError
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series, regular_step
+from gateway.takes.files.spool import pieces, release_pages
 from gateway.takes.files.take import TakeSource
 
 MAX_GAP_S: Final = 10.0
@@ -50,25 +51,68 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     least 1. Thus a server's clock that is a little fast or slow does no harm. If the time stamps do not
     progress (field note 25), or are not to be used, it is the difference of the sequence numbers.
     """
-    order = np.argsort(run.sequence, kind="stable")
-    order = order[np.concatenate([[True], np.diff(run.sequence[order]) > 0])]
-    sequence = run.sequence[order]
-    stamps = run.timestamp_us[order]
-    has_time_stamps = by_time_stamps and (len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5))
-    times = stamps if has_time_stamps else run.capture_utime[order]
-    period_us = regular_step(np.diff(times)[np.diff(sequence) == 1])
+    order = _by_sequence(run.sequence)
+    sequence, stamps, captures = run.sequence, run.timestamp_us, run.capture_utime
+    if order is not None:
+        sequence, stamps, captures = sequence[order], stamps[order], captures[order]
+    has_time_stamps = by_time_stamps and _mostly_progresses(stamps)
+    times = stamps if has_time_stamps else captures
+    period_us = _period_us(times, sequence)
     rate_hz = _rate_hz(period_us, run.rate_hz)
-    if has_time_stamps and period_us:
-        distances = np.diff(times) / period_us
-        steps = np.maximum(np.round(np.minimum(distances, 1e15)), 1).astype(np.int64)
-    else:
-        steps = np.diff(sequence)
-    cuts = np.flatnonzero(steps > MAX_GAP_S * rate_hz) + 1
-    rows = np.concatenate([[0], np.cumsum(np.where(steps > MAX_GAP_S * rate_hz, 1, steps))])
+    max_gap = MAX_GAP_S * rate_hz
+    rows = np.zeros(len(times), np.int32)
+    cuts: list[int] = []
+    newest = 0
+    for start, stop in pieces(len(times)):
+        near = slice(max(start - 1, 0), stop)
+        if has_time_stamps and period_us:
+            distances = np.diff(times[near]) / period_us
+            steps = np.maximum(np.round(np.minimum(distances, 1e15)), 1).astype(np.int64)
+        else:
+            steps = np.diff(sequence[near])
+        is_cut = steps > max_gap
+        first = near.start + 1
+        cuts += (np.flatnonzero(is_cut) + first).tolist()
+        found = newest + np.cumsum(np.where(is_cut, 1, steps), dtype=np.int64)
+        newest = int(found[-1]) if len(found) else newest
+        if newest > _MAX_INT32:
+            rows = rows.astype(np.int64)
+        rows[first:stop] = found
+    frames = np.arange(len(times), dtype=np.int32) if order is None else order
     return [
-        Grid(rate_hz, rows[start:stop] - rows[start], order[start:stop], times[start:stop], has_time_stamps)
-        for start, stop in zip([0, *cuts.tolist()], [*cuts.tolist(), len(order)], strict=True)
+        Grid(rate_hz, rows[start:stop] - rows[start], frames[start:stop], times[start:stop], has_time_stamps)
+        for start, stop in zip([0, *cuts], [*cuts, len(times)], strict=True)
     ]
+
+
+def _by_sequence(sequence: Array) -> Array | None:
+    """Return the indices of frames in the order of their numbers, each number once; None if they are so."""
+    if all((np.diff(sequence[max(start - 1, 0) : stop]) > 0).all() for start, stop in pieces(len(sequence))):
+        return None
+    order: Array = np.argsort(sequence, kind="stable")
+    is_new: Array = np.concatenate([[True], np.diff(sequence[order]) > 0])
+    return order[is_new]
+
+
+def _mostly_progresses(stamps: Array) -> bool:
+    """Return whether more than half of the time stamps are larger than the one before."""
+    num_larger = sum(
+        int((np.diff(stamps[max(start - 1, 0) : stop]) > 0).sum()) for start, stop in pieces(len(stamps))
+    )
+    return len(stamps) == 1 or num_larger > 0.5 * (len(stamps) - 1)
+
+
+def _period_us(times: Array, sequence: Array) -> float | None:
+    """Return the mean time between neighbouring frames; None if it is not known."""
+    means, counts = [], []
+    for start, stop in pieces(len(times)):
+        near = slice(max(start - 1, 0), stop)
+        steps = np.diff(times[near])[np.diff(sequence[near]) == 1]
+        mean = regular_step(steps)
+        if mean is not None:
+            means.append(mean)
+            counts.append(len(steps))
+    return float(np.average(means, weights=counts)) if means else None
 
 
 def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
@@ -83,6 +127,8 @@ def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
     rounded_hz = round(measured_hz)
     return float(rounded_hz) if abs(rounded_hz - measured_hz) <= 0.001 * measured_hz else measured_hz
 
+
+_MAX_INT32: Final = (1 << 31) - 1
 
 _SAME_CLOCK_S: Final = 0.2
 """Two time stamps are of the same measurement if they differ from the times of capture equally, within
@@ -130,6 +176,7 @@ class Placed:
         for part in self.parts:
             first, last = np.searchsorted(part.rows, [start, stop])
             block[part.rows[first:last] - start] = part.series.values[part.frames[first:last]]
+        release_pages()
         return block
 
 
