@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.messages.sequence_check import MAX_LATE
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
-from gateway.takes.files.spool import mapped, spool_file
+from gateway.takes.files.spool import append, mapped, spool_file
 
 HEAD: Final = np.dtype(
     [
@@ -118,10 +118,10 @@ class GrowingArray:
         num_bytes = stop * self._rows.dtype.itemsize * math.prod(self._rows.shape[1:])
         if self._file is None and self._spool_folder is not None and num_bytes > _IN_MEMORY_BYTES:
             self._file = spool_file(self._spool_folder)
-            self._file.write(self._rows[: self._num_rows].tobytes())
+            append(self._file, self._rows[: self._num_rows])
             self._resize(0)
         if self._file is not None:
-            self._file.write(rows.astype(self._rows.dtype, copy=False).tobytes())
+            append(self._file, rows.astype(self._rows.dtype, copy=False))
         else:
             if stop > len(self._rows):
                 self._resize(max(stop, int(len(self._rows) * _GROWTH)))

@@ -24,6 +24,14 @@ def spool_file(folder: Path) -> IO[bytes]:
     return tempfile.TemporaryFile(dir=folder)
 
 
+def append(file: IO[bytes], rows: npt.NDArray[Any]) -> None:
+    """Write rows to the end of a file. Raises OSError, which says that it is about a temporary file."""
+    try:
+        file.write(rows.tobytes())
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "a temporary file beside the new one") from error
+
+
 def mapped(file: IO[bytes], dtype: np.dtype[Any], shape: tuple[int, ...]) -> npt.NDArray[Any]:
     """Return what was written to a file as an array that cannot be changed; the file may be closed then."""
     file.flush()
