@@ -59,7 +59,7 @@ _Groups: TypeAlias = dict[str, _Group]
 _KEYS: Final = ("3d", "analog", "force")
 """The components that can be in a file; the first one that a source has gives the rate of the frames."""
 
-_BLOCK_VALUES: Final = 2_000_000  # values in memory at once: 8 MB
+_BLOCK_VALUES: Final = 500_000  # values in memory at once: 2 MB
 
 
 def export_c3d(job: ExportJob) -> None:

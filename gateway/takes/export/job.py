@@ -92,6 +92,7 @@ class ExportJob:
             from_s=self.from_s,
             to_s=self.to_s,
             progress=lambda done, total: self.progress(f"reading {self.take.name}", done, total),
+            spool_folder=self.out.parent,
         )
         if take.num_damaged:
             places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"

@@ -7,7 +7,7 @@ keep their places. The times of capture are not used: their jitter would bend th
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from gateway.errors import TakeError
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series, regular_step
+from gateway.takes.files.spool import pieces, release_pages
 from gateway.takes.files.take import TakeSource
 
 MAX_GAP_S: Final = 10.0
@@ -24,16 +25,20 @@ _TOLERANCE: Final = 0.02
 """How much the measured rate may differ from the announced one, as a part of it, to be the same rate."""
 
 
+_Frames: TypeAlias = Array | slice
+"""Indices of frames: of a recording without gaps, a slice, which takes no memory."""
+
+
 class Grid(NamedTuple):
     """Where frames of a series belong: ``rows`` has the row of each of ``frames``, which are indices.
 
-    Both have the shape (frames,) and are in order of time; no row occurs twice. ``times_us`` are the server's
-    time stamps of these frames (``has_time_stamps``), or their times of capture if the server sends none.
+    Both are in order of time; no row occurs twice. ``times_us`` are the server's time stamps of these frames
+    (``has_time_stamps``), or their times of capture if the server sends none.
     """
 
     rate_hz: float
     rows: Array
-    frames: Array
+    frames: _Frames
     times_us: Array
     has_time_stamps: bool
 
@@ -50,25 +55,77 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     least 1. Thus a server's clock that is a little fast or slow does no harm. If the time stamps do not
     progress (field note 25), or are not to be used, it is the difference of the sequence numbers.
     """
-    order = np.argsort(run.sequence, kind="stable")
-    order = order[np.concatenate([[True], np.diff(run.sequence[order]) > 0])]
-    sequence = run.sequence[order]
-    stamps = run.timestamp_us[order]
-    has_time_stamps = by_time_stamps and (len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5))
-    times = stamps if has_time_stamps else run.capture_utime[order]
-    period_us = regular_step(np.diff(times)[np.diff(sequence) == 1])
+    order = _by_sequence(run.sequence)
+    sequence, stamps, captures = run.sequence, run.timestamp_us, run.capture_utime
+    if order is not None:
+        sequence, stamps, captures = sequence[order], stamps[order], captures[order]
+    has_time_stamps = by_time_stamps and _mostly_progresses(stamps)
+    times = stamps if has_time_stamps else captures
+    period_us = _period_us(times, sequence)
     rate_hz = _rate_hz(period_us, run.rate_hz)
-    if has_time_stamps and period_us:
-        distances = np.diff(times) / period_us
-        steps = np.maximum(np.round(np.minimum(distances, 1e15)), 1).astype(np.int64)
-    else:
-        steps = np.diff(sequence)
-    cuts = np.flatnonzero(steps > MAX_GAP_S * rate_hz) + 1
-    rows = np.concatenate([[0], np.cumsum(np.where(steps > MAX_GAP_S * rate_hz, 1, steps))])
-    return [
-        Grid(rate_hz, rows[start:stop] - rows[start], order[start:stop], times[start:stop], has_time_stamps)
-        for start, stop in zip([0, *cuts.tolist()], [*cuts.tolist(), len(order)], strict=True)
-    ]
+    max_gap = MAX_GAP_S * rate_hz
+    rows = np.zeros(len(times), np.int32)
+    cuts: list[int] = []
+    newest = 0
+    for start, stop in pieces(len(times)):
+        near = slice(max(start - 1, 0), stop)
+        if has_time_stamps and period_us:
+            distances = np.diff(times[near]) / period_us
+            steps = np.maximum(np.round(np.minimum(distances, 1e15)), 1).astype(np.int64)
+        else:
+            steps = np.diff(sequence[near])
+        is_cut = steps > max_gap
+        first = near.start + 1
+        cuts += (np.flatnonzero(is_cut) + first).tolist()
+        found = newest + np.cumsum(np.where(is_cut, 1, steps), dtype=np.int64)
+        newest = int(found[-1]) if len(found) else newest
+        if newest > _MAX_INT32:
+            rows = rows.astype(np.int64)
+        rows[first:stop] = found
+    frames = slice(0, len(times)) if order is None else order
+    grids = []
+    for start, stop in zip([0, *cuts], [*cuts, len(times)], strict=True):
+        rows[start:stop] -= rows[start]
+        chosen = _some(frames, start, stop)
+        grids.append(Grid(rate_hz, rows[start:stop], chosen, times[start:stop], has_time_stamps))
+    return grids
+
+
+def _some(frames: _Frames, start: int, stop: int) -> _Frames:
+    """Return some of the frames: those at these places."""
+    return (
+        slice(frames.start + start, frames.start + stop) if isinstance(frames, slice) else frames[start:stop]
+    )
+
+
+def _by_sequence(sequence: Array) -> Array | None:
+    """Return the indices of frames in the order of their numbers, each number once; None if they are so."""
+    if all((np.diff(sequence[max(start - 1, 0) : stop]) > 0).all() for start, stop in pieces(len(sequence))):
+        return None
+    order: Array = np.argsort(sequence, kind="stable")
+    is_new: Array = np.concatenate([[True], np.diff(sequence[order]) > 0])
+    return order[is_new]
+
+
+def _mostly_progresses(stamps: Array) -> bool:
+    """Return whether more than half of the time stamps are larger than the one before."""
+    num_larger = sum(
+        int((np.diff(stamps[max(start - 1, 0) : stop]) > 0).sum()) for start, stop in pieces(len(stamps))
+    )
+    return len(stamps) == 1 or num_larger > 0.5 * (len(stamps) - 1)
+
+
+def _period_us(times: Array, sequence: Array) -> float | None:
+    """Return the mean time between neighbouring frames; None if it is not known."""
+    means, counts = [], []
+    for start, stop in pieces(len(times)):
+        near = slice(max(start - 1, 0), stop)
+        steps = np.diff(times[near])[np.diff(sequence[near]) == 1]
+        mean = regular_step(steps)
+        if mean is not None:
+            means.append(mean)
+            counts.append(len(steps))
+    return float(np.average(means, weights=counts)) if means else None
 
 
 def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
@@ -83,6 +140,8 @@ def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
     rounded_hz = round(measured_hz)
     return float(rounded_hz) if abs(rounded_hz - measured_hz) <= 0.001 * measured_hz else measured_hz
 
+
+_MAX_INT32: Final = (1 << 31) - 1
 
 _SAME_CLOCK_S: Final = 0.2
 """Two time stamps are of the same measurement if they differ from the times of capture equally, within
@@ -103,7 +162,7 @@ class Part(NamedTuple):
 
     series: Series
     rows: Array
-    frames: Array
+    frames: _Frames
 
 
 class Placed:
@@ -129,7 +188,8 @@ class Placed:
         block = np.full((stop - start, *self.series.values.shape[1:]), np.nan, np.float32)
         for part in self.parts:
             first, last = np.searchsorted(part.rows, [start, stop])
-            block[part.rows[first:last] - start] = part.series.values[part.frames[first:last]]
+            block[part.rows[first:last] - start] = part.series.values[_some(part.frames, first, last)]
+        release_pages()
         return block
 
 
@@ -170,10 +230,11 @@ class Measurement(NamedTuple):
         for grid in place(run, by_time_stamps=self.grid.has_time_stamps):
             first_row = self._row_of(run, grid, rows_per_row)
             if first_row is not None:
-                rows = grid.rows + first_row
+                rows = grid.rows
+                rows += first_row
                 first, last = np.searchsorted(rows, [0, stop])
                 if first < last:
-                    parts.append(Part(run, rows[first:last], grid.frames[first:last]))
+                    parts.append(Part(run, rows[first:last], _some(grid.frames, first, last)))
         return parts
 
     def seconds_of(self, times_us: Array, capture_utime: Array) -> Array:
@@ -182,7 +243,7 @@ class Measurement(NamedTuple):
         base_times, base_captures = self.grid.times_us, self.captures
         times = times_us if self.grid.has_time_stamps else capture_utime
         nearest = _nearest(base_times, times)
-        offset_us = (capture_utime - times) - (base_captures - base_times)[nearest]
+        offset_us = (capture_utime - times) - (base_captures[nearest] - base_times[nearest])
         belongs = (times >= base_times[0] - _MARGIN_US) & (times <= base_times[-1] + _MARGIN_US)
         belongs &= abs(offset_us) <= _SAME_CLOCK_S * _SECOND_US
         return np.where(belongs, (times - base_times[0]) / _SECOND_US, np.nan)
@@ -195,19 +256,23 @@ class Measurement(NamedTuple):
             times = grid.times_us
         else:
             times, base_times = captures, base_captures
-        overlap = np.flatnonzero(
-            (times >= base_times[0] - _MARGIN_US) & (times <= base_times[-1] + _MARGIN_US)
+        first_us, last_us = base_times[0] - _MARGIN_US, base_times[-1] + _MARGIN_US
+        is_near = np.concatenate(
+            [
+                (times[start:stop] >= first_us) & (times[start:stop] <= last_us)
+                for start, stop in pieces(len(times))
+            ]
         )
-        if not len(overlap):
+        if not is_near.any():
             return None
-        compared = overlap[np.linspace(0, len(overlap) - 1, _COMPARED).astype(np.int64)]
+        first, last = int(is_near.argmax()), len(times) - 1 - int(is_near[::-1].argmax())
+        compared = np.linspace(first, last, _COMPARED).astype(np.int64)
         nearest = _nearest(base_times, times[compared])
-        offsets_us = (captures - times)[compared] - (base_captures - base_times)[nearest]
+        offsets_us = captures[compared] - times[compared] - (base_captures[nearest] - base_times[nearest])
         if abs(np.median(offsets_us)) > _SAME_CLOCK_S * _SECOND_US:
             return None
         # The first frame within the measurement decides: differences of the clocks' rates cannot add up.
-        inside = np.flatnonzero(times >= base_times[0])
-        anchor = int(inside[0]) if len(inside) else int(overlap[-1])
+        anchor = next((index for index in range(first, last + 1) if times[index] >= base_times[0]), last)
         near = int(_nearest(base_times, times[anchor : anchor + 1])[0])
         period_us = _SECOND_US / (self.grid.rate_hz * rows_per_row)
         distance = round(float(times[anchor] - base_times[near]) / period_us)
@@ -282,8 +347,8 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 def seconds_of_row(measurement: Measurement, row: int) -> float:
     """Return when a row of a measurement was captured, in seconds since the beginning of the take."""
     base, grid = measurement.base, measurement.grid
-    is_first = grid.rows < max(_AVERAGED_S * grid.rate_hz, 1)
-    starts_s = base.seconds[grid.frames[is_first]] - grid.rows[is_first] / grid.rate_hz
+    num_first = int(np.searchsorted(grid.rows, max(_AVERAGED_S * grid.rate_hz, 1)))
+    starts_s = base.seconds_of(measurement.captures[:num_first]) - grid.rows[:num_first] / grid.rate_hz
     same_clock = abs(starts_s - starts_s[0]) <= _CLOCK_STEP_S
     return float(np.median(starts_s[same_clock])) + row / grid.rate_hz
 

@@ -1,7 +1,9 @@
 """Decoding many messages of one component at once with numpy, and finding where their numbers start again."""
 
+import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple, TypeAlias
+from pathlib import Path
+from typing import IO, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +11,7 @@ import numpy.typing as npt
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.messages.sequence_check import MAX_LATE
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
+from gateway.takes.files.spool import append, mapped, spool_file
 
 HEAD: Final = np.dtype(
     [
@@ -91,26 +94,50 @@ def _items(component: ComponentType, table: Array, num_items: int) -> Array:
 _GROWTH: Final = 1.125
 """How much more room each enlargement makes: what is not filled takes memory, too."""
 
+_IN_MEMORY_BYTES: Final = 4 * 1024 * 1024
+"""Larger arrays go to the disk, if there is a folder for them."""
+
 
 class GrowingArray:
-    """Rows of a fixed shape. The system enlarges large arrays by moving their pages, not their content."""
+    """Rows of a fixed shape. The system enlarges large arrays by moving their pages, not their content.
 
-    def __init__(self, dtype: np.dtype[Any], row_shape: tuple[int, ...] = ()) -> None:
+    With a ``spool_folder``, a large one is in a temporary file there, and takes no memory.
+    """
+
+    def __init__(
+        self, dtype: np.dtype[Any], row_shape: tuple[int, ...] = (), spool_folder: Path | None = None
+    ) -> None:
         self._rows: Array = np.empty((0, *row_shape), dtype)
         self._num_rows = 0
+        self._spool_folder = spool_folder
+        self._file: IO[bytes] | None = None
 
     def extend(self, rows: Array) -> None:
-        """Append rows; they are converted to the dtype."""
+        """Append rows; they are converted to the dtype. Raises OSError if there is no room on the disk."""
         stop = self._num_rows + len(rows)
-        if stop > len(self._rows):
-            self._resize(max(stop, int(len(self._rows) * _GROWTH)))
-        self._rows[self._num_rows : stop] = rows
+        num_bytes = stop * self._rows.dtype.itemsize * math.prod(self._rows.shape[1:])
+        if self._file is None and self._spool_folder is not None and num_bytes > _IN_MEMORY_BYTES:
+            self._file = spool_file(self._spool_folder)
+            append(self._file, self._rows[: self._num_rows])
+            self._resize(0)
+        if self._file is not None:
+            append(self._file, rows.astype(self._rows.dtype, copy=False))
+        else:
+            if stop > len(self._rows):
+                self._resize(max(stop, int(len(self._rows) * _GROWTH)))
+            self._rows[self._num_rows : stop] = rows
         self._num_rows = stop
 
     def take(self) -> Array:
-        """Return the rows, and forget them."""
-        self._resize(self._num_rows)
-        rows, self._rows, self._num_rows = self._rows, self._rows[:0].copy(), 0
+        """Return the rows, and forget them. Those on the disk cannot be changed."""
+        if self._file is not None:
+            with self._file as file:
+                rows = mapped(file, self._rows.dtype, (self._num_rows, *self._rows.shape[1:]))
+            self._file = None
+        else:
+            self._resize(self._num_rows)
+            rows, self._rows = self._rows, self._rows[:0].copy()
+        self._num_rows = 0
         return rows
 
     def _resize(self, num_rows: int) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,8 +24,12 @@ from gateway.takes.files.component_rows import (
     find_restarts,
 )
 from gateway.takes.files.row import ItemValues
+from gateway.takes.files.spool import pieces
 
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
+
+_NEIGHBOURS: Final = 20
+"""How many rows beside two tell whether something starts again between them; some may have no time stamp."""
 
 _MAX_PADDING: Final = 4
 """How many times as large as what was recorded ``items`` may become, when the labels change."""
@@ -102,6 +107,7 @@ class Series(ItemValues):
         recorded: dict[int, Array],
         parameters: Sequence[ParametersEntry],
         start_utime: int,
+        entries: Array | None = None,
     ) -> None:
         self.component = component
         self.key = component.key
@@ -112,7 +118,11 @@ class Series(ItemValues):
         for name in _COLUMNS:
             setattr(self, name, columns[name])
         self._num_items = columns["num_items"]
-        self._entries = _entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
+        self._entries = (
+            _entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
+            if entries is None
+            else entries
+        )
 
     def __len__(self) -> int:
         """Return the number of frames (of events: the number of events)."""
@@ -231,11 +241,7 @@ class Series(ItemValues):
         """
         if not len(self):
             return []
-        restarts = find_restarts(self.utime, self.sequence, self.timestamp_us, self.frame_number)
-        is_start = (np.diff(self.session) != 0) | restarts.sequence | restarts.server
-        if self.component is not ComponentType.EVENT:
-            is_start |= np.diff(self._layout_numbers()) != 0
-        starts = [0, *(np.flatnonzero(is_start) + 1).tolist(), len(self)]
+        starts = [0, *self._starts(), len(self)]
         before = dict.fromkeys(self._recorded, 0)
         runs = []
         for start, stop in pairwise(starts):
@@ -244,8 +250,27 @@ class Series(ItemValues):
             before[num_items] += stop - start
             recorded = {num_items: self._recorded[num_items][first : before[num_items]]}
             columns = {name: values[start:stop] for name, values in self._columns.items()}
-            runs.append(Series(self.component, columns, recorded, self._parameters, self.start_utime))
+            entries = self._entries[start:stop]
+            runs.append(
+                Series(self.component, columns, recorded, self._parameters, self.start_utime, entries)
+            )
         return runs
+
+    def _starts(self) -> list[int]:
+        """Return the rows but the first with which a run begins."""
+        starts: list[int] = []
+        for start, stop in pieces(len(self)):
+            # What happens between two rows is told from them and their neighbours.
+            near = slice(max(start - _NEIGHBOURS, 0), stop + _NEIGHBOURS)
+            restarts = find_restarts(
+                self.utime[near], self.sequence[near], self.timestamp_us[near], self.frame_number[near]
+            )
+            is_start = (np.diff(self.session[near]) != 0) | restarts.sequence | restarts.server
+            if self.component is not ComponentType.EVENT:
+                is_start |= np.diff(self._layout_numbers(near)) != 0
+            found = np.flatnonzero(is_start) + near.start + 1
+            starts += found[(found > start) & (found <= stop) & (found < len(self))].tolist()
+        return starts
 
     def without_empty_frames(self) -> "Series":
         """Return the frames that have items; all frames if none has."""
@@ -259,31 +284,37 @@ class Series(ItemValues):
     @cached_property
     def _layouts(self) -> dict[tuple[int, int], Description]:
         """What describes rows, by index in ``_parameters`` and number of items, as they appear."""
-        pairs = np.stack([self._entries, self._num_items], axis=1)
-        unique, first = np.unique(pairs, axis=0, return_index=True)
-        layouts = {}
-        for entry, num_items in unique[np.argsort(first)].tolist():
-            parameters = self._parameters[entry].parameters if entry >= 0 else None
-            layouts[entry, num_items] = describe(self.component, parameters, num_items)
+        layouts: dict[tuple[int, int], Description] = {}
+        for start, stop in pieces(len(self)):
+            pairs = np.stack([self._entries[start:stop], self._num_items[start:stop]], axis=1)
+            unique, first = np.unique(pairs, axis=0, return_index=True)
+            for entry, num_items in unique[np.argsort(first)].tolist():
+                if (entry, num_items) not in layouts:
+                    parameters = self._parameters[entry].parameters if entry >= 0 else None
+                    layouts[entry, num_items] = describe(self.component, parameters, num_items)
         return layouts
 
-    def _layout_numbers(self) -> Array:
-        """Return a number for each row; rows with the same number have the same description."""
+    def _layout_numbers(self, rows: slice) -> Array:
+        """Return a number for each of some rows; rows with the same number have the same description."""
         numbers: dict[Description, int] = {}
-        result = np.zeros(len(self), np.int64)
-        for (entry, num_items), layout in self._layouts.items():
+        entries, num_items = self._entries[rows], self._num_items[rows]
+        result = np.zeros(len(entries), np.int64)
+        for (entry, count), layout in self._layouts.items():
             number = numbers.setdefault(layout, len(numbers))
             if number:
-                result[(self._entries == entry) & (self._num_items == num_items)] = number
+                result[(entries == entry) & (num_items == count)] = number
         return result
 
 
 class SeriesBuilder:
-    """Collects the messages of one component."""
+    """Collects the messages of one component; large arrays are on the disk if there is a ``spool_folder``."""
 
-    def __init__(self, component: ComponentType) -> None:
+    def __init__(self, component: ComponentType, spool_folder: Path | None = None) -> None:
         self._component = component
-        self._columns = {name: GrowingArray(HEAD[name].newbyteorder("=")) for name in _COLUMNS}
+        self._spool_folder = spool_folder
+        self._columns = {
+            name: GrowingArray(HEAD[name].newbyteorder("="), (), spool_folder) for name in _COLUMNS
+        }
         self._items: dict[int, GrowingArray] = {}
 
     def add(self, rows: Rows) -> None:
@@ -304,7 +335,7 @@ class SeriesBuilder:
         for num_items, values in items.items():
             if num_items not in self._items:
                 dtype = NATIVE_ITEM_DTYPES[self._component]
-                self._items[num_items] = GrowingArray(dtype, (num_items,))
+                self._items[num_items] = GrowingArray(dtype, (num_items,), self._spool_folder)
             self._items[num_items].extend(values)
 
     def build(self, parameters: Sequence[ParametersEntry], start_utime: int) -> Series | None:
@@ -334,20 +365,18 @@ def _entries_of_rows(utime: Array, version: Array, parameters: Sequence[Paramete
     Versions start again with the gateway. Of several parameters with the version of a row, the newest that
     are older than the row describe it, or else the first.
     """
-    entries = np.full(len(utime), -1, np.int64)
+    entries = np.full(len(utime), -1, np.min_scalar_type(-len(parameters) - 1))
     by_version: dict[int, list[int]] = {}
-    for index, entry in enumerate(parameters):
-        by_version.setdefault(entry.version, []).append(index)
-    for number in np.unique(version).tolist():
-        indices = by_version.get(number, [])
-        if not indices:
-            continue
-        rows = version == number
-        if len(indices) == 1:
-            entries[rows] = indices[0]
-            continue
-        indices.sort(key=lambda index: parameters[index].utime)
-        times = np.array([parameters[index].utime for index in indices], np.int64)
-        found = np.searchsorted(times, utime[rows], side="right") - 1
-        entries[rows] = np.array(indices, np.int64)[np.maximum(found, 0)]
+    for index in sorted(range(len(parameters)), key=lambda index: parameters[index].utime):
+        by_version.setdefault(parameters[index].version, []).append(index)
+    for start, stop in pieces(len(utime)):
+        versions = version[start:stop]
+        for number in np.unique(versions).tolist():
+            indices = by_version.get(number, [])
+            if not indices:
+                continue
+            rows = np.flatnonzero(versions == number) + start
+            times = np.array([parameters[index].utime for index in indices], np.int64)
+            found = np.searchsorted(times, utime[rows], side="right") - 1
+            entries[rows] = np.array(indices)[np.maximum(found, 0)]
     return entries

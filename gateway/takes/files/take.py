@@ -83,6 +83,7 @@ def open_take(
     from_s: float | None = None,
     to_s: float | None = None,
     progress: Callable[[int, int], object] | None = None,
+    spool_folder: Path | None = None,
 ) -> Take:
     """Read a take (an event log, or the folder of a saved take) into numpy arrays.
 
@@ -99,7 +100,8 @@ def open_take(
     ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
     and ``to_s`` the time of the events, in seconds from the first event of the take; what comes after
     ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
-    much memory as their part of the file. Damage is skipped and counted. Raises TakeError if there is
+    much memory as their part of the file, unless there is a ``spool_folder``: then large ones are in
+    temporary files there, and cannot be changed. Damage is skipped and counted. Raises TakeError if there is
     no take, and SelectionError, a TakeError, if a source or component is not in it.
     """
     unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
@@ -108,7 +110,7 @@ def open_take(
     reader = TakeReader(Path(path))
     first_utime = -math.inf if from_s is None else reader.start_utime + from_s * 1e6
     end_utime = math.inf if to_s is None else reader.start_utime + to_s * 1e6
-    loader = TakeLoader(sources, COMPONENTS_BY_KEY.keys() if components is None else components)
+    loader = TakeLoader(sources, COMPONENTS_BY_KEY.keys() if components is None else components, spool_folder)
     for batches in reader.batches():
         for batch in batches:
             loader.add(batch, first_utime, end_utime)
@@ -127,10 +129,15 @@ def open_take(
 
 
 class TakeLoader:
-    """Collects the messages of a take."""
+    """Collects the messages of a take; large arrays are on the disk if there is a ``spool_folder``."""
 
-    def __init__(self, sources: Collection[str] | None, components: Collection[str]) -> None:
-        self._wanted, self._components = sources, components
+    def __init__(
+        self,
+        sources: Collection[str] | None,
+        components: Collection[str],
+        spool_folder: Path | None = None,
+    ) -> None:
+        self._wanted, self._components, self._spool_folder = sources, components, spool_folder
         self._sources: dict[str, TakeSource] = {}
         self._histories: dict[str, ParametersHistory] = {}  # by source
         self._builders: dict[tuple[str, str], SeriesBuilder] = {}
@@ -150,7 +157,7 @@ class TakeLoader:
                 source.malformed[batch.key] += rows.malformed
             builder = self._builders.get((source.name, batch.key))
             if builder is None:
-                builder = SeriesBuilder(COMPONENTS_BY_KEY[batch.key])
+                builder = SeriesBuilder(COMPONENTS_BY_KEY[batch.key], self._spool_folder)
                 self._builders[source.name, batch.key] = builder
             builder.add(rows)
         elif batch.key in ("take", "details", "status", "parameters"):

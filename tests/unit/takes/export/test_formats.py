@@ -9,6 +9,7 @@ import pytest
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
+from gateway.takes.files import component_rows, spool
 from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, scene_messages
 from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled
 from tests.unit.takes.export.test_trc import read_trc
@@ -103,3 +104,37 @@ def test_a_c3d_file_counts_from_its_first_frame_and_says_when_that_was(
     assert later.total_seconds() == pytest.approx(first, abs=0.01)
     pattern = rf"walk\.c3d: time 0 is its first frame, {first:.1f}\d\d s after .* \({text}\)"
     assert sum(bool(re.fullmatch(pattern, note)) for note in notes) == 1
+
+
+@pytest.mark.parametrize("extension", [".c3d", ".trc"])
+def test_a_take_that_does_not_fit_into_memory_becomes_the_same_file(
+    tmp_path: Path, extension: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are missing, overtaken and repeated, a measurement begins anew, and labels change."""
+    described = parameters(SCENE.parameters)
+    frames = [described, *scene_messages(SCENE, 120)]
+    del frames[200:210]
+    frames[50], frames[60] = frames[60], frames[50]
+    frames += [*frames[400:420], labelled("a", "b", version=2)]
+    frames += [markers(2, 5000 + number, version=2, timestamp_us=number * 10_000) for number in range(40)]
+    in_memory = export_messages(tmp_path, frames, f"memory{extension}")
+    monkeypatch.setattr(component_rows, "_IN_MEMORY_BYTES", 100)
+    monkeypatch.setattr(spool, "_PIECE_ROWS", 7)
+    on_disk = export_messages(tmp_path, frames, f"memory2{extension}")
+    assert len(in_memory.files.paths) > 1
+    for expected, found in zip(in_memory.files.paths, on_disk.files.paths, strict=True):
+        assert found.read_bytes() == expected.read_bytes().replace(b"memory", b"memory2")
+    assert [note.replace("memory2", "memory") for note in on_disk.notes] == in_memory.notes
+
+
+def test_a_full_disk_for_what_does_not_fit_into_memory_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(component_rows, "_IN_MEMORY_BYTES", 100)
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        monkeypatch.setattr(component_rows, "spool_file", lambda _folder: full)
+        with pytest.raises(
+            TakeError, match=r"^a temporary file beside the new one cannot be written: No space left"
+        ):
+            export_messages(tmp_path, messages(), "walk.trc")
+    assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
