@@ -4,7 +4,6 @@ Every mistake is reported with its position.
 """
 
 import json
-import logging
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -31,10 +30,8 @@ from gateway.config.settings import OutputSettings, Settings
 from gateway.config.words import find_secrets, replace_item
 from gateway.errors import ConfigError
 
-logger = logging.getLogger(__name__)
-
-_RENAMED: Final = {("metrics", "address"): "host"}
-"""The sections and keys of earlier versions that are accepted, with their new names."""
+_OLD_KEYS: Final[dict[Location, str]] = {("metrics", "address"): "write host instead"}
+"""The keys of earlier versions that no longer exist, and what to do about each."""
 
 AnySection = TypeVar("AnySection", bound=Section)
 
@@ -89,8 +86,6 @@ def _configuration(
     document: Document, model: type[Settings], folder: Path, environ: Mapping[str, str]
 ) -> Configuration:
     apply_overrides(document, environ)
-    for (section, old), new in _RENAMED.items():
-        _rename(document, section, old, new)
     mistakes = [
         mistake
         for name, field in model.model_fields.items()
@@ -105,21 +100,6 @@ def _configuration(
     if mistakes:
         raise _in_order(mistakes)
     return Configuration(settings, document.positions)
-
-
-def _rename(document: Document, section: str, old: str, new: str) -> None:
-    """Give a value its new key, and log that. A variable with the old name overrides the file, as others."""
-    values = document.values.get(section) if isinstance(document.values, dict) else None
-    if not isinstance(values, dict) or old not in values:
-        return
-    position = document.positions[section, old]
-    if new in values and (position.line or not document.positions[section, new].line):
-        return  # validation reports the old key as unknown
-    logger.warning("%s: %s.%s is now called %s.%s; use the new name", position, section, old, section, new)
-    values[new] = values.pop(old)
-    document.positions[section, new] = document.positions.pop((section, old))
-    if (section, old) in document.key_positions:
-        document.key_positions[section, new] = document.key_positions.pop((section, old))
 
 
 def _read_file(path: Path, section: type[Section], example: str) -> Document:
@@ -165,6 +145,8 @@ def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
     ]
     for details in error.errors(include_url=False):
         location, text = details["loc"], details["msg"]
+        if location in _OLD_KEYS:
+            text = f"a key of earlier versions; {_OLD_KEYS[location]}"
         position = document.key_positions.get(location) if details["type"] == UNKNOWN_KEY else None
         position = position or document.nearest_position(location)
         names = {name for place, name in variables if place[: len(location)] == location}
