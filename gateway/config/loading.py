@@ -29,6 +29,8 @@ from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import OutputSettings, Settings
 from gateway.config.words import find_secrets, replace_item
 from gateway.errors import ConfigError
+from gateway.rtc3d.commands import AllFrames
+from gateway.rtc3d.components import WIRE_ORDER
 
 _OLD_KEYS: Final[dict[Location, str]] = {("metrics", "address"): "write host instead"}
 """The keys of earlier versions that no longer exist, and what to do about each."""
@@ -264,8 +266,13 @@ def _flow(value: Any) -> str:
 _DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 
 
-class _WithoutTitles(GenerateJsonSchema):
-    """Omits the titles of keys, which only repeat the key."""
+class _SchemaGenerator(GenerateJsonSchema):
+    """Writes defaults as in YAML, and omits the titles of keys, which only repeat the key."""
+
+    def encode_default(self, dft: Any) -> Any:
+        if dft == WIRE_ORDER:
+            return [component.key for component in WIRE_ORDER]
+        return "all" if isinstance(dft, AllFrames) else super().encode_default(dft)
 
     def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002 - no key has one
         return False
@@ -273,5 +280,5 @@ class _WithoutTitles(GenerateJsonSchema):
 
 def schema_text(model: type[Settings]) -> str:
     """Return the JSON schema of ``model``, the content of ``config/gateway.schema.json``."""
-    schema = model.model_json_schema(schema_generator=_WithoutTitles)
+    schema = model.model_json_schema(schema_generator=_SchemaGenerator)
     return json.dumps({"$schema": _DIALECT, **schema, "title": "RTC3D gateway"}, indent=2) + "\n"
