@@ -47,6 +47,9 @@ QUERIES: Final = (
 )
 """What programs may ask: all keys and options, and questions with an error for an answer."""
 
+PATIENCE_S: Final = 30.0
+"""What is received takes a fifth of it."""
+
 _TOOL_POSES: Final = {"enabled": True, "tool_poses": True}
 
 
@@ -120,7 +123,7 @@ async def observe(
 async def published(lab: Lab, keys: Collection[str], channels: Collection[str]) -> dict[str, Any]:
     """Return the encodings of all keys on Zenoh, and the types on all channels of LCM.
 
-    Waits until each of ``keys`` and ``channels`` has had a message.
+    Waits until each of ``keys`` and ``channels`` has had a message, at most PATIENCE_S.
     """
     encodings: dict[str, str] = {}
     payloads: dict[str, bytes] = {}
@@ -158,7 +161,8 @@ async def published(lab: Lab, keys: Collection[str], channels: Collection[str]) 
         command.num_options = len(command.options)
         receivers[1].publish("MOCAP_LAB_PARAMETERS_REQUEST", parameters.encode())
         receivers[1].publish("MOCAP_LAB_COMMAND_REQUEST", command.encode())
-        await wait_until_async(is_complete)
+        with contextlib.suppress(AssertionError):  # the test says what is missing
+            await wait_until_async(is_complete, PATIENCE_S)
         tokens = await asyncio.to_thread(lambda: list(peer.liveliness().get("mocap/lab/*", timeout=10)))
     return {
         "keys": encodings,
@@ -188,15 +192,10 @@ async def printed(lab: Lab) -> dict[str, Any]:
     """Return what each command with ``--json`` prints, by the command, and the health check."""
 
     async def echo(*options: str) -> dict[str, Any]:
-        """Return the lines of each key that differ in more than their values."""
+        """Return the last line of each key. Whether there are parameters depends on other subscribers."""
         done = await run("echo", "--json", *options, *lab.zenoh)
-        found: dict[str, list[Any]] = {}
-        for line in map(json.loads, done.stdout.splitlines()):
-            lines = found.setdefault(line["key"], [])
-            if kinds(line) not in map(kinds, lines):
-                lines.append(line)
-        found.pop("mocap/lab/parameters", None)  # whether there are any depends on other subscribers
-        return found
+        lines = [json.loads(line) for line in done.stdout.splitlines()]
+        return {line["key"]: line for line in lines if line["key"] != "mocap/lab/parameters"}
 
     async def takes() -> dict[str, Any]:
         steps = {"start": ("walk",), "stop": (), "save": ("kept",), "list": ()}  # in this order
@@ -209,9 +208,9 @@ async def printed(lab: Lab) -> dict[str, Any]:
             return json.load(page)
 
     outputs: dict[str, Awaitable[Any]] = {
-        # Each as long as the take, in which markers and tools are sometimes out of view.
+        # As long as the take, so that there are events.
         "echo": echo("--last", "60", "--seconds", "1.3"),
-        "echo 6d/*": echo("--component", "6d/*", "--count", "13"),
+        "echo 6d/*": echo("--component", "6d/*", "--count", "1"),
         "echo --hz": lab.json("echo", "--hz", "--count", "1", "--component", "3d", *lab.zenoh),
         "list": lab.json("list", *lab.zenoh),
         "top": lab.json("top", "--once", *lab.zenoh),
@@ -228,7 +227,10 @@ async def printed(lab: Lab) -> dict[str, Any]:
 
 
 async def received(lab: Lab, wanted: Collection[str]) -> dict[str, dict[str, Any]]:
-    """Return what the subscriber of 1.0 decodes, by ``moment``, until it has all that is ``wanted``."""
+    """Return what the subscriber of 1.0 decodes, by ``moment``, until it has all that is ``wanted``.
+
+    It waits PATIENCE_S at most.
+    """
     port = lab.url.partition("?")[0].rpartition(":")[2]
     found: dict[str, dict[str, Any]] = {}
     process = await asyncio.create_subprocess_exec(
@@ -236,10 +238,12 @@ async def received(lab: Lab, wanted: Collection[str]) -> dict[str, dict[str, Any
     )
     assert process.stdout is not None
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE_S):
             while not found.keys() >= set(wanted):
                 values = json.loads(await process.stdout.readline())
                 found[moment(values)] = values
+    except TimeoutError:
+        pass  # the test says what is missing
     finally:
         process.kill()
         await process.wait()

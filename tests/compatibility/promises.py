@@ -26,8 +26,11 @@ from gateway.config.loading import schema_text
 from tests.support.configurations import MODEL
 from tests.support.documents import ROOT
 
-VERSIONS: Final = sorted(Path(__file__).parent.glob(f"{__version__.split('.', maxsplit=1)[0]}.*"))
-"""The folders of the versions that this one is compatible with: those with the same first number."""
+ALL_VERSIONS: Final = sorted(Path(__file__).parent.glob("[0-9]*.*"))
+"""The folders of all versions: their takes can always be read."""
+
+VERSIONS: Final = [each for each in ALL_VERSIONS if each.name.split(".")[0] == __version__.split(".")[0]]
+"""Those that this version is compatible with: they have the same first number."""
 
 PUBLIC: Final = {
     "gateway.client": {

@@ -21,7 +21,7 @@ from gateway.takes.files.event_log import EventLogReader
 from tests.compatibility import record
 from tests.compatibility.comparing import broken, broken_schema
 from tests.compatibility.lab import SUBSCRIBER
-from tests.compatibility.promises import PROMISES, VERSIONS, configuration, recorded
+from tests.compatibility.promises import ALL_VERSIONS, PROMISES, VERSIONS, configuration, recorded
 from tests.support.commands import run_in_process
 from tests.support.configurations import load
 
@@ -78,7 +78,7 @@ def messages_of(take: Path) -> Iterator[dict[str, Any]]:
             yield {"channel": event.channel} | values
 
 
-@each_version
+@pytest.mark.parametrize("version", ALL_VERSIONS, ids=lambda path: path.name)
 def test_a_take_has_the_arrays_that_it_had(version: Path) -> None:
     """Recordings are kept for decades."""
     by_type = defaultdict(list)
