@@ -34,16 +34,8 @@ QUERIES: Final = (
     *("parameters/general", "parameters/3d?format=xml", "parameters/6d", "parameters/analog?format=json"),
     *("parameters/force", "parameters/events", "3d", "3d?format=json", "6d", "analog", "force?format=lcm"),
     *("event", "status", "status?format=json", "3d?from=0;to=3", "6d?last_s=1", "clock?last_s=10", "history"),
-    *(
-        "status?since_utime=1",
-        "6d/Tool%201?last_s=1",
-        "frame",
-        "schema/markers_t",
-        "take",
-        "c3d",
-        "recording",
-    ),
-    *("parameters/4d", "take?set=start;name=a/b", "recording?set=stop"),
+    *("status?since_utime=1", "6d/Tool%201?last_s=1", "frame", "schema/markers_t", "take", "c3d"),
+    *("recording", "parameters/4d", "take?set=start;name=a/b", "recording?set=stop"),
 )
 """What programs may ask: all keys and options, and questions with an error for an answer."""
 

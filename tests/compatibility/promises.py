@@ -26,8 +26,10 @@ from gateway.config.loading import schema_text
 from tests.support.configurations import MODEL
 from tests.support.documents import ROOT
 
-ALL_VERSIONS: Final = sorted(Path(__file__).parent.glob("[0-9]*.*"))
-"""The folders of all versions: their takes can always be read."""
+ALL_VERSIONS: Final = sorted(
+    Path(__file__).parent.glob("[0-9]*.*"), key=lambda path: [int(number) for number in path.name.split(".")]
+)
+"""The folders of all versions, the oldest first: their takes can always be read."""
 
 VERSIONS: Final = [each for each in ALL_VERSIONS if each.name.split(".")[0] == __version__.split(".")[0]]
 """Those that this version is compatible with: they have the same first number."""

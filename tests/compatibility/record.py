@@ -35,7 +35,7 @@ _TAKE_S: Final = 1.2
 """Long enough for the press and the release of a button.
 
 When the take is played again, the server's time starts again before the gateway has a model of its clock
-(1.5 s). So what depends on it is always null, and not sometimes.
+(1.5 s). So no value depends on whether there is one yet.
 """
 
 _KEYS: Final = (
