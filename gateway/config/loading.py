@@ -4,7 +4,6 @@ Every mistake is reported with its position.
 """
 
 import json
-import logging
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -30,11 +29,11 @@ from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import OutputSettings, Settings
 from gateway.config.words import find_secrets, replace_item
 from gateway.errors import ConfigError
+from gateway.rtc3d.commands import AllFrames
+from gateway.rtc3d.components import WIRE_ORDER
 
-logger = logging.getLogger(__name__)
-
-_RENAMED: Final = {("metrics", "address"): "host"}
-"""The sections and keys of earlier versions that are accepted, with their new names."""
+_OLD_KEYS: Final[dict[Location, str]] = {("metrics", "address"): "write host instead"}
+"""The keys of earlier versions that no longer exist, and what to do about each."""
 
 AnySection = TypeVar("AnySection", bound=Section)
 
@@ -89,8 +88,6 @@ def _configuration(
     document: Document, model: type[Settings], folder: Path, environ: Mapping[str, str]
 ) -> Configuration:
     apply_overrides(document, environ)
-    for (section, old), new in _RENAMED.items():
-        _rename(document, section, old, new)
     mistakes = [
         mistake
         for name, field in model.model_fields.items()
@@ -105,21 +102,6 @@ def _configuration(
     if mistakes:
         raise _in_order(mistakes)
     return Configuration(settings, document.positions)
-
-
-def _rename(document: Document, section: str, old: str, new: str) -> None:
-    """Give a value its new key, and log that. A variable with the old name overrides the file, as others."""
-    values = document.values.get(section) if isinstance(document.values, dict) else None
-    if not isinstance(values, dict) or old not in values:
-        return
-    position = document.positions[section, old]
-    if new in values and (position.line or not document.positions[section, new].line):
-        return  # validation reports the old key as unknown
-    logger.warning("%s: %s.%s is now called %s.%s; use the new name", position, section, old, section, new)
-    values[new] = values.pop(old)
-    document.positions[section, new] = document.positions.pop((section, old))
-    if (section, old) in document.key_positions:
-        document.key_positions[section, new] = document.key_positions.pop((section, old))
 
 
 def _read_file(path: Path, section: type[Section], example: str) -> Document:
@@ -165,6 +147,8 @@ def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
     ]
     for details in error.errors(include_url=False):
         location, text = details["loc"], details["msg"]
+        if location in _OLD_KEYS:
+            text = f"a key of earlier versions; {_OLD_KEYS[location]}"
         position = document.key_positions.get(location) if details["type"] == UNKNOWN_KEY else None
         position = position or document.nearest_position(location)
         names = {name for place, name in variables if place[: len(location)] == location}
@@ -282,8 +266,13 @@ def _flow(value: Any) -> str:
 _DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 
 
-class _WithoutTitles(GenerateJsonSchema):
-    """Omits the titles of keys, which only repeat the key."""
+class _SchemaGenerator(GenerateJsonSchema):
+    """Writes defaults as in YAML, and omits the titles of keys, which only repeat the key."""
+
+    def encode_default(self, dft: Any) -> Any:
+        if dft == WIRE_ORDER:
+            return [component.key for component in WIRE_ORDER]
+        return "all" if isinstance(dft, AllFrames) else super().encode_default(dft)
 
     def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002 - no key has one
         return False
@@ -291,5 +280,5 @@ class _WithoutTitles(GenerateJsonSchema):
 
 def schema_text(model: type[Settings]) -> str:
     """Return the JSON schema of ``model``, the content of ``config/gateway.schema.json``."""
-    schema = model.model_json_schema(schema_generator=_WithoutTitles)
+    schema = model.model_json_schema(schema_generator=_SchemaGenerator)
     return json.dumps({"$schema": _DIALECT, **schema, "title": "RTC3D gateway"}, indent=2) + "\n"

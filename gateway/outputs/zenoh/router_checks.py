@@ -139,7 +139,8 @@ def check_links(before: RouterNetwork, after: RouterNetwork, gateways: Iterable[
     findings = {}
     for gateway in gateways:
         way = after.way_from(gateway) or []
-        for router, next_zid in zip(way, [*(each.zid for each in way[1:]), after.own], strict=True):
+        zids = [*(each.zid for each in way), after.own]
+        for router, next_zid in zip(way, zids[1:], strict=True):
             former = before.routers.get(router.zid, router).dropped.get(next_zid)
             dropped = router.dropped.get(next_zid)
             if former is None or dropped is None:

@@ -124,18 +124,13 @@ def test_a_mistake_is_told_with_its_place(file: Path, line: str, error: str) -> 
     assert found.startswith(error)
 
 
-def test_the_old_name_of_a_key_is_accepted_with_a_note(file: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """metrics.address became metrics.host, as in all other sections."""
-    file.write_text(f"{SERVER}metrics: {{address: 0.0.0.0}}\n")
-    configuration = read(file, MODEL, {})
-    assert configuration.settings.metrics.host == "0.0.0.0"  # noqa: S104
-    assert ("metrics", "host") in configuration.positions
-    assert "metrics.address is now called metrics.host; use the new name" in caplog.text
-    variable = {"RTC3D_GATEWAY__METRICS__ADDRESS": "127.0.0.2"}
-    file.write_text(f"{SERVER}metrics: {{host: 0.0.0.0}}\n")
-    assert read(file, MODEL, variable).settings.metrics.host == "127.0.0.2"
-    [both] = refused(file, f"{SERVER}metrics: {{host: a, address: b}}\n")
-    assert "metrics.address: unknown key" in both
+def test_a_key_of_an_earlier_version_is_refused_with_what_to_write_instead(file: Path) -> None:
+    """After an update, whoever runs the gateway sees each line to change, in the file and in variables."""
+    [found] = refused(file, f"{SERVER}metrics: {{address: 0.0.0.0}}\n")
+    assert found == "4:11: metrics.address: a key of earlier versions; write host instead"
+    file.write_text(SERVER)
+    with pytest.raises(ConfigError, match=r"^RTC3D_GATEWAY__METRICS__ADDRESS: metrics.address: a key of ea"):
+        read(file, MODEL, {"RTC3D_GATEWAY__METRICS__ADDRESS": "127.0.0.2"})
 
 
 def test_all_mistakes_are_told_in_the_files_order(file: Path) -> None:
