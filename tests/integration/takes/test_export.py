@@ -42,7 +42,7 @@ def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -
     (tmp_path / "damaged.lcmlog").write_bytes(content[:-100])
     done = run_in_process("export", tmp_path / "damaged.lcmlog", tmp_path / "DAMAGED.MCAP")
     assert done.returncode == 0
-    assert "note: the take is damaged at 2 places: " in done.stderr
+    assert "\tthe take is damaged at 2 places\t" in done.stderr
 
 
 EXISTS = "exists already, and nothing is overwritten"
@@ -51,7 +51,7 @@ EXISTS = "exists already, and nothing is overwritten"
 @pytest.mark.parametrize(
     ("name", "options", "problem", "status"),
     [
-        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .csv or .mcap", 2),
+        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .mot, .sto, .csv or .mcap", 2),
         ("walk", (), "walk has no known extension", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
         ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
@@ -151,7 +151,7 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
         record.send_signal(signal.SIGINT)
         assert record.wait(30) == 0
     [note] = run_in_process("export", take, copy).stderr.splitlines()
-    assert "time 0 is its first frame" in note
+    assert "time 0 is the first frame" in note
     expected, found = (read_ezc3d(path) for path in (original, copy))
     events = [content["parameters"]["EVENT"] for content in (expected, found)]
     assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]
