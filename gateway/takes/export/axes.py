@@ -23,9 +23,9 @@ def rotation_of(job: ExportJob, measurement: Measurement, file: str) -> Array:
     reason = ""
     if up is None:
         up = up_axis_of(entry.parameters for entry in measurement.source.parameters)
-        reason = f"; the force plates say that {up} points up"
+        reason = f"; {up} is up by the plates"
     if up is None:
-        up, reason = _DEFAULT_UP, f"; that {_DEFAULT_UP} points up is a guess, as no force plate shows it"
+        up, reason = _DEFAULT_UP, f"; that {_DEFAULT_UP} is up is a guess"
     if forward is None:
         forward = "z" if up.endswith("x") else "x"
     if up[-1] == forward[-1]:

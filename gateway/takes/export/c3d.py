@@ -67,7 +67,7 @@ def export_c3d(job: ExportJob) -> None:
     for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
         _write(job, content_of(job, measurement), path)
         if measurement.source.tools is not None:
-            job.note("tools (6D) left out: a C3D file has points, analog channels and events", path.name)
+            job.note("tools (6D) left out", path.name)
 
 
 def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
@@ -105,9 +105,9 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
     if content.start_s * content.rate_hz >= 1:
         utc = utc_text(content.measurement, content.start_s)
         job.note(
-            f"time 0 is the first frame ({utc}), not the beginning of the take",
+            f"time 0 is the first frame, {utc}",
             path.name,
-            f"{content.start_s:.3f} s later",
+            f"{content.start_s:.3f} s after the beginning",
         )
     if incomplete_samples:
         job.note("analog samples missing in the take are NaN", path.name, incomplete_samples)

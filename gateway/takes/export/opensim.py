@@ -97,11 +97,9 @@ def export_sto(job: ExportJob) -> None:
 
 def _note_left_out(job: ExportJob, source: TakeSource, written: Counter[tuple[str, str]]) -> None:
     if source.tools is not None:
-        job.note(
-            f"tools (6D) of {source.name} left out: OpenSim's files have markers", amount=len(source.tools)
-        )
+        job.note(f"tools (6D) of {source.name} left out", amount=len(source.tools))
     if source.events is not None:
-        job.note(f"events of {source.name} left out; export to .c3d has them", amount=len(source.events))
+        job.note(f"events of {source.name} left out; .c3d has them", amount=len(source.events))
     for key, series in source.series.items():
         count, total = written[source.name, key], len(series)
         if 0 < count < total:
@@ -259,7 +257,7 @@ def _signs(
         if signs[-1] < 0:
             job.note(f"{name}: forces reversed, because those on the plate were recorded", path.name)
         job.note(
-            f"{name}: no contact below {min_force_n:g} N; force and moment are 0, the position is its centre",
+            f"{name}: no contact below {min_force_n:g} N: force and moment are 0",
             path.name,
             f"{num_known - num_contact} of {num_known} samples",
         )
@@ -332,7 +330,7 @@ def _write_external_loads(job: ExportJob, mot: Path, plans: list[PlatePlan]) -> 
     if not bodies:
         bodies = tuple(islice(cycle(_FEET), len(plans)))
         job.note(
-            f"a guess: the plates' forces act on {', '.join(bodies)}; say by --bodies who stepped on which",
+            f"which foot is on which plate is a guess: {', '.join(bodies)}; --bodies says it",
             path.name,
             len(bodies),
         )

@@ -30,9 +30,7 @@ def opensim_labels(job: ExportJob, file: str, labels: Sequence[str], noun: str) 
     fitted = fitting_labels(labels, fit, _MAX_LABEL_BYTES, noun)
     changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
     if changed:
-        job.note(
-            f"labels of {noun}s changed: OpenSim's have no spaces and few special characters", file, changed
-        )
+        job.note(f"labels of {noun}s: spaces and special characters replaced", file, changed)
     return fitted
 
 

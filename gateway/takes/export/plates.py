@@ -73,7 +73,7 @@ def plan_plates(
     unknown = 0 if forces is None else forces.num_items - len(plates)
     if unknown > 0:
         job.note(
-            "plates without parameters left out, because their corners are not known; .csv has their forces",
+            "plates without parameters left out; .csv has their forces",
             amount=unknown,
         )
     for index, plate in enumerate(plates[:_MAX_PLATES]):

@@ -202,7 +202,7 @@ def test_a_take_without_parameters(tmp_path: Path) -> None:
     found, notes = export_c3d(tmp_path, [description(), *scene_messages(SCENE, 20)])
     assert notes == [
         "no parameters of lab in the take: labels, units and rates are not known",
-        "plates without parameters left out, because their corners are not known; .csv has their forces | 2",
+        "plates without parameters left out; .csv has their forces | 2",
     ]
     assert found("POINT", "LABELS") == [f"marker {n}" for n in range(1, 6)]
     assert (*found("POINT", "RATE"), *found("ANALOG", "RATE")) == (100, 1000)

@@ -101,5 +101,5 @@ def test_a_c3d_file_counts_from_its_first_frame_and_says_when_that_was(
     [text] = found("TRIAL", "DATE_TIME")
     later = datetime.fromisoformat(text) - datetime.fromisoformat(f"{BEGIN}Z")
     assert later.total_seconds() == pytest.approx(first, abs=0.01)
-    pattern = rf"walk\.c3d \| time 0 is the first frame \({text}\).* \| {first:.1f}\d\d s later"
+    pattern = rf"walk\.c3d \| time 0 is the first frame, {text} \| {first:.1f}\d\d s after the beginning"
     assert sum(bool(re.fullmatch(pattern, note)) for note in notes) == 1
