@@ -48,7 +48,7 @@ _BLOCK_ROWS: Final = 500
 def export_opensim(job: ExportJob) -> None:
     """Write each measurement of each source to files in a folder, which is created if it does not exist."""
     job.files.create_folder(job.out)
-    job = replace(job, out=job.out / f"{job.take.name.removesuffix(SUFFIX)}.trc")
+    job = replace(job, out=job.out / f"{job.take.absolute().name.removesuffix(SUFFIX)}.trc")
     found = named_measurements(job, ("3d", "analog", "force"), "markers, analog channels or forces")
     written: Counter[tuple[str, str]] = Counter()
     for measurement, path in found:
@@ -59,13 +59,14 @@ def export_opensim(job: ExportJob) -> None:
         mot = path.with_suffix(".mot")
         rotated = [each.name for each, exists in ((path, has_markers), (mot, loads)) if exists]
         rotation = rotation_of(job, measurement, ", ".join(rotated)) if rotated else np.eye(3)
+        bodies = () if loads is None else _bodies(job, mot, loads.plans)
         if has_markers:
             unit = measurement.base.unit or "mm"
             job.note(f"positions converted from {unit} to m", path.name)
             write_trc(job, measurement, path, "m", rotation, _metres(job, unit))
         if loads is not None:
             _write_mot(job, mot, loads, rotation)
-            _write_external_loads(job, mot, loads.plans)
+            _write_external_loads(job, mot, loads.plans, bodies)
         if analog is not None:
             _write_sto(job, path.with_suffix(".sto"), analog)
         for key, samples in (("analog", analog), ("force", forces)):
@@ -100,11 +101,12 @@ def _note_left_out(job: ExportJob, source: TakeSource, written: Counter[tuple[st
         job.note(f"tools (6D) of {source.name} left out", amount=len(source.tools))
     if source.events is not None:
         job.note(f"events of {source.name} left out; .c3d has them", amount=len(source.events))
-    for key, series in source.series.items():
-        count, total = written[source.name, key], len(series)
-        if 0 < count < total:
+    for key in ("analog", "force"):
+        count = written[source.name, key]
+        total = len(source.series[key].without_empty_frames()) if key in source.series else 0
+        if count < total:
             job.note(
-                f"samples of {key} of {source.name} before the first frame or after the last one left out",
+                f"samples of {key} of {source.name} without a frame of the markers left out",
                 amount=f"{total - count} of {total}",
             )
 
@@ -239,7 +241,8 @@ def _signs(
 ) -> list[float]:
     """Return -1 for each plate whose loads are those on the plate, 1 for those on the person.
 
-    The force on a person points up.
+    The force on a person points up. Cubes are summed, so that steps decide, and not hours of the small force
+    that an empty plate shows.
     """
     sums, num_contacts = np.zeros(len(loads.plans)), np.zeros(len(loads.plans), int)
     num_known = 0
@@ -247,12 +250,12 @@ def _signs(
         num_known += int(np.count_nonzero(is_known))
         for index, reactions in enumerate(found):
             forces = reactions.forces[is_known]
-            sums[index] += (forces @ rotation[1]).sum()
+            sums[index] += ((forces @ rotation[1]) ** 3).sum()
             num_contacts[index] += np.count_nonzero(forces.any(axis=1))
     signs = []
-    for plan, total_n, num_contact in zip(loads.plans, sums.tolist(), num_contacts.tolist(), strict=True):
+    for plan, total, num_contact in zip(loads.plans, sums.tolist(), num_contacts.tolist(), strict=True):
         is_vertical = abs(float(plan.geometry.rotation[:, 2] @ rotation[1])) > _VERTICAL
-        signs.append(-1.0 if is_vertical and total_n < 0 else 1.0)
+        signs.append(-1.0 if is_vertical and total < 0 else 1.0)
         name = f"plate {plan.position + 1}"
         if signs[-1] < 0:
             job.note(f"{name}: forces reversed, because those on the plate were recorded", path.name)
@@ -321,19 +324,25 @@ def _write_table(
 _FEET: Final = ("calcn_r", "calcn_l")
 
 
-def _write_external_loads(job: ExportJob, mot: Path, plans: list[PlatePlan]) -> None:
-    """Write the file that tells OpenSim on which bodies the forces of ``mot`` act."""
-    path = mot.with_suffix(".xml")
+def _bodies(job: ExportJob, mot: Path, plans: list[PlatePlan]) -> tuple[str, ...]:
+    """Return the body on which the force of each plate acts. Raises SelectionError unless each has one."""
     bodies = job.opensim.bodies
     if bodies and len(bodies) != len(plans):
-        raise SelectionError(f"{mot.name} has {len(plans)} plates, but --bodies names {len(bodies)}")
+        raise SelectionError(
+            f"--bodies must have a name for each plate in {mot.name}: {len(plans)}, not {len(bodies)}"
+        )
     if not bodies:
         bodies = tuple(islice(cycle(_FEET), len(plans)))
         job.note(
             f"which foot is on which plate is a guess: {', '.join(bodies)}; --bodies says it",
-            path.name,
+            mot.with_suffix(".xml").name,
             len(bodies),
         )
+    return bodies
+
+
+def _write_external_loads(job: ExportJob, mot: Path, plans: list[PlatePlan], bodies: tuple[str, ...]) -> None:
+    """Write the file that tells OpenSim on which bodies the forces of ``mot`` act."""
     forces = []
     for plan, body in zip(plans, bodies, strict=True):
         force, point, torque = _identifiers(plan)
@@ -361,4 +370,4 @@ def _write_external_loads(job: ExportJob, mot: Path, plans: list[PlatePlan]) -> 
   </ExternalLoads>
 </OpenSimDocument>
 """
-    job.files.create(path).write(text.encode())
+    job.files.create(mot.with_suffix(".xml")).write(text.encode())

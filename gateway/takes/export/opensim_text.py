@@ -38,7 +38,7 @@ _NUM_DIGITS: Final = 9
 """As many digits as any 32-bit float needs to be read back exactly."""
 
 _MAX_EXPONENT: Final = 60
-"""32-bit floats, and what is computed from them, are between 1e-60 and 1e60; other numbers count as 0."""
+"""All 32-bit floats are between 1e-60 and 1e60. Smaller numbers are written as 0, larger ones as missing."""
 
 _POWERS: Final = 10.0 ** np.arange(-_MAX_EXPONENT, _MAX_EXPONENT + _NUM_DIGITS)
 _CELL_BYTES: Final = 16  # a tab, the sign, "1.23456789e-01"
@@ -51,7 +51,8 @@ def encode_rows(heads: Sequence[bytes], values: Array, missing: bytes, end: byte
     """Return rows as text: the head of each, a tab and a number for each value, and the end.
 
     ``heads`` are the first cells of the rows, and ``values`` has the shape (rows, columns). ``missing`` (up
-    to 3 bytes) stands for NaN and infinity.
+    to 3 bytes) stands for NaN, infinity and numbers that no
+    32-bit float can hold.
     """
     num_rows = len(heads)
     with np.errstate(invalid="ignore"):  # any bits that are a NaN
@@ -66,11 +67,11 @@ def encode_rows(heads: Sequence[bytes], values: Array, missing: bytes, end: byte
 
 def _cells(values: Array, missing: bytes) -> Array:
     """Return a tab and the text of each of ``values``, shape (values, 16); bytes that are not used are 0."""
-    is_known = np.isfinite(values)
+    is_known = np.abs(values) < _POWERS[2 * _MAX_EXPONENT]
     sizes = np.abs(np.where(is_known, values, 0.0))
-    in_range = (sizes > _POWERS[0]) & (sizes < _POWERS[2 * _MAX_EXPONENT])
-    sizes = np.where(in_range, sizes, 0.0)
-    exponents = np.floor(np.log10(np.where(in_range, sizes, 1.0))).astype(np.int64)
+    is_zero = sizes <= _POWERS[0]
+    sizes[is_zero] = 0.0
+    exponents = np.floor(np.log10(np.where(is_zero, 1.0, sizes))).astype(np.int64)
     numbers = np.rint(sizes * _POWERS[_MAX_EXPONENT + _NUM_DIGITS - 1 - exponents])
     is_rounded_up = numbers >= 10**_NUM_DIGITS
     exponents += is_rounded_up

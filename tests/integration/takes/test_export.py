@@ -57,6 +57,15 @@ EXISTS = "exists already, and nothing is overwritten"
         ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
         ("a.trc", ("--source", "studio"), "has no source 'studio'; its sources are: lab", 2),
         ("a.trc", ("--from", "3000"), "has no markers", 2),
+        ("a.csv", ("--forward", "-x"), "--forward is for .trc, .mot or --opensim only", 2),
+        ("a.mot", ("--bodies", "calcn_r"), "--bodies is for --opensim only", 2),
+        (
+            "a",
+            ("--opensim", "--bodies", "toes,heel"),
+            "--bodies must have a name for each plate in walk.mot: 1, not 2",
+            2,
+        ),
+        ("walk.c3d", ("--opensim",), EXISTS, 1),
     ],
 )
 def test_what_cannot_be_exported_leaves_no_file(

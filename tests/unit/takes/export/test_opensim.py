@@ -13,12 +13,28 @@ from lxml import etree
 
 from gateway.errors import SelectionError, TakeError
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
+from gateway.rtc3d.parameters import (
+    AnalogChannel,
+    ForceChannel,
+    Parameters,
+    ParametersAnalog,
+    ParametersForce,
+    Plate,
+    Point,
+)
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import Axis, ExportJob, OpenSimOptions, export_take
 from gateway.takes.export.opensim_text import encode_rows
-from tests.support.takes import Message, description, frame, parameters, record_scene, scene_messages
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    frame,
+    parameters,
+    record_scene,
+    scene_messages,
+)
 from tests.unit.takes.export.exported import (
     NAN,
     SCENE,
@@ -164,6 +180,12 @@ def test_forces_on_the_plate_become_those_on_the_person(tmp_path: Path) -> None:
     assert reversed_row in notes_of(job)
 
 
+def test_the_offset_of_an_empty_plate_does_not_reverse_the_forces_of_a_step(tmp_path: Path) -> None:
+    offset = (0.0, 0.0, -15.0, 0.0, 0.0, 0.0)
+    export_messages(tmp_path, step_messages(*[offset] * 100, STEP), "walk.mot")
+    assert vectors_of(read_storage(tmp_path / "walk.mot"), 1)[0][:, 1].tolist() == [-15] * 100 + [800]
+
+
 def test_the_limit_of_contact_is_chosen(tmp_path: Path) -> None:
     messages = step_messages(STEP, (0, 0, 9.5, 0, 0, 1))
     export_messages(tmp_path, messages, "walk.mot", opensim=OpenSimOptions(min_force_n=9.5))
@@ -208,12 +230,8 @@ def test_samples_outside_the_frames_and_other_components_are_reported(tmp_path: 
 
     shown = SyntheticScene(markers=5, tools=1, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000)
     notes = notes_of(export_messages(tmp_path, scene(20, shown, keep=keep), "out", folder_format="opensim"))
-    assert (
-        "samples of force of lab before the first frame or after the last one left out | 50 of 200" in notes
-    )
-    assert (
-        "samples of analog of lab before the first frame or after the last one left out | 50 of 200" in notes
-    )
+    assert "samples of force of lab without a frame of the markers left out | 50 of 200" in notes
+    assert "samples of analog of lab without a frame of the markers left out | 50 of 200" in notes
     assert "tools (6D) of lab left out | 20" in notes
 
 
@@ -228,6 +246,25 @@ def test_a_rate_that_is_no_multiple_is_reported_and_a_file_of_its_own_has_it(tmp
         assert note in notes_of(job)
     export_messages(tmp_path, scene(50, odd), "walk.mot")
     assert len(read_storage(tmp_path / "walk.mot").times_s) == 125
+
+
+def test_forces_with_another_rate_than_the_plates_own_channels_have_all_their_samples(tmp_path: Path) -> None:
+    """Channels of 100 Hz give the same load, but only every second sample."""
+    channels = tuple(AnalogChannel(str(n), f"c{n}", frequency_hz=100.0) for n in range(6))
+    plate = replace(PLATE, frequency_hz=200.0, analog_channel_ids=tuple("012345"))
+    described = Parameters(analog=ParametersAnalog(channels), force=ParametersForce((plate,)))
+    load_nmm = (*STEP[:3], *(1000 * moment for moment in STEP[3:]))
+    messages = [description(), parameters(described)]
+    for number in range(20):
+        time_us, utime = 5000 * number, START_UTIME + 5000 * number
+        messages.append(frame(ComponentType.FORCE, [STEP], number, timestamp_us=time_us, utime=utime))
+        if number % 2 == 0:
+            row = number // 2
+            messages.append(frame(ComponentType.ANALOG, load_nmm, row, timestamp_us=time_us, utime=utime))
+    export_messages(tmp_path, messages, "out", folder_format="opensim")
+    found = read_storage(tmp_path / "out/take.mot")
+    assert len(found.times_s) == 20
+    assert vectors_of(found, 1)[0].tolist() == [[10, 800, -20]] * 20
 
 
 AXES: list[tuple[Axis | None, Axis | None, str]] = [
@@ -283,7 +320,7 @@ def test_bodies_are_guessed_and_reported_or_as_many_as_the_plates(tmp_path: Path
     job = export_messages(tmp_path, scene(10), "out", folder_format="opensim")
     guess = "take.xml | which foot is on which plate is a guess: calcn_r, calcn_l; --bodies says it"
     assert f"{guess} | 2" in notes_of(job)
-    with pytest.raises(SelectionError, match=r"take\.mot has 2 plates, but --bodies names 1"):
+    with pytest.raises(SelectionError, match=r"each plate in take\.mot: 2, not 1"):
         export_messages(
             tmp_path, scene(10), "b", folder_format="opensim", opensim=OpenSimOptions(bodies=("a",))
         )
@@ -328,3 +365,5 @@ def test_numbers_are_read_back_exactly() -> None:
     found = np.array([float(cell) for _, cell in rows]).astype(np.float32)
     assert np.array_equal(found, np.where(np.isfinite(values), values, NAN), equal_nan=True)
     assert text.splitlines()[-11] == b"7\t0.00000000e+00"
+    assert encode_rows([b"7"], np.array([[0.99999999996]]), b"", b"\n") == b"7\t1.00000000e+00\n"
+    assert encode_rows([b"7"], np.array([[1e-90, -1e90]]), b"", b"\t\n") == b"7\t0.00000000e+00\t\t\n"
