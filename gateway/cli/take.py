@@ -269,7 +269,8 @@ def export(
     ):
         if value is not None and kind not in kinds:
             raise typer.BadParameter(f"{name} is for {join_or(kinds)} only")
-    chosen = OpenSimOptions(up, forward, min_force, tuple(bodies.split(",")) if bodies else ())
+    names = tuple(body.strip() for body in bodies.split(",")) if bodies else ()
+    chosen = OpenSimOptions(up, forward, min_force, names)
     job = ExportJob(
         file, out, "opensim" if opensim else "", source=source, from_s=from_s, to_s=to_s, opensim=chosen
     )
