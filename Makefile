@@ -17,7 +17,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs site lcm-types examples samples \
-    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
+    screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -237,6 +237,11 @@ stops: .venv/installed
 hiroz: .venv/installed
 	cargo build --quiet --manifest-path tests/ros2_hiroz/Cargo.toml
 	tests/with-netns $(BIN)/python -m tests.ros2_hiroz
+
+# Read an export with OpenSim, which takes 280 MB and is not a dependency. Not part of the check.
+opensim: .venv/installed
+	$(BIN)/pip install --quiet opensim
+	$(BIN)/python -m tests.opensim
 
 # Mutation tests: about 150 changes of meaning, each of which some test should notice. PACKAGES="stream publish"
 # selects packages. Not part of the check.

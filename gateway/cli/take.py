@@ -14,7 +14,7 @@ from gateway.cli.main import exit_with, print_json
 from gateway.config.words import join_or
 from gateway.errors import QueryError
 from gateway.logs.safe_text import safe_text
-from gateway.takes.export.job import FORMATS, ExportJob, export_take
+from gateway.takes.export.job import FORMATS, Axis, ExportJob, OpenSimOptions, export_take
 
 if TYPE_CHECKING:
     from gateway.cli.take_report import ListedTake
@@ -225,16 +225,61 @@ def export(
     from_s: options.FromOption = None,
     to_s: options.ToOption = None,
     ros2: Annotated[bool, typer.Option("--ros2", help="Write a bag of ROS 2 (.mcap).")] = False,
+    opensim: Annotated[
+        bool,
+        typer.Option(
+            "--opensim",
+            help="OUT is a folder for OpenSim: markers, ground reactions, analog channels.",
+        ),
+    ] = False,
+    up: Annotated[
+        Axis | None,
+        typer.Option(
+            help="The server's axis that points up, which becomes Y; the default is that of the plates, or z."
+        ),
+    ] = None,
+    forward: Annotated[
+        Axis | None,
+        typer.Option(help="The server's axis that becomes X; the default is x, or z if x points up."),
+    ] = None,
+    min_force: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="The force in N at which contact with a plate begins; the default is 10."),
+    ] = None,
+    bodies: Annotated[
+        str | None,
+        typer.Option(
+            help="The model's bodies that step on the plates, in the order of the plates: calcn_r,calcn_l."
+        ),
+    ] = None,
     quiet: options.NoProgressOption = False,
 ) -> None:
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
+    from rich.console import Console
+
+    from gateway.display.terminal import print_list
+
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
-    job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s, is_for_ros2=ros2)
+    formats = [name for name, is_chosen in (("opensim", opensim), ("ros2", ros2)) if is_chosen]
+    if len(formats) > 1:
+        raise typer.BadParameter(f"--{formats[0]} and --{formats[1]} are different formats; choose one")
+    chosen_format = formats[0] if formats else ""
+    kind = f"--{chosen_format}" if chosen_format else out.suffix.lower()
+    for name, value, kinds in (
+        ("--up", up, (".trc", ".mot", "--opensim")),
+        ("--forward", forward, (".trc", ".mot", "--opensim")),
+        ("--min-force", min_force, (".mot", "--opensim")),
+        ("--bodies", bodies, ("--opensim",)),
+    ):
+        if value is not None and kind not in kinds:
+            raise typer.BadParameter(f"{name} is for {join_or(kinds)} only")
+    names = tuple(body.strip() for body in bodies.split(",")) if bodies else ()
+    chosen = OpenSimOptions(up, forward, min_force, names)
+    job = ExportJob(file, out, chosen_format, source=source, from_s=from_s, to_s=to_s, opensim=chosen)
     with progress_bar(quiet=quiet, counts_bytes=False) as job.progress:
         paths = export_take(job)
-    for note in job.notes:
-        print(f"note: {safe_text(note)}", file=sys.stderr)
+    print_list(Console(stderr=True), ["file", "changed, rounded or left out", "how much"], job.notes)
     for path in paths:
         size = path.stat().st_size
         print(f"{path} ({size / 1e6:.1f} MB)" if size >= 100_000 else f"{path} ({size / 1e3:.1f} kB)")

@@ -7,7 +7,8 @@ the plate refers to the server's own channels. Otherwise six channels are added,
 
 import math
 import re
-from typing import Any, Final, NamedTuple, TypeAlias
+from collections.abc import Iterable
+from typing import Any, Final, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -198,6 +199,23 @@ def placed_plates(parameters: Parameters) -> list[PlacedPlate | None]:
     return found
 
 
+UpAxis: TypeAlias = Literal["x", "y", "z"]
+
+_VERTICAL: Final = 0.95
+"""The cosine from which a plate counts as horizontal."""
+
+
+def up_axis_of(parameters: Iterable[Parameters]) -> UpAxis | None:
+    """Return the axis that points up, by the plates: people step on them; None if they do not show it."""
+    found: set[UpAxis] = set()
+    for each in parameters:
+        for plate in placed_plates(each):
+            if plate is not None:
+                by_size = zip(get_args(UpAxis), map(abs, plate.normal), strict=True)
+                found |= {axis for axis, part in by_size if part > _VERTICAL}
+    return found.pop() if len(found) == 1 else None
+
+
 def units_of(plate: Plate) -> tuple[float, float]:
     """Return the units of a plate's forces and moments, in N and in Nm; unknown ones count as N and Nm."""
     units = [channel.unit for channel in plate.channels]
@@ -227,3 +245,33 @@ def force_on(plate: PlacedPlate, load: tuple[float, ...]) -> PlateForce | None:
         z + (nx * my - ny * mx) * factor,
     )
     return PlateForce(position, (fx * plate.newtons, fy * plate.newtons, fz * plate.newtons))
+
+
+class GroundReactions(NamedTuple):
+    """What a plate does to what stands on it, in N, m and Nm; each has the shape (samples, 3).
+
+    ``free_moments`` are about the normal of the surface, at the centre of pressure.
+    """
+
+    forces: Array
+    positions: Array
+    free_moments: Array
+
+
+def ground_reactions(
+    loads: Array, normal: Array, centre: Array, min_force_n: float = MIN_FORCE_N
+) -> GroundReactions:
+    """Return the forces of loads, shape (samples, 6), in N and Nm, as ``force_on`` does for one.
+
+    ``normal`` and ``centre`` are those of the surface. Below ``min_force_n`` at a right angle to the surface,
+    or if the load is not known, there is no contact: forces and moments are 0, and the position is the
+    centre.
+    """
+    forces, moments = loads[:, :3], loads[:, 3:]
+    normal_forces = forces @ normal
+    has_contact = np.isfinite(loads).all(axis=1) & (abs(normal_forces) >= min_force_n) & (normal_forces != 0)
+    forces, moments = (np.where(has_contact[:, None], values, 0.0) for values in (forces, moments))
+    divisors = np.where(has_contact, normal_forces, 1.0)[:, None]
+    arms = np.cross(normal, moments) / divisors
+    about_normal = (moments - np.cross(arms, forces)) @ normal
+    return GroundReactions(forces, centre + arms, about_normal[:, None] * normal)

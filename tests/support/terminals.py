@@ -24,8 +24,13 @@ LONG_RUNNING: Final = (
 )
 """Commands that run until Ctrl-C."""
 
-LISTS: Final = ("rtc3d-gateway list", "rtc3d-gateway params", "rtc3d-gateway take list")
-"""Commands that print another text where stdout is not a terminal; the pages show that of a terminal."""
+LISTS: Final = (
+    "rtc3d-gateway list",
+    "rtc3d-gateway params",
+    "rtc3d-gateway take list",
+    "rtc3d-gateway export",
+)
+"""Commands that print another text where there is no terminal; the pages show that of a terminal."""
 
 TIMEOUT_S: Final = 120
 

@@ -7,10 +7,10 @@ from typing import Final
 
 import viser
 
-from gateway.descriptions.force_plates import METRES_PER_NEWTON
+from gateway.descriptions.force_plates import METRES_PER_NEWTON, UpAxis
 from gateway.display.live import LiveData, LiveSource
 from gateway.display.view.plots import Plots
-from gateway.display.view.scene_items import UP_AXES, Rgb, UpAxis
+from gateway.display.view.scene_items import UP_AXES, Rgb
 from gateway.display.view.texts import (
     clock_text,
     counted,

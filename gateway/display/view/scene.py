@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple
 from urllib.parse import quote
@@ -10,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 import viser
 
-from gateway.descriptions.force_plates import METRES_PER_NEWTON, placed_plates
+from gateway.descriptions.force_plates import METRES_PER_NEWTON, UpAxis, up_axis_of
 from gateway.display.live import LiveComponent, LiveSource
 from gateway.display.view.panel import Switches
 from gateway.display.view.scene_items import (
@@ -20,27 +20,11 @@ from gateway.display.view.scene_items import (
     Markers,
     Plates,
     Tools,
-    UpAxis,
     color_of,
     on_floor,
 )
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array
-
-_VERTICAL: Final = 0.95
-"""The cosine from which a plate counts as horizontal."""
-
-
-def up_axis_of(parameters: Iterable[Parameters]) -> UpAxis | None:
-    """Return the axis that points up, by the plates: people step on them; None if they do not show it."""
-    found: set[UpAxis] = set()
-    for each in parameters:
-        for plate in placed_plates(each):
-            if plate is not None:
-                by_size = {axis: abs(part) for axis, part in zip("xyz", plate.normal, strict=True)}
-                found |= {axis for axis in UP_AXES if by_size[axis] > _VERTICAL}
-    return found.pop() if len(found) == 1 else None
-
 
 _MIN_RADIUS_M: Final = 0.3
 _MARGIN: Final = 1.15

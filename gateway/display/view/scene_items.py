@@ -10,6 +10,7 @@ import viser
 from gateway.descriptions.force_plates import (
     METRES_PER_NEWTON,
     PlacedPlate,
+    UpAxis,
     force_on,
     placed_plates,
     units_of,
@@ -300,7 +301,6 @@ class Tools:
         )
 
 
-UpAxis = Literal["x", "y", "z"]
 UP_AXES: Final[tuple[UpAxis, ...]] = ("z", "y", "x")
 PLANES: Final[dict[UpAxis, Literal["xy", "zx", "yz"]]] = {"z": "xy", "y": "zx", "x": "yz"}
 """The floor for each axis that points up; seen from above, the second axis is left of the first one."""

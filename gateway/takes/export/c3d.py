@@ -24,13 +24,13 @@ from gateway.errors import TakeError
 from gateway.takes.export.c3d_content import (
     MAX_LIST,
     C3dContent,
-    PlatePlan,
     content_of,
     encode_points,
     residual_step,
 )
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import Measurement, named_measurements, note_missing, utc_text
+from gateway.takes.export.plates import PlatePlan
 from gateway.takes.files.component_rows import Array
 
 _BLOCK_BYTES: Final = 512
@@ -67,7 +67,7 @@ def export_c3d(job: ExportJob) -> None:
     for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
         _write(job, content_of(job, measurement), path)
         if measurement.source.tools is not None:
-            job.note("tools (6D) were left out: a C3D file has points, analog channels and events")
+            job.note("tools (6D) left out", path.name)
 
 
 def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
@@ -103,11 +103,14 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
         file.write(bytes(-file.tell() % _BLOCK_BYTES))
     note_missing(job, path, content.measurement, content.first_row, content.num_frames)
     if content.start_s * content.rate_hz >= 1:
-        begin = f"{content.start_s:.3f} s after the take's beginning"
         utc = utc_text(content.measurement, content.start_s)
-        job.note(f"{path.name}: time 0 is its first frame, {begin} ({utc})")
+        job.note(
+            f"time 0 is the first frame, {utc}",
+            path.name,
+            f"{content.start_s:.3f} s after the beginning",
+        )
     if incomplete_samples:
-        job.note(f"{path.name}: {incomplete_samples} analog samples are missing in the take; they are NaN")
+        job.note("analog samples missing in the take are NaN", path.name, incomplete_samples)
 
 
 _TEXT_SIZES: Final = (_MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
@@ -121,8 +124,8 @@ def _head(job: ExportJob, content: C3dContent, scale: float) -> bytes:
         if head is not None:
             if max_bytes < _MAX_TEXT_BYTES:
                 job.note(
-                    "a C3D file has no room for so many texts: descriptions were left out, "
-                    f"and labels have at most {max_bytes} bytes"
+                    "descriptions left out and labels cut: a C3D file has no room for so many texts",
+                    amount=f"{max_bytes} bytes each",
                 )
             return head
     raise TakeError("the labels do not fit into a C3D file; export to .csv instead")
@@ -148,7 +151,7 @@ def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -
     }
     for text in (details.subject, details.session):
         if _encode_text(text) != text.encode():
-            job.note(f"{text!r} was cut: a C3D file has texts of at most {_MAX_TEXT_BYTES} bytes")
+            job.note(f"{text!r} cut: a C3D file has short texts only", amount=f"{_MAX_TEXT_BYTES} bytes")
     if details.session:
         groups["TRIAL"]["SESSION"] = [details.session]
     if details.note.strip():  # in lines as long as a parameter can have in any script
@@ -167,7 +170,7 @@ def _texts(job: ExportJob, labels: list[str], descriptions: list[str], max_bytes
     fitted = fitting_labels(labels, printable, max_bytes, noun)
     changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
     if changed and max_bytes == _MAX_TEXT_BYTES:
-        job.note(f"{changed} labels of {noun}s were changed, because a C3D file cannot hold them")
+        job.note(f"labels of {noun}s changed, because a C3D file cannot hold them", amount=changed)
     if max_bytes < _MAX_TEXT_BYTES or not any(descriptions):
         descriptions = [""] * len(fitted)
     return _lists("LABELS", fitted) | _lists("DESCRIPTIONS", [printable(text) for text in descriptions])
@@ -244,7 +247,7 @@ def _event_group(job: ExportJob, measurement: Measurement, first_row: int, num_r
     chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
     if len(chosen) > MAX_LIST:
         left_out = len(chosen) - MAX_LIST
-        job.note(f"{left_out} of {len(chosen)} events were left out: a C3D file has at most 255")
+        job.note("events left out: a C3D file has at most 255", amount=f"{left_out} of {len(chosen)}")
         chosen = chosen[:MAX_LIST]
     if not len(chosen):
         return {}

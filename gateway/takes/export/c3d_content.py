@@ -5,21 +5,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.force_plates import (
-    FORCES_AND_MOMENTS,
-    PlateGeometry,
-    calibration_of,
-    channels_from_loads,
-    geometry_of,
-    is_equal,
-    loads_from_channels,
-    moment_factor,
-    own_channels,
-    possible_types,
-)
-from gateway.rtc3d.parameters import Parameters, Plate
+from gateway.descriptions.force_plates import channels_from_loads
+from gateway.rtc3d.parameters import Parameters
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, Part, Placed, place, seconds_of_row
+from gateway.takes.export.measurements import Measurement, Placed, sampled, seconds_of_row
+from gateway.takes.export.plates import PlatePlan, plan_plates
 from gateway.takes.files.component_rows import Array
 
 MAX_LIST: Final = 255
@@ -66,112 +56,8 @@ def residual_step(blocks: Iterable[Array]) -> float:
     return float(different[0] if is_exact else different[-1] / np.float32(_MAX_STEPS))
 
 
-_COMPARED_BLOCKS: Final = 20
-_COMPARED_ROWS: Final = 1000  # of each block
-_FIRST_MOMENT: Final = 3
-
-
-class PlatePlan(NamedTuple):
-    """How one plate is written. ``channels`` are indices of analog channels.
-
-    If ``is_added``, these six channels follow the server's own, and are computed from the Force component.
-    ``position`` is the index of the plate in it.
-    """
-
-    position: int
-    plate: Plate
-    geometry: PlateGeometry
-    type: int
-    channels: tuple[int, ...]
-    is_added: bool
-    moment_factor: float
-
-    def explains(self, channels: Array, loads: Array) -> bool:
-        """Whether readers compute the recorded loads from the plate's own channels.
-
-        The server's loads may have the axes of the laboratory or those of the plate.
-        """
-        own_axes = self.geometry._replace(rotation=np.eye(3), origin=np.zeros(3))
-        calibration, recorded = calibration_of(self.plate), self.loads_of(loads)
-        return any(
-            is_equal(loads_from_channels(self.type, channels, calibration, geometry), recorded)
-            for geometry in (self.geometry, own_axes)
-        )
-
-    def loads_of(self, loads: Array) -> Array:
-        """Return the plate's loads, shape (samples, 6), of Force items, shape (samples, plates, 6)."""
-        return loads[:, self.position].astype(np.float64) * ([1.0] * 3 + [self.moment_factor] * 3)
-
-
-def plan_plates(
-    job: ExportJob, parameters: Parameters, unit: str, analog: Placed | None, forces: Placed | None
-) -> list[PlatePlan]:
-    """Return how each plate is written; plates that cannot be written are reported.
-
-    ``analog`` and ``forces`` have the same rate. ``unit`` is that of the points.
-    """
-    plans: list[PlatePlan] = []
-    num_channels = 0 if analog is None else analog.num_items
-    plates = parameters.force.plates if parameters.force else ()
-    unknown = 0 if forces is None else forces.num_items - len(plates)
-    if unknown > 0:
-        job.note(
-            f"forces of plates without parameters were left out: {unknown}, because their corners are not "
-            "known; export to .csv has them"
-        )
-    for index, plate in enumerate(plates[:MAX_LIST]):
-        name = f"force plate {index + 1}" + (f" ({plate.label})" if plate.label else "")
-        geometry = geometry_of(plate, unit)
-        if geometry is None:
-            job.note(f"{name} was left out: its parameters do not give the corners of a rectangle")
-            continue
-        moments = plate.channels[_FIRST_MOMENT:][:1]
-        factor = moment_factor(moments[0].unit if moments else "", unit)
-        plan = PlatePlan(index, plate, geometry, FORCES_AND_MOMENTS, (), False, factor)
-        own = _with_own_channels(plan, parameters, analog, forces)
-        if own is not None:
-            plans.append(own)
-        elif forces is not None and index < forces.num_items:
-            channels = tuple(range(num_channels, num_channels + 6))
-            plans.append(plan._replace(channels=channels, is_added=True))
-            num_channels += 6
-        else:
-            job.note(f"{name} was left out: the take has neither its analog channels nor its forces")
-    return plans
-
-
-def _with_own_channels(
-    plan: PlatePlan, parameters: Parameters, analog: Placed | None, forces: Placed | None
-) -> PlatePlan | None:
-    """Return the plan with the server's own channels; None if the recorded loads do not follow from them.
-
-    Values of the same times are compared, from the whole measurement.
-    """
-    channels = own_channels(plan.plate, parameters.analog)
-    if analog is None or not channels or max(channels) >= analog.num_items:
-        return None
-    plans = [
-        plan._replace(type=plate_type, channels=channels)
-        for plate_type in possible_types(plan.plate, len(channels))
-    ]
-    if forces is None or plan.position >= forces.num_items:
-        return next(iter(plans), None)
-    first, last = max(analog.first_row, forces.first_row), min(analog.last_row, forces.last_row)
-    latest = max(first, last - _COMPARED_ROWS + 1)
-    starts = np.unique(np.linspace(first, latest, _COMPARED_BLOCKS).astype(int)).tolist()
-    values, loads = (
-        np.concatenate([placed.block(start, start + _COMPARED_ROWS) for start in starts])
-        for placed in (analog, forces)
-    )
-    known = np.isfinite(values).all(axis=1) & np.isfinite(loads).all(axis=(1, 2))
-    values = values[known][:, channels].astype(np.float64)
-    return next((own for own in plans if not known.any() or own.explains(values, loads[known])), None)
-
-
 _MAX_TRIMMED_S: Final = 1.0
 """Frames at either end that lack analog samples are left out, up to this duration."""
-
-_RATIO_TOLERANCE: Final = 0.02
 
 
 class C3dContent(NamedTuple):
@@ -242,46 +128,23 @@ def content_of(job: ExportJob, measurement: Measurement) -> C3dContent:
     """Choose and align the components of a measurement."""
     base = measurement.frames
     markers = base if base.series.key == "3d" else None
-    analog, samples = _sampled(job, measurement, "analog", None)
-    forces, samples = _sampled(job, measurement, "force", samples)
+    analog, samples = sampled(job, measurement, "analog", None)
+    forces, samples = sampled(job, measurement, "force", samples)
     samples = samples or 1
-    sampled, first, stop = analog or forces, 0, measurement.grid.num_rows
-    if sampled is not None:
+    timed, first, stop = analog or forces, 0, measurement.grid.num_rows
+    if timed is not None:
         most = _MAX_TRIMMED_S * measurement.grid.rate_hz
-        first_complete, stop_complete = -(-sampled.first_row // samples), (sampled.last_row + 1) // samples
+        first_complete, stop_complete = -(-timed.first_row // samples), (timed.last_row + 1) // samples
         first = first_complete if first_complete <= most else first
         stop = stop_complete if stop - stop_complete <= most else stop
         if first >= stop:
             first, stop = 0, measurement.grid.num_rows
     left_out = measurement.grid.num_rows - (stop - first)
     if left_out:
-        job.note(f"frames at the ends were left out because they have no analog samples: {left_out}")
+        job.note("frames at the ends left out, because they have no analog samples", amount=left_out)
     parameters = base.series.parameters_of(0)
     unit = (base.series.unit if markers else parameters.markers and parameters.markers.unit) or "mm"
     plates = plan_plates(job, parameters, unit, analog, forces)
     return C3dContent(
         measurement, parameters, unit, markers, analog, forces, samples, plates, first, stop - first
     )
-
-
-def _sampled(
-    job: ExportJob, measurement: Measurement, key: str, samples: int | None
-) -> tuple[Placed | None, int | None]:
-    """Return a component, and its number of samples in each frame, which must be ``samples`` if given."""
-    found: dict[tuple[int, tuple[str, ...]], list[Part]] = {}
-    for run in measurement.runs_of(key):
-        ratio = place(run)[0].rate_hz / measurement.grid.rate_hz
-        count = round(ratio)
-        fits = count >= 1 and abs(ratio - count) <= _RATIO_TOLERANCE * count and count == (samples or count)
-        parts = measurement.parts(run, max(count, 1))
-        if parts and fits:
-            found.setdefault((count, run.labels), []).extend(parts)
-        elif parts:
-            wanted = "that of the analog channels" if samples else "a multiple of that of the frames"
-            job.note(f"{key} was left out: in C3D, its rate must be {wanted}; export to .csv has it")
-    if not found:
-        return None, samples
-    chosen = max(found, key=lambda identity: sum(len(part.rows) for part in found[identity]))
-    if len(found) > 1:
-        job.note(f"{key}: a part with other labels or another rate was left out; export to .csv has it")
-    return Placed(found[chosen]), chosen[0]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from gateway.config.words import join_or
 from gateway.errors import SelectionError, TakeError
@@ -19,14 +19,16 @@ if TYPE_CHECKING:
 
 FORMATS: Final = {
     ".c3d": ("c3d", "export_c3d"),
-    ".trc": ("text_files", "export_trc"),
-    ".csv": ("text_files", "export_csv"),
+    ".trc": ("trc", "export_trc"),
+    ".mot": ("opensim", "export_mot"),
+    ".sto": ("opensim", "export_sto"),
+    ".csv": ("csv_files", "export_csv"),
     ".mcap": ("mcap", "export_mcap"),
 }
 """The module and the function that write the files of a job, by the extension of its ``out``."""
 
-ROS2_FORMATS: Final = {".mcap": ("rosbag", "export_rosbag")}
-"""The same for ROS 2."""
+CHOSEN_FORMATS: Final = {"opensim": ("opensim", "export_opensim"), "ros2": ("rosbag", "export_rosbag")}
+"""The same for the formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
 
 _INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
 _MAX_NAMED: Final = 10
@@ -35,11 +37,11 @@ _MAX_NAMED: Final = 10
 def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     extension = job.out.suffix.lower()
-    formats = ROS2_FORMATS if job.is_for_ros2 else FORMATS
-    if extension not in formats:
-        kind = "no extension of a bag of ROS 2" if job.is_for_ros2 else "no known extension"
-        raise SelectionError(f"{job.out} has {kind}; choose {join_or(formats)}")
-    module, function = formats[extension]
+    if job.format == "ros2" and extension != ".mcap":
+        raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does")
+    if not job.format and extension not in FORMATS:
+        raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
+    module, function = CHOSEN_FORMATS[job.format] if job.format else FORMATS[extension]
     with job.files:
         try:
             write = getattr(import_module(f"gateway.takes.export.{module}"), function)
@@ -53,30 +55,67 @@ def export_take(job: "ExportJob") -> list[Path]:
     return job.files.paths
 
 
+class Note(NamedTuple):
+    """What was changed, rounded or left out in a file, and how much of it; ``file`` is "" for all files."""
+
+    file: str
+    what: str
+    amount: str
+
+
+Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+@dataclass(frozen=True)
+class OpenSimOptions:
+    """How files for OpenSim are made.
+
+    ``up`` and ``forward`` are the axes of the server that become Y and X; None means the default, which
+    ``axes.rotation_of`` describes. ``min_force_n`` is the force on a plate below which there is no contact;
+    None means 10 N. ``bodies`` are the bodies of the model to which the plates' forces are applied, in the
+    order of the plates; () means a guess.
+    """
+
+    up: Axis | None = None
+    forward: Axis | None = None
+    min_force_n: float | None = None
+    bodies: tuple[str, ...] = ()
+
+    @property
+    def has_axes(self) -> bool:
+        """Whether the axes are chosen."""
+        return self.up is not None or self.forward is not None
+
+
 @dataclass
 class ExportJob:
     """What to export, and where it goes.
 
+    ``format`` is a key of CHOSEN_FORMATS; "" means that the extension of ``out`` says the format.
     ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
-    the take. ``is_for_ros2`` makes the file a bag of ROS 2. ``progress`` is called with what is being done,
-    how much of it is done, and how much there is (0: that is not known). ``notes`` are sentences about what
-    was changed or left out.
+    the take. ``progress`` is called with what is being done, how much of it is done, and how much there is
+    (0: that is not known). ``notes`` say what was changed, rounded or left out.
     """
 
     take: Path
     out: Path
+    format: str = ""
     source: str | None = None
     from_s: float | None = None
     to_s: float | None = None
-    is_for_ros2: bool = False
     progress: Callable[[str, int, int], None] = lambda *_: None
-    notes: list[str] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
+    opensim: OpenSimOptions = OpenSimOptions()
     files: NewFiles = field(default_factory=NewFiles)
 
-    def note(self, text: str) -> None:
-        """Report a sentence about what was changed or left out; the same one is reported once."""
-        if text not in self.notes:
-            self.notes.append(text)
+    def note(self, what: str, file: str = "", amount: object = "") -> None:
+        """Report what was changed, rounded or left out, and how much of it; the same is reported once.
+
+        ``file`` is the name of the file that it concerns; "" means all.
+        """
+        note = Note(file, what, str(amount))
+        if note not in self.notes:
+            self.notes.append(note)
 
     def open_take(self, components: Collection[str] | None = None) -> "Take":
         """Return the chosen part of the take, and report what could not be read. Raises TakeError.
@@ -96,16 +135,18 @@ class ExportJob:
         )
         if take.num_damaged:
             places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"
-            self.note(f"the take is damaged at {places}: {take.damaged_bytes} bytes cannot be read")
+            self.note(f"the take is damaged at {places}", amount=f"{take.damaged_bytes} bytes")
         if take.unknown:
             more = ["…"] if len(take.unknown) > _MAX_NAMED else []
             channels = ", ".join([*take.unknown][:_MAX_NAMED] + more)
-            left_out = f"{sum(take.unknown.values())}, on the channels {channels}"
-            self.note(f"messages of other programs or versions were left out: {left_out}")
+            self.note(
+                f"messages of other programs or versions left out, on the channels {channels}",
+                amount=sum(take.unknown.values()),
+            )
         for source in take.sources.values():
             if not source.parameters:
                 self.note(
-                    f"the take has no parameters of {source.name}: labels, units and rates are not known"
+                    f"no parameters of {source.name} in the take: labels, units and rates are not known"
                 )
         if components is None:
             self.note_malformed(take)
@@ -122,7 +163,7 @@ class ExportJob:
         for source in take.sources.values():
             for key, count in source.malformed.items():
                 if count:
-                    self.note(f"malformed messages of {key} of {source.name} were left out: {count}")
+                    self.note(f"malformed messages of {key} of {source.name} left out", amount=count)
 
     def file_name(self, *parts: str) -> Path:
         """Return the name of one of several files: the name of ``out`` with these parts at its end."""
@@ -136,6 +177,10 @@ def nothing_to_export(job: ExportJob, what: str) -> TakeError:
     source = "" if job.source is None else f" of {job.source}"
     error = SelectionError if part else TakeError
     return error(
-        f"{job.take} has no {what}{source}{part}, and {job.out.suffix} holds nothing else; "
+        f"{job.take} has no {what}{source}{part}, and {_format_name(job)} holds nothing else; "
         "`rtc3d-gateway take info` lists what the take has"
     )
+
+
+def _format_name(job: ExportJob) -> str:
+    return f"--{job.format}" if job.format else job.out.suffix

@@ -70,7 +70,7 @@ def export_mcap(job: ExportJob) -> None:
         raise nothing_to_export(job, "frames")
     for name, exported in sources.items():
         for what, count in exported.left_out.items():
-            job.note(f"{what} of {name} were left out: {count}")
+            job.note(f"{what} of {name} left out", amount=count)
         for problem in exported.lacking:
             job.note(f"{name}: {problem}")
 

@@ -299,7 +299,7 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
             f"{job.take} has {total} measurements, and each becomes a file; choose a part by --from and --to"
         )
     if total > 1:
-        job.note(f"there are {total} measurements, so there are {total} files")
+        job.note("several measurements, each with files of its own", amount=total)
     named = []
     for name, found in by_source.items():
         for number, measurement in enumerate(found, start=1):
@@ -315,12 +315,44 @@ def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement
     return [Measurement(source, runs, run, grid) for run in base_runs for grid in place(run)]
 
 
+_ALONE: Final = {"analog": ".sto", "force": ".mot"}
+"""The formats that have one component, at any rate."""
+
+_RATIO_TOLERANCE: Final = 0.02
+
+
+def sampled(
+    job: ExportJob, measurement: Measurement, key: str, samples: int | None
+) -> tuple[Placed | None, int | None]:
+    """Return a component, and its number of samples in each frame, which must be ``samples`` if given.
+
+    A part of it with another rate or other labels is left out and reported.
+    """
+    found: dict[tuple[int, tuple[str, ...]], list[Part]] = {}
+    for run in measurement.runs_of(key):
+        ratio = place(run)[0].rate_hz / measurement.grid.rate_hz
+        count = round(ratio)
+        fits = count >= 1 and abs(ratio - count) <= _RATIO_TOLERANCE * count and count == (samples or count)
+        parts = measurement.parts(run, max(count, 1))
+        if parts and fits:
+            found.setdefault((count, run.labels), []).extend(parts)
+        elif parts:
+            wanted = "that of the analog channels" if samples else "a multiple of that of the frames"
+            job.note(f"{key} left out: its rate is not {wanted}; export to {_ALONE[key]} has it")
+    if not found:
+        return None, samples
+    chosen = max(found, key=lambda identity: sum(len(part.rows) for part in found[identity]))
+    if len(found) > 1:
+        job.note(f"a part of {key} with other labels or another rate left out; export to .csv has it")
+    return Placed(found[chosen]), chosen[0]
+
+
 def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
     """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
     found = int(np.diff(np.searchsorted(measurement.grid.rows, [first, first + count])).sum())
     missing = count - found
     if missing:
-        job.note(f"{path.name}: {missing} of {count} frames are missing in the take; they are empty")
+        job.note("frames missing in the take are empty", path.name, f"{missing} of {count}")
 
 
 def _nearest(times: Array, wanted: Array) -> Array:

@@ -44,9 +44,9 @@ from gateway.messages.ros2_names import (
     wrench_topic,
 )
 from gateway.messages.topics import unique_name
+from gateway.takes.export.csv_files import parts_of
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.mcap import McapFile
-from gateway.takes.export.text_files import parts_of
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series
 
@@ -74,7 +74,7 @@ def export_rosbag(job: ExportJob) -> None:
     job.note_malformed(take)
     for name, source in sources.items():
         for what, count in source.left_out.items():
-            job.note(f"{what} of {name} were left out: {count}")
+            job.note(f"{what} of {name} left out", job.out.name, count)
 
 
 class _SourceTopics:

@@ -74,6 +74,7 @@ class NewFiles:
         self.paths: list[Path] = []
         """The files, in the order of their creation."""
         self._temporary: list[Path] = []
+        self._folders: list[Path] = []
         self._open: list[IO[bytes]] = []
 
     def __enter__(self) -> Self:
@@ -92,10 +93,19 @@ class NewFiles:
                         file.close()
                 for temporary in self._temporary:
                     temporary.unlink(missing_ok=True)
+                for folder in self._folders:
+                    with contextlib.suppress(OSError):  # it has files: those of this block, or of others
+                        folder.rmdir()
         except OSError as failure:
             raise self._as_take_error(failure) from failure
         if isinstance(error, OSError):
             raise self._as_take_error(error) from error
+
+    def create_folder(self, path: Path) -> None:
+        """Create a folder unless it exists. If the block fails, it is removed. Raises OSError."""
+        if not path.is_dir():
+            path.mkdir()
+            self._folders.append(path)
 
     def create(self, path: Path) -> IO[bytes]:
         """Open a new file for writing. It has its name when the block ends. Raises TakeError."""

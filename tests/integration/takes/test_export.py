@@ -42,7 +42,7 @@ def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -
     (tmp_path / "damaged.lcmlog").write_bytes(content[:-100])
     done = run_in_process("export", tmp_path / "damaged.lcmlog", tmp_path / "DAMAGED.MCAP")
     assert done.returncode == 0
-    assert "note: the take is damaged at 2 places: " in done.stderr
+    assert "\tthe take is damaged at 2 places\t" in done.stderr
 
 
 EXISTS = "exists already, and nothing is overwritten"
@@ -51,12 +51,21 @@ EXISTS = "exists already, and nothing is overwritten"
 @pytest.mark.parametrize(
     ("name", "options", "problem", "status"),
     [
-        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .csv or .mcap", 2),
+        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .mot, .sto, .csv or .mcap", 2),
         ("walk", (), "walk has no known extension", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
         ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
         ("a.trc", ("--source", "studio"), "has no source 'studio'; its sources are: lab", 2),
         ("a.trc", ("--from", "3000"), "has no markers", 2),
+        ("a.csv", ("--forward", "-x"), "--forward is for .trc, .mot or --opensim only", 2),
+        ("a.mot", ("--bodies", "calcn_r"), "--bodies is for --opensim only", 2),
+        (
+            "a",
+            ("--opensim", "--bodies", "toes,heel"),
+            "--bodies must have a name for each plate in walk.mot: 1, not 2",
+            2,
+        ),
+        ("walk.c3d", ("--opensim",), EXISTS, 1),
     ],
 )
 def test_what_cannot_be_exported_leaves_no_file(
@@ -151,7 +160,7 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
         record.send_signal(signal.SIGINT)
         assert record.wait(30) == 0
     [note] = run_in_process("export", take, copy).stderr.splitlines()
-    assert "time 0 is its first frame" in note
+    assert "time 0 is the first frame" in note
     expected, found = (read_ezc3d(path) for path in (original, copy))
     events = [content["parameters"]["EVENT"] for content in (expected, found)]
     assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]

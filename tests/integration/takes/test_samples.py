@@ -120,7 +120,7 @@ def test_the_simulator_serves_both(option: str) -> None:
 
 def test_the_take_is_exported(tmp_path: Path) -> None:
     """The manual exports this file to each format."""
-    for extension in ("c3d", "trc", "csv", "mcap"):
+    for extension in ("c3d", "trc", "mot", "sto", "csv", "mcap"):
         ended = run_in_process("export", TAKE, tmp_path / f"walk.{extension}")
         assert ended.returncode == 0, ended.stderr
         assert [*tmp_path.glob(f"walk*.{extension}")]

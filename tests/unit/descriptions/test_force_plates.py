@@ -11,14 +11,25 @@ from gateway.descriptions.force_plates import (
     EIGHT_FORCES,
     FORCES_AND_MOMENTS,
     channels_from_loads,
+    force_on,
     geometry_of,
+    ground_reactions,
     is_equal,
     loads_from_channels,
     moment_factor,
     own_channels,
+    placed_plates,
     possible_types,
+    up_axis_of,
 )
-from gateway.rtc3d.parameters import AnalogChannel, ParametersAnalog, Plate, Point
+from gateway.rtc3d.parameters import (
+    AnalogChannel,
+    Parameters,
+    ParametersAnalog,
+    ParametersForce,
+    Plate,
+    Point,
+)
 
 CORNERS = (Point(508, 464, 0), Point(508, 0, 10), Point(0, 0, 10), Point(0, 464, 0))
 PLATE = Plate("1", corners=CORNERS, origin=Point(1.5, -0.8, -34))
@@ -94,3 +105,57 @@ def test_loads_are_compared_by_the_largest_of_their_kind() -> None:
     assert not is_equal(loads, loads + np.array([1, 0, 0, 0, 0, 0]))
     assert not is_equal(loads, loads + np.array([0, 0, 0, 0, 0, 60]))
     assert is_equal(np.zeros((0, 6)), np.zeros((0, 6)))
+
+
+def plate_with(*corners: tuple[float, float, float]) -> Parameters:
+    return Parameters(force=ParametersForce((Plate("1", corners=tuple(Point(*each) for each in corners)),)))
+
+
+def test_plates_that_lie_flat_tell_what_is_up_unless_they_disagree() -> None:
+    x_up = plate_with((0, 0, 0), (0, 400, 0), (0, 400, 600), (0, 0, 600))
+    y_up = plate_with((0, 0, 0), (0, 0, 400), (600, 0, 400), (600, 0, 0))
+    z_up = plate_with((0, 0, 0), (400, 0, 0), (400, 600, 0), (0, 600, 0))
+    tilted = plate_with((0, 0, 0), (400, 0, 300), (400, 600, 300), (0, 600, 0))
+    assert [up_axis_of([Parameters(), each]) for each in (x_up, y_up, z_up)] == ["x", "y", "z"]
+    for plates in ([y_up, z_up], [tilted], [Parameters()]):
+        assert up_axis_of(plates) is None
+
+
+LOADS = np.array(
+    [
+        # 800 N upwards, 100 N to the side; 0.1 m from the centre along x, 0.05 m along y; 4 Nm about it.
+        [100.0, 0, 800, 40, -80, 4 - 5],
+        [0, 0, 9, 0.5, 0, 0],
+        [0, 0, math.nan, 0, 0, 0],
+    ]
+)
+
+
+def test_ground_reactions_worked_out_by_hand() -> None:
+    """M = r × F + T: with r = (0.1, 0.05, 0) and F = (100, 0, 800), r × F is (40, -80, -5)."""
+    found = ground_reactions(LOADS, np.array([0.0, 0, 1]), np.array([0.2, 0.3, 0.01]))
+    assert found.forces.tolist() == [[100, 0, 800], [0, 0, 0], [0, 0, 0]]
+    assert found.positions[0] == pytest.approx([0.3, 0.35, 0.01])
+    assert found.positions[1:].tolist() == [[0.2, 0.3, 0.01]] * 2
+    assert found.free_moments[0] == pytest.approx([0, 0, 4])
+    assert not found.free_moments[1:].any()
+    below = ground_reactions(LOADS, np.array([0.0, 0, 1]), np.zeros(3), min_force_n=9)
+    assert below.forces[1].tolist() == [0, 0, 9]
+    assert below.positions[1] == pytest.approx([0, 0.5 / 9, 0])
+
+
+def test_ground_reactions_without_a_limit_are_those_of_the_live_view() -> None:
+    """Of a plate that is tilted, in the axes of the laboratory."""
+    geometry = geometry_of(PLATE, "m")
+    assert geometry
+    [plate] = placed_plates(Parameters(force=ParametersForce((PLATE,))))
+    assert plate
+    loads = np.random.default_rng(3).normal(size=(20, 6)) * 300
+    loads[0] = 0
+    found = ground_reactions(loads, geometry.rotation[:, 2], geometry.corners.mean(axis=0), min_force_n=0)
+    for row, load in enumerate(loads.tolist()):
+        live = force_on(plate, tuple(load))
+        if live is not None:
+            assert found.positions[row] == pytest.approx(live.position)
+            assert found.forces[row] == pytest.approx(live.force)
+    assert np.isfinite(np.concatenate(found)).all()

@@ -1,4 +1,4 @@
-"""Numbers and text from the network as HTML, the camera, and which axis points up."""
+"""Numbers and text from the network as HTML, and the camera."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gateway.display.statistics import Percentiles
-from gateway.display.view.scene import sphere_around, up_axis_of
-from gateway.display.view.scene_items import MAX_M, UpAxis, on_floor, positions_in_metres
+from gateway.display.view.scene import sphere_around
+from gateway.display.view.scene_items import MAX_M, positions_in_metres
 from gateway.display.view.texts import (
     NONE,
     age_text,
@@ -20,7 +20,6 @@ from gateway.display.view.texts import (
     rate_text,
     share_text,
 )
-from gateway.rtc3d.parameters import Parameters, ParametersForce, Plate, Point
 
 
 def test_text_from_the_network_is_shown_and_is_no_html() -> None:
@@ -84,16 +83,3 @@ def test_the_sphere_is_around_all_points() -> None:
         assert 0 < sphere.radius < limit  # one point far away does not move the camera away
     assert sphere_around([points((NAN, NAN, NAN))]) is None
     assert sphere_around([]) is None
-
-
-def plate_on(up: UpAxis, *, tilted: bool = False) -> Parameters:
-    corners = ((0, 0, 0.0), (400, 0, 300.0 * tilted), (400, 600, 300.0 * tilted), (0, 600, 0.0))
-    plate = Plate("1", corners=tuple(Point(*on_floor(up, *corner)) for corner in corners))
-    return Parameters(force=ParametersForce((plate,)))
-
-
-def test_plates_that_lie_flat_tell_what_is_up_unless_they_disagree() -> None:
-    axes: tuple[UpAxis, ...] = ("x", "y", "z")
-    assert [up_axis_of([Parameters(), plate_on(up)]) for up in axes] == ["x", "y", "z"]
-    for plates in ([plate_on("y"), plate_on("z")], [plate_on("z", tilted=True)], [Parameters()]):
-        assert up_axis_of(plates) is None

@@ -78,7 +78,12 @@ class C3d:
 def export_c3d(folder: Path, messages: Iterable[Message], **options: Any) -> tuple[C3d, list[str]]:
     """Export to out.c3d; return what ezc3d reads, and the notes of the export."""
     job = export_messages(folder, messages, "out.c3d", **options)
-    return C3d(folder / "out.c3d"), job.notes
+    return C3d(folder / "out.c3d"), notes_of(job)
+
+
+def notes_of(job: ExportJob) -> list[str]:
+    """Return what the table of an export says, the cells of each row between bars."""
+    return [" | ".join(filter(None, note)) for note in job.notes]
 
 
 class IndependentC3d(NamedTuple):

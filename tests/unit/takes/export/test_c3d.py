@@ -174,7 +174,7 @@ def test_labels_that_c3d_cannot_hold_are_changed_and_reported(tmp_path: Path) ->
     messages = points(*[[(1, 2, 3, 0)] * 4] * 3)
     found, notes = export_c3d(tmp_path, [labelled(*labels), *messages])
     assert found("POINT", "LABELS") == ["a_b", "Ä" * 60, "x" * 120, "x" * 118 + "_2"]
-    assert notes == ["4 labels of markers were changed, because a C3D file cannot hold them"]
+    assert notes == ["labels of markers changed, because a C3D file cannot hold them | 4"]
 
 
 @pytest.mark.parametrize("num_markers", [255, 256, 600, 4000])
@@ -201,9 +201,8 @@ def test_a_long_recording_has_all_its_frames(tmp_path: Path) -> None:
 def test_a_take_without_parameters(tmp_path: Path) -> None:
     found, notes = export_c3d(tmp_path, [description(), *scene_messages(SCENE, 20)])
     assert notes == [
-        "the take has no parameters of lab: labels, units and rates are not known",
-        "forces of plates without parameters were left out: 2, because their corners are not known; "
-        "export to .csv has them",
+        "no parameters of lab in the take: labels, units and rates are not known",
+        "plates without parameters left out; .csv has their forces | 2",
     ]
     assert found("POINT", "LABELS") == [f"marker {n}" for n in range(1, 6)]
     assert (*found("POINT", "RATE"), *found("ANALOG", "RATE")) == (100, 1000)
@@ -225,7 +224,7 @@ def test_readers_find_the_exact_ratio_of_odd_rates(tmp_path: Path, rate_hz: floa
 def test_analog_with_a_rate_that_c3d_cannot_have_is_reported(tmp_path: Path) -> None:
     odd = SyntheticScene(markers=2, tools=0, analog=3, plates=0, rate_hz=100, analog_rate_hz=250)
     found, [note] = export_c3d(tmp_path, scene(50, odd))
-    assert note.startswith("analog was left out: in C3D, its rate must be a multiple of that of the frames;")
+    assert note == "analog left out: its rate is not a multiple of that of the frames; export to .sto has it"
     assert found.points.shape == (4, 2, 50)
 
 
@@ -317,5 +316,5 @@ def test_own_channels_are_used_if_they_give_the_recorded_loads(
 
 def test_a_plate_without_corners_is_reported(tmp_path: Path) -> None:
     found, [note] = export_c3d(tmp_path, plate_messages(Plate("1", "left"), np.ones((5, 2)), np.ones((5, 6))))
-    assert note == "force plate 1 (left) was left out: its parameters do not give the corners of a rectangle"
+    assert note == "force plate 1 (left) left out: its parameters do not give the corners of a rectangle"
     assert found.analog.shape == (2, 5)

@@ -20,6 +20,7 @@ from tests.unit.takes.export.exported import (
     export_messages,
     float32,
     labelled,
+    notes_of,
     read_independently,
     samples,
     scene,
@@ -48,8 +49,8 @@ def test_lost_frames_are_empty_and_the_others_keep_their_places(tmp_path: Path) 
     lost = {ComponentType.MARKERS: {10, 11, 30}, ComponentType.ANALOG: {205, 206}}
     found, notes = export_c3d(tmp_path, scene(50, keep=lambda key, number: number not in lost.get(key, ())))
     assert notes == [
-        "out.c3d: 3 of 50 frames are missing in the take; they are empty",
-        "out.c3d: 2 analog samples are missing in the take; they are NaN",
+        "out.c3d | frames missing in the take are empty | 3 of 50",
+        "out.c3d | analog samples missing in the take are NaN | 2",
     ]
     assert np.flatnonzero(np.isnan(found.points[0]).all(axis=0)).tolist() == [10, 11, 30]
     assert np.array_equal(found.points[0, :, 12:13], x_of(12, 13), equal_nan=True)
@@ -77,7 +78,7 @@ def test_what_markers_and_analog_do_not_both_have_at_the_ends_is_left_out(
     assert found.points.shape[2] == last - first
     assert np.array_equal(found.analog[:3], samples(10 * first, 10 * last))
     assert np.array_equal(found.points[0], x_of(first, last), equal_nan=True)
-    assert ("frames at the ends were left out" in "".join(notes)) == (last - first < len(markers))
+    assert ("frames at the ends left out" in "".join(notes)) == (last - first < len(markers))
 
 
 def test_each_measurement_is_a_file(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ def test_each_measurement_is_a_file(tmp_path: Path) -> None:
     ]
     job, files = export_all(tmp_path, messages)
     assert [path.name for path in job.files.paths] == ["walk-1.c3d", "walk-2.c3d", "walk-3.c3d"]
-    assert job.notes[0] == "there are 3 measurements, so there are 3 files"
+    assert notes_of(job)[0] == "several measurements, each with files of its own | 3"
     for found, count in zip(files, (20, 30, 10), strict=True):
         assert found.points.shape[2] == count
         assert np.array_equal(found.analog[:3], samples(0, 10 * count))
@@ -111,7 +112,7 @@ def test_each_set_of_labels_is_a_file(tmp_path: Path) -> None:
 def test_frames_without_items_begin_no_new_measurement(tmp_path: Path) -> None:
     frames = [frame(ComponentType.MARKERS, [] if n % 5 == 2 else [(n, 2, 3, 0)], n) for n in range(20)]
     _, notes = export_c3d(tmp_path, [labelled("a"), *frames])
-    assert notes == ["out.c3d: 4 of 20 frames are missing in the take; they are empty"]
+    assert notes == ["out.c3d | frames missing in the take are empty | 4 of 20"]
     content = read_independently(tmp_path / "out.c3d")
     assert content.is_visible[:, 0].tolist() == [n % 5 != 2 for n in range(20)]
     assert content.points[3, 0, 0] == 3

@@ -11,7 +11,7 @@ from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.files import component_rows, spool
 from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, scene_messages
-from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled
+from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled, notes_of
 from tests.unit.takes.export.test_trc import read_trc
 
 ANALOG = frame(ComponentType.ANALOG, [1, 2])
@@ -96,13 +96,13 @@ def test_trc_and_csv_count_from_the_beginning_of_the_take(tmp_path: Path) -> Non
 def test_a_c3d_file_counts_from_its_first_frame_and_says_when_that_was(
     tmp_path: Path, from_s: float | None, first: float
 ) -> None:
-    notes = export_messages(tmp_path, messages(), "walk.c3d", from_s=from_s).notes
+    notes = notes_of(export_messages(tmp_path, messages(), "walk.c3d", from_s=from_s))
     found = C3d(tmp_path / "walk.c3d")
     assert found("TRIAL", "TIME_OFFSET") == pytest.approx([first], abs=0.01)
     [text] = found("TRIAL", "DATE_TIME")
     later = datetime.fromisoformat(text) - datetime.fromisoformat(f"{BEGIN}Z")
     assert later.total_seconds() == pytest.approx(first, abs=0.01)
-    pattern = rf"walk\.c3d: time 0 is its first frame, {first:.1f}\d\d s after .* \({text}\)"
+    pattern = rf"walk\.c3d \| time 0 is the first frame, {text} \| {first:.1f}\d\d s after the beginning"
     assert sum(bool(re.fullmatch(pattern, note)) for note in notes) == 1
 
 
@@ -124,7 +124,8 @@ def test_a_take_that_does_not_fit_into_memory_becomes_the_same_file(
     assert len(in_memory.files.paths) > 1
     for expected, found in zip(in_memory.files.paths, on_disk.files.paths, strict=True):
         assert found.read_bytes() == expected.read_bytes().replace(b"memory", b"memory2")
-    assert [note.replace("memory2", "memory") for note in on_disk.notes] == in_memory.notes
+    named = [note._replace(file=note.file.replace("memory2", "memory")) for note in on_disk.notes]
+    assert named == in_memory.notes
 
 
 def test_a_full_disk_for_what_does_not_fit_into_memory_is_reported(

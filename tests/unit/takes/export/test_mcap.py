@@ -47,7 +47,7 @@ from tests.support.takes import (
     parameters,
     scene_messages,
 )
-from tests.unit.takes.export.exported import export_messages
+from tests.unit.takes.export.exported import export_messages, notes_of
 from tests.unit.takes.export.read_mcap import (
     McapContent,
     assert_equals_take,
@@ -146,7 +146,9 @@ def test_markers_are_in_metres_without_missing_ones(tmp_path: Path, name: str, m
 
 def test_an_unknown_unit_is_reported(tmp_path: Path) -> None:
     job = export_messages(tmp_path, [unit("furlong"), markers(1)], "walk.mcap")
-    assert job.notes == ["lab: the unit of length 'furlong' is unknown; positions are shown as if it were mm"]
+    assert notes_of(job) == [
+        "lab: the unit of length 'furlong' is unknown; positions are shown as if it were mm"
+    ]
 
 
 def test_visible_tools_are_transforms_from_the_source_to_their_labels(tmp_path: Path) -> None:
@@ -304,7 +306,7 @@ def test_frames_with_very_many_channels_are_left_out_and_reported(tmp_path: Path
     values = np.arange(10_001).tolist()
     messages = [frame(ComponentType.ANALOG, values[1:]), frame(ComponentType.ANALOG, values, 1)]
     job = export_messages(tmp_path, messages, "walk.mcap")
-    assert job.notes[1:] == ["messages with more than 10000 numbers in analog of lab were left out: 1"]
+    assert notes_of(job)[1:] == ["messages with more than 10000 numbers in analog of lab left out | 1"]
     [log] = read_mcap(tmp_path / "walk.mcap").topics["/lab/analog"]
     assert list(floats_of(log.content).values()) == values[1:]
 
@@ -338,11 +340,11 @@ def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
     damaged = [(channel, data) for data in (truncated, too_many, message[:20], early, late)]
     damaged.append((unit("mm")[0], unit("mm")[1][:-1]))
     job = export_messages(tmp_path, [unit("mm"), markers(2), *damaged, other], "walk.mcap")
-    assert sorted(job.notes) == [
-        "malformed messages of 3d of lab were left out: 3",
-        "malformed messages of parameters of lab were left out: 1",
-        "messages from before 1970 or after 2106 in 3d of lab were left out: 2",
-        "messages of other programs or versions were left out: 1, on the channels MOCAP_LAB_OTHER",
+    assert sorted(notes_of(job)) == [
+        "malformed messages of 3d of lab left out | 3",
+        "malformed messages of parameters of lab left out | 1",
+        "messages from before 1970 or after 2106 in 3d of lab left out | 2",
+        "messages of other programs or versions left out, on the channels MOCAP_LAB_OTHER | 1",
     ]
     assert len(read_mcap(tmp_path / "walk.mcap").topics["/lab/markers"]) == 1
 

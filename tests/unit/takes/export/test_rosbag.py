@@ -13,7 +13,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, Parameters6D, ParametersForce, Plate, Tool
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
-from gateway.takes.export.job import ExportJob
+from gateway.takes.export.job import ExportJob, Note
 from tests.support.takes import START_UTIME, frame, parameters, scene_messages
 from tests.unit.takes.export.exported import NAN, export_messages, labelled
 
@@ -42,7 +42,7 @@ class Bag:
 
 
 def export(folder: Path, *messages: Any, **options: Any) -> tuple[Bag, ExportJob]:
-    job = export_messages(folder, messages, "out.mcap", is_for_ros2=True, **options)
+    job = export_messages(folder, messages, "out.mcap", format="ros2", **options)
     return Bag(folder / "out.mcap"), job
 
 
@@ -104,8 +104,10 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     }
     points = np.frombuffer(bag.messages["/mocap/lab/markers"][0][1].data, "<f4").reshape(-1, 5)
     assert np.array_equal(points[:, 0], np.array([1e-3, NAN], np.float32), equal_nan=True)
-    assert "events of lab were left out: 1" in job.notes
-    assert "messages from before 1970 or after 2106 in analog of lab were left out: 1" in job.notes
+    assert [(note.what, note.amount) for note in job.notes] == [
+        ("events of lab left out", "1"),
+        ("messages from before 1970 or after 2106 in analog of lab left out", "1"),
+    ]
 
 
 def test_units_of_plates_are_converted_and_unknown_lengths_left_out(tmp_path: Path) -> None:
@@ -121,12 +123,12 @@ def test_units_of_plates_are_converted_and_unknown_lengths_left_out(tmp_path: Pa
     _, job = export(
         tmp_path, labelled("a", unit="furlong"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)]), load
     )
-    assert "markers with the unknown unit 'furlong' of lab were left out: 1" in job.notes
+    assert Note("out.mcap", "markers with the unknown unit 'furlong' of lab left out", "1") in job.notes
 
 
 def test_a_bag_of_another_format_or_of_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SelectionError, match=r"no extension of a bag of ROS 2; choose \.mcap"):
-        export_messages(tmp_path, [labelled("a")], "out.c3d", is_for_ros2=True)
+    with pytest.raises(SelectionError, match=r"out\.c3d does not end in \.mcap"):
+        export_messages(tmp_path, [labelled("a")], "out.c3d", format="ros2")
     with pytest.raises(TakeError, match="has no markers, tools, analog channels or forces"):
-        export_messages(tmp_path, [labelled("a")], "out.mcap", is_for_ros2=True)
+        export_messages(tmp_path, [labelled("a")], "out.mcap", format="ros2")
     assert not (tmp_path / "out.mcap").exists()
