@@ -32,7 +32,7 @@ test: .venv/installed
 
 # What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
 # commands in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view site)
+SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_PYTHON)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
@@ -102,10 +102,10 @@ RELEASE := $(RELEASE_PYTHON) -B -m release
 
 release: $(RELEASE_PYTHON) build/release-packages/complete
 	@[ -z "$$(git status --porcelain)" ] || { echo 'A release is built from a commit: commit your changes first.' >&2; exit 1; }
-	rm -rf dist
+	rm -rf dist && mkdir dist
 	$(RELEASE).audit requirements-view.txt
-	$(MAKE) --no-print-directory $(ARTEFACTS)
 	$(RELEASE).licences build/release-packages/bin/python dist/THIRD_PARTY.txt
+	$(MAKE) --no-print-directory $(ARTEFACTS)
 	cd dist && LC_ALL=C sha256sum * >../build/SHA256SUMS && mv ../build/SHA256SUMS .
 	@echo "Built in dist/: $$(ls dist | wc -l) files."
 

@@ -2,8 +2,8 @@
 
     build/release-venv/bin/python -m release.audit [--osv-url URL] requirements.txt
 
-Without an answer from OSV, it prints that it could not check. With CI=true, as in the release workflow, that is
-an error. A vulnerability always is.
+Without an answer from OSV, it prints that it could not check. With CI=true, as in the release workflow, that
+is an error. A vulnerability always is.
 """
 
 import argparse

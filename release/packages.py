@@ -11,9 +11,9 @@ _COPIED_KEYS: Final = ("type", "name", "version", "scope", "hashes", "licenses",
 
 
 def packages_of(python: str) -> list[Distribution]:
-    """Return what is installed for a Python, without pip and the gateway."""
+    """Return what is installed for a Python, without the gateway."""
     folder = run(python, "-I", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip()
-    found = (each for each in distributions(path=[folder]) if each.name not in {"rtc3d-gateway", "pip"})
+    found = (each for each in distributions(path=[folder]) if each.name != "rtc3d-gateway")
     return sorted(found, key=lambda package: package.name.lower())
 
 

@@ -68,7 +68,8 @@ def bill_of_file(file: Path, packages: dict[str, Any]) -> dict[str, Any]:
         "hashes": [{"alg": "SHA-256", "content": digest}],
         "properties": [{"name": "file", "value": file.name}],
     }
-    if not file.name.endswith((".tar.gz", "-none-any.whl")):  # all others contain compiled modules
+    is_pure = file.name.startswith("rtc3d_gateway-") and file.name.endswith((".tar.gz", "-none-any.whl"))
+    if not is_pure:
         version = mypy().version
         purl = f"pkg:pypi/mypy@{version}"
         runtime = {"type": "library", "name": "mypy", "version": version, "purl": purl}

