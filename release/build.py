@@ -111,12 +111,11 @@ def compiler_environment(folder: Path) -> dict[str, str]:
 
 
 def run(*command: str | Path, cwd: Path | None = None, env: Mapping[str, str] | None = None) -> str:
-    """Run a command and return its output; if it fails, end this program with that output."""
-    result = subprocess.run(
-        command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
-    )
+    """Run a command and return its output; if it fails, end this program with all it has printed."""
+    result = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
     if result.returncode:
-        sys.exit(f"{result.stdout}\nThis command failed: {shlex.join(map(str, command))}")
+        failed = shlex.join(map(str, command))
+        sys.exit(f"{result.stdout}{result.stderr}\nThis command failed: {failed}")
     return result.stdout
 
 
