@@ -14,6 +14,7 @@ UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 SYSTEM_PYTHON ?= /usr/bin/python3
 
 # The tools of a release, in a venv of their own: they must not change the versions that the tests use.
+RELEASE_TOOLS := build/release-venv/complete
 RELEASE_PYTHON := build/release-venv/bin/python
 
 # What the compiled modules are built from.
@@ -34,7 +35,7 @@ test: .venv/installed
 # commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site)
 
-test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_PYTHON)
+test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
@@ -100,7 +101,7 @@ wheel:
 ARTEFACTS := wheels
 RELEASE := $(RELEASE_PYTHON) -B -m release
 
-release: $(RELEASE_PYTHON) build/release-packages/complete
+release: $(RELEASE_TOOLS) build/release-packages/complete
 	@[ -z "$$(git status --porcelain)" ] || { echo 'A release is built from a commit: commit your changes first.' >&2; exit 1; }
 	rm -rf dist && mkdir dist
 	$(RELEASE).audit requirements-view.txt
@@ -110,13 +111,13 @@ release: $(RELEASE_PYTHON) build/release-packages/complete
 	@echo "Built in dist/: $$(ls dist | wc -l) files."
 
 # The sdist, a wheel for any Python, and a compiled wheel for each Python that this machine has.
-wheels: $(RELEASE_PYTHON) build/release-packages/complete
+wheels: $(RELEASE_TOOLS) build/release-packages/complete
 	$(RELEASE).wheels
 	$(RELEASE).sbom build/release-packages/bin/python dist/rtc3d_gateway-*.tar.gz dist/rtc3d_gateway-*.whl
 
 # Build a release twice, in different surroundings, and compare the check sums.
-reproducible: $(RELEASE_PYTHON)
-	$(RELEASE).reproducible
+reproducible:
+	$(PYTHON) -B -m release.reproducible
 
 # The compiled gateway, for tests and measurements. Programs run with $(COMPILED) import it instead of the sources.
 COMPILED := PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/compiled
@@ -164,7 +165,7 @@ uninstall:
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
 # Download the packages that an installation needs: its tests have no network.
-wheelhouse: build/wheelhouse/complete $(RELEASE_PYTHON)
+wheelhouse: build/wheelhouse/complete $(RELEASE_TOOLS)
 
 build/wheelhouse/complete: pyproject.toml requirements.txt release/build-requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv
@@ -179,14 +180,14 @@ define timed
 @set -e; echo '$(1) (about $(2)) …'; start=$$(date +%s); $(3); echo "Done in $$(($$(date +%s) - start)) s."
 endef
 
-$(RELEASE_PYTHON): release/tool-requirements.txt
+$(RELEASE_TOOLS): release/tool-requirements.txt
 	$(call timed,Installing the tools of a release into build/release-venv,15 s,rm -rf build/release-venv; \
 	    $(PYTHON) -m venv build/release-venv; \
 	    build/release-venv/bin/pip install --quiet --require-hashes --requirement release/tool-requirements.txt)
 	@touch $@
 
 # The packages that a wheel installs with all its extras.
-build/release-packages/complete: requirements-view.txt $(RELEASE_PYTHON)
+build/release-packages/complete: requirements-view.txt $(RELEASE_TOOLS)
 	$(call timed,Installing the packages of a release into build/release-packages,30 s,rm -rf $(@D); \
 	    $(PYTHON) -m venv --without-pip $(@D); build/release-venv/bin/pip --python $(@D)/bin/python install --quiet \
 	    --require-hashes --requirement requirements-view.txt)

@@ -85,7 +85,7 @@ def reproducible_environment() -> dict[str, str]:
     """Return environment variables for a build whose output depends on the sources only."""
     kept = {name: text for name, text in os.environ.items() if not name.startswith(("HATCH_", "PYTHON"))}
     environment = {**kept, "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8", "TZ": "UTC"}
-    if (ROOT / ".git").exists():
+    if (ROOT / ".git").exists() and shutil.which("git"):
         # `sudo make install` runs as another user than the owner of the repository.
         commit_time = run("git", "-c", "safe.directory=*", "log", "-1", "--format=%ct", cwd=ROOT)
         environment["SOURCE_DATE_EPOCH"] = commit_time.strip()

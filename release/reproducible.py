@@ -1,6 +1,6 @@
 """Build a release twice and compare the check sums of its files.
 
-    build/release-venv/bin/python -m release.reproducible
+    python3 -m release.reproducible
 
 Each build has a clone of its own. They differ in folder, umask, time zone, language and time.
 """
@@ -28,7 +28,7 @@ def main() -> None:
             clone = Path(folder, name)
             os.umask(umask)
             run("git", "clone", "--quiet", ROOT, clone)
-            run("make", "release", cwd=clone, env={**os.environ, **variables})
+            run("make", "release", cwd=clone, env={**os.environ, **variables, "MAKEFLAGS": ""})
             builds.append(set((clone / "dist/SHA256SUMS").read_text().splitlines()))
     first, second = builds
     for line in sorted(first & second):

@@ -17,7 +17,7 @@ from release.build import ROOT, reproducible_environment, run
 
 DIST: Final = ROOT / "dist"
 MINOR_VERSIONS: Final = range(11, 15)
-"""The versions 3.x that the gateway is tested with."""
+"""The versions 3.x for which a release has compiled wheels."""
 
 _CAN_COMPILE: Final = "from release.build import missing_to_compile; assert not missing_to_compile()"
 
