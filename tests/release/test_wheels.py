@@ -81,6 +81,14 @@ def test_with_a_compiler_the_wheel_is_compiled_for_this_platform(compiled: Built
     assert compiled.wheel.name.endswith(f"{sysconfig.get_platform().replace('-', '_')}.whl")
 
 
+def test_a_compiled_module_names_no_folder_of_the_machine_that_built_it(compiled: Built) -> None:
+    """Otherwise another machine would not build the same bytes."""
+    skip_if_plain(compiled.output)
+    wheel = zipfile.ZipFile(compiled.wheel)
+    modules = [wheel.read(name) for name in compiled.names_in_wheel if name.endswith(".so")]
+    assert not any(path in module for module in modules for path in (b"/tmp/", b"/include/python"))
+
+
 def test_a_compiled_wheel_runs_with_old_versions_of_glibc(compiled: Built, tmp_path: Path) -> None:
     """pip refuses a wheel for ``linux`` from an index, and takes one for ``manylinux``."""
     skip_if_plain(compiled.output)
