@@ -106,8 +106,8 @@ def compiler_environment(folder: Path) -> dict[str, str]:
         "HATCH_BUILD_HOOK_ENABLE_MYPYC": "1",
         "CC": compiler,
         "CFLAGS": " ".join(flags),
-        # Python's own value may have a folder of this machine as an rpath. mypyc adds debug information, which
-        # has the folder of Python's headers.
+        # Python's own value may have a folder of this machine as an rpath. mypyc adds debug information, in
+        # which the folder of Python's headers is.
         "LDSHARED": f"{compiler} -shared -Wl,--strip-debug",
     }
 
