@@ -31,7 +31,8 @@ settings.load_profile("gateway")
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
 _GROUPS: Final = {
-    "installation": ("tests/systemd/", "tests/packaging/test_wheel.py"),
+    "installation": ("tests/systemd/",),
+    "release": ("tests/release/",),
     "outages": ("tests/outages/",),
     "sites": ("tests/hostile/test_sites.py",),
     "proxy": ("tests/hostile/test_https_proxy.py",),

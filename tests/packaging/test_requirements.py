@@ -1,6 +1,7 @@
 """The requirements files have a tested version of every dependency that pyproject.toml names.
 
 requirements-view.txt has those of all extras; requirements.txt has the same ones without those of ``view``.
+The files in release/ have the tools of a build and of a release.
 """
 
 import re
@@ -12,10 +13,22 @@ from packaging.requirements import Requirement
 
 from tests.support.fresh_clones import ROOT
 
-PROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PYPROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT: Final = PYPROJECT["project"]
 EXTRAS: Final = PROJECT["optional-dependencies"]
 NAMES: Final = {"requirements.txt": EXTRAS.keys() - {"view"}, "requirements-view.txt": EXTRAS.keys()}
 """The extras whose dependencies each file has."""
+
+_MYPYC: Final = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"]
+WANTED: Final[dict[str, list[str]]] = {
+    **{
+        name: [*PROJECT["dependencies"], *(text for extra in extras for text in EXTRAS[extra])]
+        for name, extras in NAMES.items()
+    },
+    "release/build-requirements.txt": [*PYPROJECT["build-system"]["requires"], *_MYPYC["dependencies"]],
+    "release/tool-requirements.txt": PYPROJECT["dependency-groups"]["release"],
+}
+"""What pyproject.toml requires of each file."""
 
 
 def text_of(name: str) -> str:
@@ -27,7 +40,7 @@ def locked_in(name: str) -> list[Requirement]:
     return [Requirement(line.removesuffix(" \\")) for line in lines]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", WANTED)
 @pytest.mark.parametrize("python", ["3.11", "3.12", "3.13", "3.14"])
 def test_every_dependency_is_locked_once_in_a_version_that_it_accepts(python: str, name: str) -> None:
     environment = {
@@ -36,8 +49,7 @@ def test_every_dependency_is_locked_once_in_a_version_that_it_accepts(python: st
         "sys_platform": "linux",
         "platform_machine": "x86_64",
     }
-    extras = (EXTRAS[extra] for extra in NAMES[name])
-    for wanted in (Requirement(text) for texts in (PROJECT["dependencies"], *extras) for text in texts):
+    for wanted in map(Requirement, WANTED[name]):
         [locked] = [
             each
             for each in locked_in(name)
@@ -48,12 +60,20 @@ def test_every_dependency_is_locked_once_in_a_version_that_it_accepts(python: st
         assert specifier.version in wanted.specifier, "run make lock"
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", WANTED)
 def test_every_package_has_hashes_and_no_address(name: str) -> None:
     entries = re.split(r"\n(?! )", text_of(name).strip())
     assert len(entries) == len(locked_in(name))
     assert all("--hash=sha256:" in entry for entry in entries)
     assert "://" not in text_of(name)
+
+
+def test_the_runtime_in_the_compiled_modules_is_that_of_the_mypy_in_the_bill_of_materials() -> None:
+    [compiler], [described] = (
+        [each for each in locked_in(f"release/{name}-requirements.txt") if each.name == "mypy"]
+        for name in ("build", "tool")
+    )
+    assert compiler == described
 
 
 def test_the_service_has_the_same_versions_without_the_view() -> None:
