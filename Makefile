@@ -3,11 +3,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 # Where `make install` puts its files. Units in /etc/systemd/system belong to the administrator and cannot be masked, so
-# they go to $(LIB)/systemd/system.
+# they go to $(USR)/lib/systemd/system. The Debian package has its files in USR=/usr, below DESTDIR.
 PREFIX := /opt/rtc3d-gateway
 CONFIG := /etc/rtc3d-gateway
-LIB := /usr/local/lib
-MAN := /usr/local/share/man/man1
+USR := /usr/local
+DESTDIR :=
+MAN_PAGE := $(USR)/share/man/man1/rtc3d-gateway.1
+BASH_COMPLETION := $(USR)/share/bash-completion/completions/rtc3d-gateway
+FISH_COMPLETION := $(USR)/share/fish/vendor_completions.d/rtc3d-gateway.fish
 UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 
 # The Python for tests of the installation. It must be one that sudo finds and that the service can read.
@@ -128,28 +131,36 @@ install:
 	$(PYTHON) -m venv $(PREFIX)/venv
 	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
 	$(call pip,$(PREFIX)/venv/bin/python,install --quiet --upgrade --no-deps)
-	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d $(MAN) /usr/local/bin
-	for unit in $(UNITS); do sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(LIB)/systemd/system/$$unit; done
-	install -m 644 systemd/sysusers.conf $(LIB)/sysusers.d/rtc3d-gateway.conf
-	install -m 644 systemd/tmpfiles.conf $(LIB)/tmpfiles.d/rtc3d-gateway.conf
+	$(MAKE) --no-print-directory install-files PYTHON=$(PREFIX)/venv/bin/python
 	systemd-sysusers rtc3d-gateway.conf
 	systemd-tmpfiles --create rtc3d-gateway.conf
-	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
-	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
-	$(PREFIX)/venv/bin/python -P -m gateway.cli.man_page >$(MAN)/rtc3d-gateway.1
-	chmod 644 $(MAN)/rtc3d-gateway.1
-	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 	@echo 'Enter your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
+
+# What an installation from source and the Debian package have in common, apart from the program itself. PYTHON must
+# have the gateway.
+install-files:
+	install -d $(addprefix $(DESTDIR)$(USR)/,bin lib/systemd/system lib/sysusers.d lib/tmpfiles.d)
+	install -d $(DESTDIR)$(CONFIG) $(dir $(addprefix $(DESTDIR),$(MAN_PAGE) $(BASH_COMPLETION) $(FISH_COMPLETION)))
+	for unit in $(UNITS); do \
+	    sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(DESTDIR)$(USR)/lib/systemd/system/$$unit; done
+	install -m 644 systemd/sysusers.conf $(DESTDIR)$(USR)/lib/sysusers.d/rtc3d-gateway.conf
+	install -m 644 systemd/tmpfiles.conf $(DESTDIR)$(USR)/lib/tmpfiles.d/rtc3d-gateway.conf
+	[ -e $(DESTDIR)$(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(DESTDIR)$(CONFIG)/gateway.yaml
+	install -m 644 config/gateway.schema.json $(DESTDIR)$(CONFIG)/gateway.schema.json
+	umask 022; $(PYTHON) -P -m gateway.cli.man_page >$(DESTDIR)$(MAN_PAGE)
+	umask 022; _RTC3D_GATEWAY_COMPLETE=source_bash $(PYTHON) -P -m gateway >$(DESTDIR)$(BASH_COMPLETION)
+	umask 022; _RTC3D_GATEWAY_COMPLETE=source_fish $(PYTHON) -P -m gateway >$(DESTDIR)$(FISH_COMPLETION)
+	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway $(DESTDIR)$(USR)/bin/rtc3d-gateway
 
 # Run as root. This keeps the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
 # owns them.
 uninstall:
 	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
-	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
-	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(MAN)/rtc3d-gateway.1 \
-	    $(CONFIG)/gateway.schema.json
+	rm -f $(UNITS:%=$(USR)/lib/systemd/system/%) $(USR)/lib/sysusers.d/rtc3d-gateway.conf \
+	    $(USR)/lib/tmpfiles.d/rtc3d-gateway.conf $(USR)/bin/rtc3d-gateway $(MAN_PAGE) $(BASH_COMPLETION) \
+	    $(FISH_COMPLETION) $(CONFIG)/gateway.schema.json
 	rm -rf $(PREFIX)/venv
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
