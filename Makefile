@@ -20,7 +20,8 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
-    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
+    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install install-files uninstall \
+    deb deb-lock clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -165,6 +166,21 @@ uninstall:
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
+# Build the Debian package in dist/. It has the Python of Debian 12, and needs that of the machine to be the same.
+deb: build/wheelhouse/complete
+	rm -rf build/deb/wheel
+	$(call pip,build/wheelhouse-venv/bin/python,wheel --quiet --no-deps --wheel-dir build/deb/wheel)
+	build/wheelhouse-venv/bin/python -m release.deb.build build/deb/wheel/*.whl build/wheelhouse
+
+# Renew the versions of the packages of Debian that the Debian package contains.
+DEB_LOCK := release/deb/packages.txt
+
+deb-lock:
+	apt-get update
+	names=$$(sed -n 's/^\([^# ]*\) .*/\1/p' $(DEB_LOCK)); comments=$$(grep '^#' $(DEB_LOCK)); \
+	{ echo "$$comments"; apt-cache show --no-all-versions $$names | awk '/^Package:/ { name = $$2 } \
+	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
+
 # Download the packages that an installation needs: its tests have no network.
 BUILD_REQUIRES = import tomllib; project = tomllib.load(open("pyproject.toml", "rb")); \
     hook = project["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"]; \
@@ -172,10 +188,10 @@ BUILD_REQUIRES = import tomllib; project = tomllib.load(open("pyproject.toml", "
 
 wheelhouse: build/wheelhouse/complete
 
-build/wheelhouse/complete: pyproject.toml requirements.txt
+build/wheelhouse/complete: pyproject.toml requirements-view.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv
 	$(SYSTEM_PYTHON) -m venv build/wheelhouse-venv
-	build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse --require-hashes --requirement requirements.txt
+	build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse --require-hashes --requirement requirements-view.txt
 	build/wheelhouse-venv/bin/pip wheel --quiet --wheel-dir build/wheelhouse pip \
 	    $$(build/wheelhouse-venv/bin/python -c '$(BUILD_REQUIRES)')
 	touch $@

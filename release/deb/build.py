@@ -2,11 +2,13 @@
 
     python3.11 -m release.deb.build WHEEL WHEELHOUSE
 
-WHEEL is the gateway compiled for Python 3.11, and WHEELHOUSE a folder with the packages of requirements.txt. The same
+WHEEL is the gateway compiled for Python 3.11, and WHEELHOUSE a folder with the
+packages of requirements-view.txt. The same
 commit and wheel give the same bytes: versions, hashes and times are fixed.
 """
 
 import argparse
+import email.utils
 import gzip
 import hashlib
 import os
@@ -29,16 +31,19 @@ LIBRARY: Final = "lib/python3.11"
 DOCUMENTS: Final = "usr/share/doc/rtc3d-gateway"
 
 # Only what minimal installations of Debian 12 and 13 and of Ubuntu 24.04 have, so that no network is needed. These
-# libraries get the security updates of the distribution. patchelf and others are needed by the build only.
+# libraries get the security updates of the distribution.
+DEPENDS: Final = (
+    *("libbz2-1.0", "libc6 (>= 2.36)", "libffi8 (>= 3.4)", "libgcc-s1 (>= 4.2)", "liblzma5", "libpcre2-8-0"),
+    *("libssl3 (>= 3.0.0) | libssl3t64", "libstdc++6 (>= 11)", "libuuid1", "zlib1g"),
+    *("systemd | systemd-standalone-sysusers", "systemd | systemd-standalone-tmpfiles"),
+)
 CONTROL: Final = """\
 Package: rtc3d-gateway
 Version: {version}
 Architecture: amd64
 Maintainer: RTC3D gateway maintainers <maintainers@example.org>
 Installed-Size: {size_kib}
-Depends: libbz2-1.0, libc6 (>= 2.36), libffi8 (>= 3.4), libgcc-s1 (>= 4.2), liblzma5, libpcre2-8-0 (>= 10.22),
- libssl3 (>= 3.0.0) | libssl3t64, libstdc++6 (>= 11), libuuid1, zlib1g (>= 1:1.2.2),
- systemd | systemd-standalone-sysusers, systemd | systemd-standalone-tmpfiles
+Depends: {depends}
 Section: science
 Priority: optional
 Description: gateway from RTC3D motion-capture servers to Zenoh and LCM
@@ -50,6 +55,14 @@ Description: gateway from RTC3D motion-capture servers to Zenoh and LCM
  /opt/rtc3d-gateway. It needs no network to install.
 """
 
+CHANGELOG: Final = """\
+rtc3d-gateway ({version}) unstable; urgency=medium
+
+  * CHANGELOG.md.gz in this folder says what is new.
+
+ -- RTC3D gateway maintainers <maintainers@example.org>  {date}
+"""
+
 # Modules that need libraries of their own, and tests.
 UNUSED_OF_PYTHON: Final = (
     *("test", "sqlite3", "curses", "pydoc_data", "venv", "sitecustomize.py", "EXTERNALLY-MANAGED"),
@@ -57,6 +70,9 @@ UNUSED_OF_PYTHON: Final = (
     *(f"lib-dynload/{name}.*" for name in ("_crypt", "_curses", "_curses_panel", "_dbm", "_sqlite3")),
     *(f"lib-dynload/{name}.*" for name in ("nis", "ossaudiodev", "readline")),
 )
+
+# Only these folders have programs. (Packages also mark libraries and data as executable.)
+PROGRAMS: Final = tuple(f"{folder}/bin" for folder in (PYTHON, VENV))
 
 # Tests, sources in C, programs and libraries for developers, and what pip notes about this machine. dpkg owns the
 # files, so pip must not find a RECORD by which it would remove them.
@@ -77,16 +93,21 @@ class DebianPackage(NamedTuple):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("wheel", type=Path)
     parser.add_argument("wheelhouse", type=Path)
-    parser.add_argument("--version", default=__version__, help="version of the package, for tests of upgrades")
+    parser.add_argument(
+        "--version", default=__version__, help="version of the package, for tests of upgrades"
+    )
+    parser.add_argument("--compression", default="xz", help="as for dpkg-deb; `none` is quick, for tests")
     parser.add_argument("--output", type=Path, default=ROOT / "dist")
     arguments = parser.parse_args()
     if sys.version_info[:2] != (3, 11):
         sys.exit("The package has the Python of Debian 12: build it there, with PYTHON=/usr/bin/python3.11.")
     os.umask(0o022)
-    os.environ |= {"SOURCE_DATE_EPOCH": commit_time(), "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
+    os.environ |= {"SOURCE_DATE_EPOCH": str(commit_time()), "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
     with tempfile.TemporaryDirectory(prefix="rtc3d-gateway-deb-") as folder:
         debian, stage = Path(folder, "debian"), Path(folder, "stage")
         for package in debian_packages():
@@ -94,16 +115,22 @@ def main() -> None:
         stage_python(debian, stage)
         stage_packages(stage, arguments.wheel, arguments.wheelhouse)
         stage_shared_files(stage)
-        stage_documents(debian, stage)
+        stage_documents(debian, stage, arguments.version)
         compile_modules(stage)
         write_control_files(stage, arguments.version)
-        print(pack(stage, arguments.output / f"rtc3d-gateway_{arguments.version}_amd64.deb"))
+        print(
+            pack(
+                stage,
+                arguments.output / f"rtc3d-gateway_{arguments.version}_amd64.deb",
+                arguments.compression,
+            )
+        )
 
 
-def commit_time() -> str:
+def commit_time() -> int:
     """Return the time of the last commit, in seconds since 1970."""
     git = ["git", "-c", "safe.directory=*", "-C", str(ROOT)]
-    return subprocess.check_output([*git, "log", "-1", "--format=%ct"], text=True).strip()
+    return int(subprocess.check_output([*git, "log", "-1", "--format=%ct"]))
 
 
 def debian_packages() -> Iterator[DebianPackage]:
@@ -121,9 +148,13 @@ def download(package: DebianPackage) -> Path:
     if not path.exists():
         command = ["apt-get", "download", "--quiet=2", f"{package.name}={package.version}"]
         if subprocess.run(command, cwd=folder, check=False).returncode:
-            sys.exit(f"apt-get has no {package.name} {package.version}: run `apt-get update`, or `make deb-lock`.")
+            sys.exit(
+                f"apt-get has no {package.name} {package.version}: run `apt-get update`, or `make deb-lock`."
+            )
     if (found := hashlib.sha256(path.read_bytes()).hexdigest()) != package.sha256:
-        sys.exit(f"{path} has the SHA-256 {found}, not the one in release/deb/packages.txt. Delete it and retry.")
+        sys.exit(
+            f"{path} has the SHA-256 {found}, not the one in release/deb/packages.txt. Delete it and retry."
+        )
     return path
 
 
@@ -134,7 +165,11 @@ def stage_python(debian: Path, stage: Path) -> None:
     remove(python / LIBRARY, UNUSED_OF_PYTHON)
     libraries = debian / "usr/lib/x86_64-linux-gnu"
     for library in ("libglib-2.0.so.0", "libexpat.so.1"):
-        found = next(folder / library for folder in (libraries, debian / "lib/x86_64-linux-gnu") if (folder / library).exists())
+        found = next(
+            folder / library
+            for folder in (libraries, debian / "lib/x86_64-linux-gnu")
+            if (folder / library).exists()
+        )
         shutil.copyfile(found, python / "lib" / library)
     binary = python / "bin/python3.11"
     binary.parent.mkdir()
@@ -144,25 +179,24 @@ def stage_python(debian: Path, stage: Path) -> None:
     subprocess.run([*patchelf, binary], check=True)
 
     (venv / "bin").mkdir(parents=True)
-    (venv / "pyvenv.cfg").write_text(f"home = /{PYTHON}/bin\ninclude-system-site-packages = false\nversion = 3.11\n")
+    (venv / "pyvenv.cfg").write_text(
+        f"home = /{PYTHON}/bin\ninclude-system-site-packages = false\nversion = 3.11\n"
+    )
     (venv / "bin/python3.11").symlink_to("../../python/bin/python3.11")
     for name in ("python", "python3"):
         (venv / "bin" / name).symlink_to("python3.11")
 
 
 def stage_packages(stage: Path, wheel: Path, wheelhouse: Path) -> None:
-    """Install the gateway and the packages of requirements.txt, and the program that starts the gateway."""
+    """Install the gateway and the packages of requirements-view.txt, and the program that starts the gateway."""
     packages = stage / VENV / LIBRARY / "site-packages"
     pip = [sys.executable, "-m", "pip", "install", "-qq", "--no-compile", "--no-deps", "--no-index"]
     pip += ["--root-user-action=ignore", "--disable-pip-version-check", "--target", str(packages)]
-    requirements = ["--require-hashes", "--requirement", ROOT / "requirements.txt"]
+    requirements = ["--require-hashes", "--requirement", ROOT / "requirements-view.txt"]
     subprocess.run([*pip, "--find-links", wheelhouse, *requirements], check=True)
     subprocess.run([*pip, wheel], check=True)
     remove(packages, UNUSED_OF_PACKAGES)
-    for library in packages.glob("*__mypyc*.so"):
-        subprocess.run(["strip", "--strip-unneeded", library], check=True)
-    for library in (packages / "gateway").rglob("*.so"):
-        subprocess.run(["strip", "--strip-unneeded", library], check=True)
+    subprocess.run(["strip", "--strip-unneeded", *packages.rglob("*.so*")], check=True)  # a fifth of the size
     program = stage / VENV / "bin/rtc3d-gateway"
     program.write_text(
         f"#!/{VENV}/bin/python\nimport sys\n\nfrom gateway.__main__ import main\n\n"
@@ -176,23 +210,38 @@ def stage_shared_files(stage: Path) -> None:
     # The staged Python runs from here, without its virtual environment, which names the final place.
     packages = stage / VENV / LIBRARY / "site-packages"
     python = f"PYTHONPATH={packages} {stage / PYTHON}/bin/python3.11 -B"
-    make = ["make", "--silent", "-C", ROOT, "install-files", f"DESTDIR={stage}", "USR=/usr", f"PYTHON=env {python}"]
+    make = [
+        "make",
+        "--silent",
+        "-C",
+        ROOT,
+        "install-files",
+        f"DESTDIR={stage}",
+        "USR=/usr",
+        f"PYTHON=env {python}",
+    ]
     subprocess.run(make, check=True, env={**os.environ, "MAKEFLAGS": ""})
     compress(stage / "usr/share/man/man1/rtc3d-gateway.1")
     # Editors find the schema beside the configuration. It is no configuration file, which upgrades would keep.
     schema = stage / "usr/share/rtc3d-gateway/gateway.schema.json"
     schema.parent.mkdir()
     (stage / "etc/rtc3d-gateway/gateway.schema.json").rename(schema)
-    (stage / "etc/rtc3d-gateway/gateway.schema.json").symlink_to("../../usr/share/rtc3d-gateway/gateway.schema.json")
+    (stage / "etc/rtc3d-gateway/gateway.schema.json").symlink_to(
+        "/usr/share/rtc3d-gateway/gateway.schema.json"
+    )
 
 
-def stage_documents(debian: Path, stage: Path) -> None:
+def stage_documents(debian: Path, stage: Path, version: str) -> None:
     """Stage the changelog, and the licences of everything in the package."""
     documents = stage / DOCUMENTS
     documents.mkdir(parents=True)
     shutil.copyfile(HERE / "copyright", documents / "copyright")
-    shutil.copyfile(ROOT / "CHANGELOG.md", documents / "changelog")
-    compress(documents / "changelog")
+    shutil.copyfile(ROOT / "CHANGELOG.md", documents / "CHANGELOG.md")
+    (documents / "changelog").write_text(
+        CHANGELOG.format(version=version, date=email.utils.formatdate(commit_time()))
+    )
+    for name in ("CHANGELOG.md", "changelog"):
+        compress(documents / name)
     for package in debian_packages():
         if package.name != "patchelf":
             # The folder of a package may be a link to that of another one.
@@ -236,7 +285,9 @@ def write_control_files(stage: Path, version: str) -> None:
     control.mkdir()
     files = sorted(path for path in stage.rglob("*") if path.is_file() and not path.is_symlink())
     size_kib = sum((path.stat().st_size + 1023) // 1024 for path in files)
-    (control / "control").write_text(CONTROL.format(version=version, size_kib=size_kib))
+    (control / "control").write_text(
+        CONTROL.format(version=version, size_kib=size_kib, depends=", ".join(DEPENDS))
+    )
     (control / "conffiles").write_text("/etc/rtc3d-gateway/gateway.yaml\n")
     (control / "md5sums").write_text(
         "".join(
@@ -250,14 +301,24 @@ def write_control_files(stage: Path, version: str) -> None:
         (control / name).chmod(0o755)
 
 
-def pack(stage: Path, output: Path) -> Path:
+def pack(stage: Path, output: Path, compression: str) -> Path:
     """Write the package; modes, owners, times and the number of threads do not depend on the machine."""
+    commit_time_s = commit_time()
     for path in stage.rglob("*"):
         if not path.is_symlink():
-            path.chmod(0o755 if path.is_dir() or path.stat().st_mode & 0o100 else 0o644)
-        os.utime(path, (int(os.environ["SOURCE_DATE_EPOCH"]),) * 2, follow_symlinks=False)
+            program = any(path.is_relative_to(stage / folder) for folder in ("DEBIAN", *PROGRAMS))
+            path.chmod(0o755 if path.is_dir() or (program and path.stat().st_mode & 0o100) else 0o644)
+        os.utime(path, (commit_time_s, commit_time_s), follow_symlinks=False)
     output.parent.mkdir(exist_ok=True)
-    command = ["dpkg-deb", "--root-owner-group", "-Zxz", "--threads-max=2", "--build", stage, output]
+    command = [
+        "dpkg-deb",
+        "--root-owner-group",
+        f"-Z{compression}",
+        "--threads-max=2",
+        "--build",
+        stage,
+        output,
+    ]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return output
 
