@@ -80,7 +80,9 @@ def bill_of_file(file: Path, packages: dict[str, Any]) -> dict[str, Any]:
     if file.suffix == ".deb":
         bill["components"] += [
             {
-                "type": "library", "name": package.name, "version": package.version,
+                "type": "library",
+                "name": package.name,
+                "version": package.version,
                 "purl": f"pkg:deb/debian/{package.name}@{quote(package.version)}?arch=amd64&distro=bookworm",
                 "hashes": [{"alg": "SHA-256", "content": package.sha256}],
             }
