@@ -83,8 +83,7 @@ UNUSED_OF_PACKAGES: Final = (
 )
 
 
-# The largest libraries with symbols; without, the package is 8 MB smaller. What auditwheel has changed, such as numpy,
-# does not survive stripping.
+# The largest libraries with symbols. What auditwheel has changed, such as numpy, does not survive stripping.
 STRIPPED: Final = ("foxglove/*.so", "uvloop/*.so", "zenoh/*.so")
 
 
