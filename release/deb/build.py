@@ -77,7 +77,16 @@ PROGRAMS: Final = tuple(f"{folder}/bin" for folder in (PYTHON, VENV))
 # the files, so pip must not find a RECORD by which it would remove them.
 UNUSED_OF_PACKAGES: Final = (
     *("bin", "include", "lib", "share", "**/tests", "**/*.a"),
-    *("**/*.c", "**/*.cpp", "**/*.h", "**/*.pxd", "**/*.pxi", "**/*.pyx", "viser/client/src"),
+    *(
+        "**/*.c",
+        "**/*.cpp",
+        "**/*.h",
+        "**/*.pxd",
+        "**/*.pxi",
+        "**/*.pyx",
+        "viser/client/src",
+        "viser/client/.gitignore",
+    ),
     *("numpy/f2py", "numpy/distutils", "numpy/_core/*tests*.so"),
     *("*.dist-info/RECORD", "*.dist-info/REQUESTED", "*.dist-info/INSTALLER", "*.dist-info/direct_url.json"),
 )
