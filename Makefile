@@ -3,11 +3,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 # Where `make install` puts its files. Units in /etc/systemd/system belong to the administrator and cannot be masked, so
-# they go to $(LIB)/systemd/system.
+# they go to $(USR)/lib/systemd/system. The Debian package has its files in USR=/usr, below DESTDIR.
 PREFIX := /opt/rtc3d-gateway
 CONFIG := /etc/rtc3d-gateway
-LIB := /usr/local/lib
-MAN := /usr/local/share/man/man1
+USR := /usr/local
+DESTDIR :=
+MAN_PAGE := $(USR)/share/man/man1/rtc3d-gateway.1
+BASH_COMPLETION := $(USR)/share/bash-completion/completions/rtc3d-gateway
+FISH_COMPLETION := $(USR)/share/fish/vendor_completions.d/rtc3d-gateway.fish
 UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 
 # The Python for tests of the installation. It must be one that sudo finds and that the service can read.
@@ -20,9 +23,9 @@ RELEASE_PYTHON := build/release-venv/bin/python
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs site lcm-types examples samples \
-    screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release wheels \
-    reproducible wheel compiled wheelhouse install uninstall clone-url clean
+.PHONY: demo lock test test-slow test-install test-compiled check lint types contracts generated docs site lcm-types examples \
+    samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
+    wheels reproducible deb deb-lock wheel compiled wheelhouse install install-files uninstall clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -107,7 +110,7 @@ wheel:
 
 # Everything that a release publishes, in dist/: for each file a bill of materials, the licences, and the check sums.
 # A further kind of file is a further target in ARTEFACTS. It puts its files, with a bill of its own, into dist/.
-ARTEFACTS := wheels
+ARTEFACTS := wheels deb
 RELEASE := $(RELEASE_PYTHON) -B -m release
 
 release: $(RELEASE_TOOLS) build/release-packages/complete
@@ -141,45 +144,71 @@ build/compiled/complete: .venv/installed $(shell find $(SOURCES) ! -path '*__pyc
 
 # Run as root. The service's user cannot read home directories, so its Python must not be in one.
 install:
+	@[ ! -e /usr/lib/systemd/system/rtc3d-gateway.service ] || { \
+	    echo 'The Debian package is installed, with its files in the same place: apt remove rtc3d-gateway' >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; home = sys.base_prefix.startswith(("/home/", "/root/")); \
 	    sys.exit(f"the service cannot read {sys.base_prefix}, which is in a home directory; run make with PYTHON=/usr/bin/python3" if home else 0)'
 	$(PYTHON) -m venv $(PREFIX)/venv
 	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
 	@set -e; dist=$$(mktemp -d); trap 'rm -rf "$$dist"' EXIT; $(PYTHON) -B -m release.build --dist "$$dist" wheel; \
 	    $(PREFIX)/venv/bin/pip install --quiet --force-reinstall --no-deps "$$dist"/*.whl
-	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d $(MAN) /usr/local/bin
-	for unit in $(UNITS); do sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(LIB)/systemd/system/$$unit; done
-	install -m 644 systemd/sysusers.conf $(LIB)/sysusers.d/rtc3d-gateway.conf
-	install -m 644 systemd/tmpfiles.conf $(LIB)/tmpfiles.d/rtc3d-gateway.conf
+	$(MAKE) --no-print-directory install-files PYTHON=$(PREFIX)/venv/bin/python
 	systemd-sysusers rtc3d-gateway.conf
 	systemd-tmpfiles --create rtc3d-gateway.conf
-	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
-	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
-	$(PREFIX)/venv/bin/python -P -m gateway.cli.man_page >$(MAN)/rtc3d-gateway.1
-	chmod 644 $(MAN)/rtc3d-gateway.1
-	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 	@echo 'Enter your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
+
+# What an installation from source and the Debian package have in common, apart from the program itself. PYTHON must
+# have the gateway.
+install-files:
+	install -d $(addprefix $(DESTDIR)$(USR)/,bin lib/systemd/system lib/sysusers.d lib/tmpfiles.d)
+	install -d $(DESTDIR)$(CONFIG) $(dir $(addprefix $(DESTDIR),$(MAN_PAGE) $(BASH_COMPLETION) $(FISH_COMPLETION)))
+	for unit in $(UNITS); do \
+	    sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(DESTDIR)$(USR)/lib/systemd/system/$$unit; done
+	install -m 644 systemd/sysusers.conf $(DESTDIR)$(USR)/lib/sysusers.d/rtc3d-gateway.conf
+	install -m 644 systemd/tmpfiles.conf $(DESTDIR)$(USR)/lib/tmpfiles.d/rtc3d-gateway.conf
+	[ -e $(DESTDIR)$(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(DESTDIR)$(CONFIG)/gateway.yaml
+	install -m 644 config/gateway.schema.json $(DESTDIR)$(CONFIG)/gateway.schema.json
+	umask 022; $(PYTHON) -P -m gateway.cli.man_page >$(DESTDIR)$(MAN_PAGE)
+	umask 022; _RTC3D_GATEWAY_COMPLETE=source_bash $(PYTHON) -P -m gateway >$(DESTDIR)$(BASH_COMPLETION)
+	umask 022; _RTC3D_GATEWAY_COMPLETE=source_fish $(PYTHON) -P -m gateway >$(DESTDIR)$(FISH_COMPLETION)
+	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway $(DESTDIR)$(USR)/bin/rtc3d-gateway
 
 # Run as root. This keeps the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
 # owns them.
 uninstall:
 	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
-	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
-	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(MAN)/rtc3d-gateway.1 \
-	    $(CONFIG)/gateway.schema.json
+	rm -f $(UNITS:%=$(USR)/lib/systemd/system/%) $(USR)/lib/sysusers.d/rtc3d-gateway.conf \
+	    $(USR)/lib/tmpfiles.d/rtc3d-gateway.conf $(USR)/bin/rtc3d-gateway $(MAN_PAGE) $(BASH_COMPLETION) \
+	    $(FISH_COMPLETION) $(CONFIG)/gateway.schema.json
 	rm -rf $(PREFIX)/venv
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
+# Build the Debian package in dist/. It has the Python of Debian 12, and needs that of the machine to be the same.
+deb: build/wheelhouse/complete $(RELEASE_TOOLS) build/release-packages/complete
+	rm -rf build/deb/wheel
+	build/wheelhouse-venv/bin/python -B -m release.build --dist build/deb/wheel compiled
+	build/wheelhouse-venv/bin/python -B -m release.deb.build build/deb/wheel/*.whl build/wheelhouse
+	$(RELEASE).sbom build/release-packages/bin/python dist/rtc3d-gateway_*.deb
+
+# Renew the versions of the packages of Debian that the Debian package contains.
+DEB_LOCK := release/deb/packages.txt
+
+deb-lock:
+	apt-get update
+	names=$$(sed -n 's/^\([^# ]*\) .*/\1/p' $(DEB_LOCK)); comments=$$(grep '^#' $(DEB_LOCK)); \
+	{ echo "$$comments"; apt-cache show --no-all-versions $$names | awk '/^Package:/ { name = $$2 } \
+	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
+
 # Download the packages that an installation needs: its tests have no network.
 wheelhouse: build/wheelhouse/complete $(RELEASE_TOOLS)
 
-build/wheelhouse/complete: pyproject.toml requirements.txt release/build-requirements.txt
+build/wheelhouse/complete: pyproject.toml requirements-view.txt release/build-requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv
 	$(SYSTEM_PYTHON) -m venv build/wheelhouse-venv
-	set -e; for file in requirements.txt release/build-requirements.txt; do \
+	set -e; for file in requirements-view.txt release/build-requirements.txt; do \
 	    build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse --require-hashes --requirement $$file; done
 	build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse pip
 	touch $@
