@@ -3,21 +3,28 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 # Where `make install` puts its files. Units in /etc/systemd/system belong to the administrator and cannot be masked, so
-# they go to $(LIB)/systemd/system.
+# they go to $(USR)/lib/systemd/system. The Debian package has its files in USR=/usr, below DESTDIR.
 PREFIX := /opt/rtc3d-gateway
 CONFIG := /etc/rtc3d-gateway
-LIB := /usr/local/lib
-MAN := /usr/local/share/man/man1
+USR := /usr/local
+DESTDIR :=
+MAN_PAGE := $(USR)/share/man/man1/rtc3d-gateway.1
+BASH_COMPLETION := $(USR)/share/bash-completion/completions/rtc3d-gateway
+FISH_COMPLETION := $(USR)/share/fish/vendor_completions.d/rtc3d-gateway.fish
 UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 
 # The Python for tests of the installation. It must be one that sudo finds and that the service can read.
 SYSTEM_PYTHON ?= /usr/bin/python3
 
-# What a wheel is built from.
-SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
+# The tools of a release, in a venv of their own: they must not change the versions that the tests use.
+RELEASE_PYTHON := build/release-venv/bin/python
+
+# What the compiled modules are built from.
+SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
-    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
+    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel wheels compiled wheelhouse \
+    install install-files uninstall deb deb-lock clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -88,28 +95,13 @@ samples: .venv/installed
 screenshots: .venv/installed
 	tests/with-netns unshare --uts sh -c 'echo mocap-pc >/proc/sys/kernel/hostname && exec $(BIN)/python -m tests.screenshots'
 
-# Print what the compilation for a Python lacks: the C compiler that it would call, or its headers.
-MISSING = import os, shutil, sysconfig; \
-    compiler = (os.environ.get("CC") or sysconfig.get_config_var("CC")).split()[0]; \
-    header = sysconfig.get_path("include") + "/Python.h"; \
-    print(" and ".join([compiler] * (not shutil.which(compiler)) + [header] * (not os.path.exists(header))))
-
-# $(call pip,PYTHON,PIP COMMAND[,EXTRAS]): run a pip command on the gateway, compiled if possible.
-# mypyc writes its output beside the sources, and Python would import that output instead of the sources. It therefore
-# compiles a copy. The flags save 3 % of the instructions per frame: with hidden visibility, compiled modules call each
-# other directly, and with no-plt they call Python's own functions without a stub.
-define pip
-@set -e; copy=$$(mktemp -d); trap 'rm -rf "$$copy"' EXIT; cp -R $(SOURCES) "$$copy"; \
-missing=$$($(1) -c '$(MISSING)'); \
-if [ -z "$$missing" ]; then export HATCH_BUILD_HOOK_ENABLE_MYPYC=1 CFLAGS="$$CFLAGS -fvisibility=hidden -fno-plt"; \
-else echo "Not compiled; missing: $$missing (Debian: apt-get install gcc python3-dev)." \
-    "The gateway works the same but needs more CPU time per frame."; fi; \
-$(1) -m pip $(2) "$$copy$(3)"
-endef
-
-# Build a wheel for `pipx install dist/*.whl`.
+# Build a wheel for `pipx install dist/*.whl`, compiled for $(PYTHON) if possible.
 wheel:
-	$(call pip,$(PYTHON),wheel --quiet --no-deps --wheel-dir dist)
+	@$(PYTHON) -B -m release.build wheel
+
+# Build the sdist, a wheel for any Python, and a compiled wheel for each Python that this machine has.
+wheels: $(RELEASE_PYTHON)
+	$(RELEASE_PYTHON) -B -m release.wheels
 
 # The compiled gateway, for tests and measurements. Programs run with $(COMPILED) import it instead of the sources.
 COMPILED := PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/compiled
@@ -118,7 +110,8 @@ compiled: build/compiled/complete
 
 build/compiled/complete: .venv/installed $(shell find $(SOURCES) ! -path '*__pycache__*')
 	rm -rf build/compiled
-	$(call pip,$(BIN)/python,install --quiet --no-deps --target build/compiled)
+	$(BIN)/python -B -m release.build --dist build/compiled/wheel wheel
+	$(BIN)/pip install --quiet --no-deps --target build/compiled build/compiled/wheel/*.whl
 	touch $@
 
 # Run as root. The service's user cannot read home directories, so its Python must not be in one.
@@ -127,52 +120,78 @@ install:
 	    sys.exit(f"the service cannot read {sys.base_prefix}, which is in a home directory; run make with PYTHON=/usr/bin/python3" if home else 0)'
 	$(PYTHON) -m venv $(PREFIX)/venv
 	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
-	$(call pip,$(PREFIX)/venv/bin/python,install --quiet --upgrade --no-deps)
-	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d $(MAN) /usr/local/bin
-	for unit in $(UNITS); do sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(LIB)/systemd/system/$$unit; done
-	install -m 644 systemd/sysusers.conf $(LIB)/sysusers.d/rtc3d-gateway.conf
-	install -m 644 systemd/tmpfiles.conf $(LIB)/tmpfiles.d/rtc3d-gateway.conf
+	@set -e; dist=$$(mktemp -d); trap 'rm -rf "$$dist"' EXIT; $(PYTHON) -B -m release.build --dist "$$dist" wheel; \
+	    $(PREFIX)/venv/bin/pip install --quiet --force-reinstall --no-deps "$$dist"/*.whl
+	$(MAKE) --no-print-directory install-files PYTHON=$(PREFIX)/venv/bin/python
 	systemd-sysusers rtc3d-gateway.conf
 	systemd-tmpfiles --create rtc3d-gateway.conf
-	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
-	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
-	$(PREFIX)/venv/bin/python -P -m gateway.cli.man_page >$(MAN)/rtc3d-gateway.1
-	chmod 644 $(MAN)/rtc3d-gateway.1
-	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 	@echo 'Enter your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
+
+# What an installation from source and the Debian package have in common, apart from the program itself. PYTHON must
+# have the gateway.
+install-files:
+	install -d $(addprefix $(DESTDIR)$(USR)/,bin lib/systemd/system lib/sysusers.d lib/tmpfiles.d)
+	install -d $(DESTDIR)$(CONFIG) $(dir $(addprefix $(DESTDIR),$(MAN_PAGE) $(BASH_COMPLETION) $(FISH_COMPLETION)))
+	for unit in $(UNITS); do \
+	    sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(DESTDIR)$(USR)/lib/systemd/system/$$unit; done
+	install -m 644 systemd/sysusers.conf $(DESTDIR)$(USR)/lib/sysusers.d/rtc3d-gateway.conf
+	install -m 644 systemd/tmpfiles.conf $(DESTDIR)$(USR)/lib/tmpfiles.d/rtc3d-gateway.conf
+	[ -e $(DESTDIR)$(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(DESTDIR)$(CONFIG)/gateway.yaml
+	install -m 644 config/gateway.schema.json $(DESTDIR)$(CONFIG)/gateway.schema.json
+	umask 022; $(PYTHON) -P -m gateway.cli.man_page >$(DESTDIR)$(MAN_PAGE)
+	umask 022; _RTC3D_GATEWAY_COMPLETE=source_bash $(PYTHON) -P -m gateway >$(DESTDIR)$(BASH_COMPLETION)
+	umask 022; _RTC3D_GATEWAY_COMPLETE=source_fish $(PYTHON) -P -m gateway >$(DESTDIR)$(FISH_COMPLETION)
+	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway $(DESTDIR)$(USR)/bin/rtc3d-gateway
 
 # Run as root. This keeps the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
 # owns them.
 uninstall:
 	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
-	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
-	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(MAN)/rtc3d-gateway.1 \
-	    $(CONFIG)/gateway.schema.json
+	rm -f $(UNITS:%=$(USR)/lib/systemd/system/%) $(USR)/lib/sysusers.d/rtc3d-gateway.conf \
+	    $(USR)/lib/tmpfiles.d/rtc3d-gateway.conf $(USR)/bin/rtc3d-gateway $(MAN_PAGE) $(BASH_COMPLETION) \
+	    $(FISH_COMPLETION) $(CONFIG)/gateway.schema.json
 	rm -rf $(PREFIX)/venv
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
-# Download the packages that an installation needs: its tests have no network.
-BUILD_REQUIRES = import tomllib; project = tomllib.load(open("pyproject.toml", "rb")); \
-    hook = project["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"]; \
-    print(*project["build-system"]["requires"], *hook["dependencies"])
+# Build the Debian package in dist/. It has the Python of Debian 12, and needs that of the machine to be the same.
+deb: build/wheelhouse/complete
+	rm -rf build/deb/wheel
+	build/wheelhouse-venv/bin/python -B -m release.build --dist build/deb/wheel compiled
+	build/wheelhouse-venv/bin/python -B -m release.deb.build build/deb/wheel/*.whl build/wheelhouse
 
+# Renew the versions of the packages of Debian that the Debian package contains.
+DEB_LOCK := release/deb/packages.txt
+
+deb-lock:
+	apt-get update
+	names=$$(sed -n 's/^\([^# ]*\) .*/\1/p' $(DEB_LOCK)); comments=$$(grep '^#' $(DEB_LOCK)); \
+	{ echo "$$comments"; apt-cache show --no-all-versions $$names | awk '/^Package:/ { name = $$2 } \
+	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
+
+# Download the packages that an installation needs: its tests have no network.
 wheelhouse: build/wheelhouse/complete
 
-build/wheelhouse/complete: pyproject.toml requirements.txt
+build/wheelhouse/complete: pyproject.toml requirements-view.txt release/build-requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv
 	$(SYSTEM_PYTHON) -m venv build/wheelhouse-venv
-	build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse --require-hashes --requirement requirements.txt
-	build/wheelhouse-venv/bin/pip wheel --quiet --wheel-dir build/wheelhouse pip \
-	    $$(build/wheelhouse-venv/bin/python -c '$(BUILD_REQUIRES)')
+	set -e; for file in requirements-view.txt release/build-requirements.txt; do \
+	    build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse --require-hashes --requirement $$file; done
+	build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse pip
 	touch $@
 
 # $(call timed,WHAT,EXPECTED TIME,COMMANDS): say what is done and how long it takes, do it quietly, say how long it took.
 define timed
 @set -e; echo '$(1) (about $(2)) …'; start=$$(date +%s); $(3); echo "Done in $$(($$(date +%s) - start)) s."
 endef
+
+$(RELEASE_PYTHON): release/tool-requirements.txt
+	$(call timed,Installing the tools of a release into build/release-venv,15 s,rm -rf build/release-venv; \
+	    $(PYTHON) -m venv build/release-venv; \
+	    build/release-venv/bin/pip install --quiet --require-hashes --requirement release/tool-requirements.txt)
+	@touch $@
 
 # What running needs, with the live view, in the versions of requirements-view.txt; .venv/installed adds the
 # development tools.
@@ -193,12 +212,19 @@ endef
 UV_COMPILE := build/lock-venv/bin/uv pip compile --quiet --universal --python-version 3.11 --upgrade --generate-hashes \
     --no-annotate --no-header --no-emit-index-url
 
+# What pyproject.toml requires for a build.
+BUILD_REQUIRES = import tomllib; project = tomllib.load(open("pyproject.toml", "rb")); \
+    hook = project["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"]; \
+    print(*project["build-system"]["requires"], *hook["dependencies"], sep="\n")
+
 lock:
 	$(PYTHON) -m venv build/lock-venv
 	build/lock-venv/bin/pip install --quiet uv
 	$(UV_COMPILE) --all-extras --output-file requirements-view.txt pyproject.toml
 	$(UV_COMPILE) --extra c3d --extra foxglove --extra lsl --extra systemd --constraint requirements-view.txt \
 	    --output-file requirements.txt pyproject.toml
+	build/lock-venv/bin/python -c '$(BUILD_REQUIRES)' | $(UV_COMPILE) --output-file release/build-requirements.txt -
+	$(UV_COMPILE) --group release --output-file release/tool-requirements.txt
 
 # Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
 FUZZ_SECONDS ?= 60

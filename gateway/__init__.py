@@ -6,7 +6,7 @@ __version__ = "1.0.0"
 
 
 def version_text() -> str:
-    """Return the version, with "(compiled)" if the modules of the data path are compiled (docs/design.md)."""
+    """Return the version, and whether the modules of the data path are compiled (docs/design.md)."""
     path = find_spec("gateway.publish.fan_out")
     is_python = path is None or path.origin is None or path.origin.endswith(".py")
-    return __version__ if is_python else f"{__version__} (compiled)"
+    return f"{__version__} ({'pure Python' if is_python else 'compiled'})"
