@@ -23,7 +23,7 @@ RELEASE_PYTHON := build/release-venv/bin/python
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
-    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd wheel wheels compiled wheelhouse \
+    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd release wheels reproducible wheel compiled wheelhouse \
     install install-files uninstall deb deb-lock clone-url clean
 
 demo: .venv/runtime
@@ -38,7 +38,7 @@ test: .venv/installed
 # commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view site)
 
-test-slow: .venv/installed build/wheelhouse/complete
+test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_PYTHON)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
@@ -99,9 +99,28 @@ screenshots: .venv/installed
 wheel:
 	@$(PYTHON) -B -m release.build wheel
 
-# Build the sdist, a wheel for any Python, and a compiled wheel for each Python that this machine has.
-wheels: $(RELEASE_PYTHON)
-	$(RELEASE_PYTHON) -B -m release.wheels
+# Everything that a release publishes, in dist/: for each file a bill of materials, the licences, and the check sums.
+# A further kind of file is a further target in ARTEFACTS. It puts its files, with a bill of its own, into dist/.
+ARTEFACTS := wheels deb
+RELEASE := $(RELEASE_PYTHON) -B -m release
+
+release: $(RELEASE_PYTHON) build/release-packages/complete
+	@[ -z "$$(git status --porcelain)" ] || { echo 'A release is built from a commit: commit your changes first.' >&2; exit 1; }
+	rm -rf dist
+	$(RELEASE).audit requirements-view.txt
+	$(MAKE) --no-print-directory $(ARTEFACTS)
+	$(RELEASE).licences build/release-packages/bin/python dist/THIRD_PARTY.txt
+	cd dist && LC_ALL=C sha256sum * >../build/SHA256SUMS && mv ../build/SHA256SUMS .
+	@echo "Built in dist/: $$(ls dist | wc -l) files."
+
+# The sdist, a wheel for any Python, and a compiled wheel for each Python that this machine has.
+wheels: $(RELEASE_PYTHON) build/release-packages/complete
+	$(RELEASE).wheels
+	$(RELEASE).sbom build/release-packages/bin/python dist/rtc3d_gateway-*.tar.gz dist/rtc3d_gateway-*.whl
+
+# Build a release twice, in different surroundings, and compare the check sums.
+reproducible: $(RELEASE_PYTHON)
+	$(RELEASE).reproducible
 
 # The compiled gateway, for tests and measurements. Programs run with $(COMPILED) import it instead of the sources.
 COMPILED := PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/compiled
@@ -172,7 +191,7 @@ deb-lock:
 	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
 
 # Download the packages that an installation needs: its tests have no network.
-wheelhouse: build/wheelhouse/complete
+wheelhouse: build/wheelhouse/complete $(RELEASE_PYTHON)
 
 build/wheelhouse/complete: pyproject.toml requirements-view.txt release/build-requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv
@@ -191,6 +210,13 @@ $(RELEASE_PYTHON): release/tool-requirements.txt
 	$(call timed,Installing the tools of a release into build/release-venv,15 s,rm -rf build/release-venv; \
 	    $(PYTHON) -m venv build/release-venv; \
 	    build/release-venv/bin/pip install --quiet --require-hashes --requirement release/tool-requirements.txt)
+	@touch $@
+
+# The packages that a wheel installs with all its extras.
+build/release-packages/complete: requirements-view.txt $(RELEASE_PYTHON)
+	$(call timed,Installing the packages of a release into build/release-packages,30 s,rm -rf $(@D); \
+	    $(PYTHON) -m venv --without-pip $(@D); build/release-venv/bin/pip --python $(@D)/bin/python install --quiet \
+	    --require-hashes --requirement requirements-view.txt)
 	@touch $@
 
 # What running needs, with the live view, in the versions of requirements-view.txt; .venv/installed adds the
@@ -224,7 +250,7 @@ lock:
 	$(UV_COMPILE) --extra c3d --extra foxglove --extra lsl --extra systemd --constraint requirements-view.txt \
 	    --output-file requirements.txt pyproject.toml
 	build/lock-venv/bin/python -c '$(BUILD_REQUIRES)' | $(UV_COMPILE) --output-file release/build-requirements.txt -
-	$(UV_COMPILE) --group release --output-file release/tool-requirements.txt
+	$(UV_COMPILE) --group release --constraint release/build-requirements.txt --output-file release/tool-requirements.txt
 
 # Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
 FUZZ_SECONDS ?= 60

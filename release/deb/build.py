@@ -1,4 +1,4 @@
-"""Build the Debian package into dist/: the gateway with its own Python and all libraries that bare systems lack.
+"""Build the Debian package into dist/: the gateway, its own Python and the libraries that bare systems lack.
 
     python3.11 -m release.deb.build WHEEL WHEELHOUSE
 
@@ -12,6 +12,7 @@ import email.utils
 import gzip
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,8 +22,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gateway import __version__
+from release.build import ROOT, reproducible_environment, run
 
-ROOT: Final = Path(__file__).parents[2]
 HERE: Final = Path(__file__).parent
 PREFIX: Final = "opt/rtc3d-gateway"
 PYTHON: Final = f"{PREFIX}/python"
@@ -30,8 +31,8 @@ VENV: Final = f"{PREFIX}/venv"
 LIBRARY: Final = "lib/python3.11"
 DOCUMENTS: Final = "usr/share/doc/rtc3d-gateway"
 
-# Only what minimal installations of Debian 12 and 13 and of Ubuntu 24.04 have, so that no network is needed. These
-# libraries get the security updates of the distribution.
+# Only what minimal installations of Debian 12 and 13 and of Ubuntu 24.04 have, so that no network is needed.
+# The distribution updates these libraries.
 DEPENDS: Final = (
     *("libbz2-1.0", "libc6 (>= 2.36)", "libffi8 (>= 3.4)", "libgcc-s1 (>= 4.2)", "liblzma5", "libpcre2-8-0"),
     *("libssl3 (>= 3.0.0) | libssl3t64", "libstdc++6 (>= 11)", "libuuid1", "zlib1g"),
@@ -74,11 +75,11 @@ UNUSED_OF_PYTHON: Final = (
 # Only these folders have programs. (Packages also mark libraries and data as executable.)
 PROGRAMS: Final = tuple(f"{folder}/bin" for folder in (PYTHON, VENV))
 
-# Tests, sources in C, programs and libraries for developers, and what pip notes about this machine. dpkg owns the
-# files, so pip must not find a RECORD by which it would remove them.
+# Tests, sources in C, programs and libraries for developers, and what pip notes about this machine. dpkg owns
+# the files, so pip must not find a RECORD by which it would remove them.
 UNUSED_OF_PACKAGES: Final = (
     *("bin", "include", "lib", "share", "**/tests", "**/*.a"),
-    *("**/*.c", "**/*.cpp", "**/*.h", "**/*.pxd", "**/*.pxi", "**/*.pyx"),
+    *("**/*.c", "**/*.cpp", "**/*.h", "**/*.pxd", "**/*.pxi", "**/*.pyx", "viser/client/src"),
     *("numpy/f2py", "numpy/distutils", "numpy/_core/*tests*.so"),
     *("*.dist-info/RECORD", "*.dist-info/REQUESTED", "*.dist-info/INSTALLER", "*.dist-info/direct_url.json"),
 )
@@ -93,6 +94,7 @@ class DebianPackage(NamedTuple):
 
 
 def main() -> None:
+    """Run the program."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -107,11 +109,13 @@ def main() -> None:
     if sys.version_info[:2] != (3, 11):
         sys.exit("The package has the Python of Debian 12: build it there, with PYTHON=/usr/bin/python3.11.")
     os.umask(0o022)
-    os.environ |= {"SOURCE_DATE_EPOCH": str(commit_time()), "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
+    os.environ |= reproducible_environment()
+    if "SOURCE_DATE_EPOCH" not in os.environ:
+        sys.exit("The package has the time of its commit: build it in a clone, or set SOURCE_DATE_EPOCH.")
     with tempfile.TemporaryDirectory(prefix="rtc3d-gateway-deb-") as folder:
         debian, stage = Path(folder, "debian"), Path(folder, "stage")
         for package in debian_packages():
-            subprocess.run(["dpkg-deb", "--extract", download(package), debian], check=True)
+            run("dpkg-deb", "--extract", download(package), debian)
         stage_python(debian, stage)
         stage_packages(stage, arguments.wheel, arguments.wheelhouse)
         stage_shared_files(stage)
@@ -125,12 +129,6 @@ def main() -> None:
                 arguments.compression,
             )
         )
-
-
-def commit_time() -> int:
-    """Return the time of the last commit, in seconds since 1970."""
-    git = ["git", "-c", "safe.directory=*", "-C", str(ROOT)]
-    return int(subprocess.check_output([*git, "log", "-1", "--format=%ct"]))
 
 
 def debian_packages() -> Iterator[DebianPackage]:
@@ -174,9 +172,8 @@ def stage_python(debian: Path, stage: Path) -> None:
     binary = python / "bin/python3.11"
     binary.parent.mkdir()
     shutil.copy(debian / "usr/bin/python3.11", binary)
-    # DT_RPATH, other than DT_RUNPATH, also serves the libraries of the modules that Python loads: lcm needs GLib.
-    patchelf = [debian / "usr/bin/patchelf", "--force-rpath", "--set-rpath", "$ORIGIN/../lib"]
-    subprocess.run([*patchelf, binary], check=True)
+    # DT_RPATH, other than DT_RUNPATH, also serves the modules that Python loads: lcm needs GLib.
+    run(debian / "usr/bin/patchelf", "--force-rpath", "--set-rpath", "$ORIGIN/../lib", binary)
 
     (venv / "bin").mkdir(parents=True)
     (venv / "pyvenv.cfg").write_text(
@@ -188,15 +185,15 @@ def stage_python(debian: Path, stage: Path) -> None:
 
 
 def stage_packages(stage: Path, wheel: Path, wheelhouse: Path) -> None:
-    """Install the gateway and the packages of requirements-view.txt, and the program that starts the gateway."""
+    """Install the packages of requirements-view.txt, the gateway, and the program that starts it."""
     packages = stage / VENV / LIBRARY / "site-packages"
-    pip = [sys.executable, "-m", "pip", "install", "-qq", "--no-compile", "--no-deps", "--no-index"]
-    pip += ["--root-user-action=ignore", "--disable-pip-version-check", "--target", str(packages)]
-    requirements = ["--require-hashes", "--requirement", ROOT / "requirements-view.txt"]
-    subprocess.run([*pip, "--find-links", wheelhouse, *requirements], check=True)
-    subprocess.run([*pip, wheel], check=True)
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", "--no-deps", "--no-index")
+    pip += ("--find-links", str(wheelhouse), "--target", str(packages))
+    run(*pip, "--require-hashes", "--requirement", ROOT / "requirements-view.txt")
+    run(*pip, wheel)
     remove(packages, UNUSED_OF_PACKAGES)
-    subprocess.run(["strip", "--strip-unneeded", *packages.rglob("*.so*")], check=True)  # a fifth of the size
+    libraries = [path for path in packages.rglob("*") if re.search(r"\.so(\.[0-9.]+)?$", path.name)]
+    run("strip", "--strip-unneeded", *libraries)  # a fifth of the size
     program = stage / VENV / "bin/rtc3d-gateway"
     program.write_text(
         f"#!/{VENV}/bin/python\nimport sys\n\nfrom gateway.__main__ import main\n\n"
@@ -209,20 +206,10 @@ def stage_shared_files(stage: Path) -> None:
     """Stage what an installation from source has, too: units, configuration, man page, completions."""
     # The staged Python runs from here, without its virtual environment, which names the final place.
     packages = stage / VENV / LIBRARY / "site-packages"
-    python = f"PYTHONPATH={packages} {stage / PYTHON}/bin/python3.11 -B"
-    make = [
-        "make",
-        "--silent",
-        "-C",
-        ROOT,
-        "install-files",
-        f"DESTDIR={stage}",
-        "USR=/usr",
-        f"PYTHON=env {python}",
-    ]
-    subprocess.run(make, check=True, env={**os.environ, "MAKEFLAGS": ""})
+    python = f"env PYTHONPATH={packages} {stage / PYTHON}/bin/python3.11 -B"
+    run("make", "-C", ROOT, "install-files", f"DESTDIR={stage}", "USR=/usr", f"PYTHON={python}")
     compress(stage / "usr/share/man/man1/rtc3d-gateway.1")
-    # Editors find the schema beside the configuration. It is no configuration file, which upgrades would keep.
+    # Editors look for the schema beside the configuration, but upgrades would keep a file there.
     schema = stage / "usr/share/rtc3d-gateway/gateway.schema.json"
     schema.parent.mkdir()
     (stage / "etc/rtc3d-gateway/gateway.schema.json").rename(schema)
@@ -238,7 +225,7 @@ def stage_documents(debian: Path, stage: Path, version: str) -> None:
     shutil.copyfile(HERE / "copyright", documents / "copyright")
     shutil.copyfile(ROOT / "CHANGELOG.md", documents / "CHANGELOG.md")
     (documents / "changelog").write_text(
-        CHANGELOG.format(version=version, date=email.utils.formatdate(commit_time()))
+        CHANGELOG.format(version=version, date=email.utils.formatdate(int(os.environ["SOURCE_DATE_EPOCH"])))
     )
     for name in ("CHANGELOG.md", "changelog"):
         compress(documents / name)
@@ -257,7 +244,8 @@ def remove(folder: Path, patterns: tuple[str, ...]) -> None:
     """Remove files and folders by patterns, each of which must match."""
     for pattern in patterns:
         found = list(folder.glob(pattern))
-        assert found, f"{pattern} matches nothing in {folder}"
+        if not found:
+            sys.exit(f"{pattern}, which the package should not contain, matches nothing in {folder}.")
         for path in found:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
@@ -272,11 +260,9 @@ def compress(path: Path) -> None:
 
 
 def compile_modules(stage: Path) -> None:
-    """Write the bytecode of all modules. Nobody but dpkg changes them, so Python need not compare them with it."""
-    python = stage / PYTHON / "bin/python3.11"
-    options = ["-q", "-f", "--invalidation-mode=unchecked-hash", f"-s{stage}", "-p/"]
-    # Some packages have templates that are not valid Python; nothing imports them.
-    subprocess.run([python, "-m", "compileall", *options, stage / PREFIX], check=True)
+    """Write the bytecode of all modules; only dpkg changes them, so Python need not compare the two."""
+    options = ("-q", "-f", "--invalidation-mode=unchecked-hash", f"-s{stage}", "-p/")
+    run(stage / PYTHON / "bin/python3.11", "-m", "compileall", *options, stage / PREFIX)
 
 
 def write_control_files(stage: Path, version: str) -> None:
@@ -289,13 +275,8 @@ def write_control_files(stage: Path, version: str) -> None:
         CONTROL.format(version=version, size_kib=size_kib, depends=", ".join(DEPENDS))
     )
     (control / "conffiles").write_text("/etc/rtc3d-gateway/gateway.yaml\n")
-    (control / "md5sums").write_text(
-        "".join(
-            f"{hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()}  {path.relative_to(stage)}\n"
-            for path in files
-            if not path.is_relative_to(stage / "etc")
-        )
-    )
+    sums = {path: hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest() for path in files}
+    (control / "md5sums").write_text("".join(f"{sums[path]}  {path.relative_to(stage)}\n" for path in files))
     for name in ("preinst", "postinst", "prerm", "postrm"):
         shutil.copyfile(HERE / name, control / name)
         (control / name).chmod(0o755)
@@ -303,23 +284,15 @@ def write_control_files(stage: Path, version: str) -> None:
 
 def pack(stage: Path, output: Path, compression: str) -> Path:
     """Write the package; modes, owners, times and the number of threads do not depend on the machine."""
-    commit_time_s = commit_time()
+    time_s = int(os.environ["SOURCE_DATE_EPOCH"])
     for path in stage.rglob("*"):
         if not path.is_symlink():
             program = any(path.is_relative_to(stage / folder) for folder in ("DEBIAN", *PROGRAMS))
             path.chmod(0o755 if path.is_dir() or (program and path.stat().st_mode & 0o100) else 0o644)
-        os.utime(path, (commit_time_s, commit_time_s), follow_symlinks=False)
+        os.utime(path, (time_s, time_s), follow_symlinks=False)
     output.parent.mkdir(exist_ok=True)
-    command = [
-        "dpkg-deb",
-        "--root-owner-group",
-        f"-Z{compression}",
-        "--threads-max=2",
-        "--build",
-        stage,
-        output,
-    ]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    options = ("--root-owner-group", f"-Z{compression}", "--threads-max=2")
+    run("dpkg-deb", *options, "--build", stage, output)
     return output
 
 
