@@ -23,8 +23,8 @@ RELEASE_PYTHON := build/release-venv/bin/python
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
-    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd release wheels reproducible wheel compiled wheelhouse \
-    install install-files uninstall deb deb-lock clone-url clean
+    screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd release check-sums wheels reproducible wheel compiled wheelhouse \
+    install install-files uninstall deb deb-lock image workflows clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -36,7 +36,7 @@ test: .venv/installed
 
 # What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
 # commands in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view site)
+SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view site release)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_PYTHON)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
@@ -53,7 +53,7 @@ test-compiled: build/compiled/complete
 
 # The tests use both cores, and wait often enough for the compiler and mypy to run beside them.
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint contracts generated docs wheelhouse
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs wheelhouse
 	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types
 	$(MAKE) --no-print-directory test-slow
 	$(MAKE) --no-print-directory test-compiled
@@ -110,8 +110,13 @@ release: $(RELEASE_PYTHON) build/release-packages/complete
 	$(RELEASE).audit requirements-view.txt
 	$(MAKE) --no-print-directory $(ARTEFACTS)
 	$(RELEASE).licences build/release-packages/bin/python dist/THIRD_PARTY.txt
-	cd dist && LC_ALL=C sha256sum * >../build/SHA256SUMS && mv ../build/SHA256SUMS .
+	$(MAKE) --no-print-directory check-sums
 	@echo "Built in dist/: $$(ls dist | wc -l) files."
+
+# The check sums of all files in dist/, also of those that were built on other machines.
+check-sums:
+	mkdir -p build; rm -f dist/SHA256SUMS
+	cd dist && LC_ALL=C sha256sum * >../build/SHA256SUMS && mv ../build/SHA256SUMS .
 
 # The sdist, a wheel for any Python, and a compiled wheel for each Python that this machine has.
 wheels: $(RELEASE_PYTHON) build/release-packages/complete
@@ -189,6 +194,40 @@ deb-lock:
 	names=$$(sed -n 's/^\([^# ]*\) .*/\1/p' $(DEB_LOCK)); comments=$$(grep '^#' $(DEB_LOCK)); \
 	{ echo "$$comments"; apt-cache show --no-all-versions $$names | awk '/^Package:/ { name = $$2 } \
 	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
+
+# Build the container image from the Debian package, in dist/ as an OCI archive; it needs podman, and the registry of the base.
+# The archive is the same for the same package and base. IMAGE_OPTIONS=--build-arg=BASE=… takes another base.
+IMAGE_OPTIONS :=
+VERSION = $(shell sed -n 's/^__version__.*"\(.*\)"/\1/p' gateway/__init__.py)
+OCI = dist/rtc3d-gateway_$(VERSION)_amd64.oci.tar
+
+image: deb
+	rm -rf build/image $(OCI)
+	set -e; export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct); \
+	    release/image/build dist/rtc3d-gateway_$(VERSION)_amd64.deb $(IMAGE_OPTIONS); \
+	    podman save --quiet --format oci-dir --output build/image rtc3d-gateway:$(VERSION); \
+	    tar --create --file $(OCI) --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner \
+	        --mode=u=rwX,go=rX --directory build/image blobs index.json oci-layout
+
+# A minimal Debian 12 as the base of the image in tests, which have no registry.
+build/debian/root.tar:
+	rm -rf build/debian && mkdir -p build/debian
+	debootstrap --variant=minbase --include=libssl3 bookworm build/debian/root >build/debian/log
+	tar --create --file $@ --directory build/debian/root --exclude=./var/cache/apt/archives/*.deb .
+	rm -rf build/debian/root
+
+# Check the workflows and the shell scripts. Building actionlint takes 10 s, once, and needs go; without it or without
+# shellcheck, a message says so.
+ACTIONLINT := github.com/rhysd/actionlint/cmd/actionlint@v1.7.7
+SHELL_SCRIPTS := .ci/run config/certificates.sh release/image/build release/image/healthz tests/quick-cc $(wildcard release/deb/p??inst release/deb/p??rm)
+
+workflows: build/bin/actionlint
+	@if command -v shellcheck >/dev/null; then shellcheck --severity=warning $(SHELL_SCRIPTS); else echo 'shellcheck is missing (Debian: shellcheck)'; fi
+	@if [ -x $< ]; then $<; fi
+
+build/bin/actionlint:
+	@if command -v go >/dev/null; then GOBIN=$(CURDIR)/build/bin go install $(ACTIONLINT); \
+	else echo 'The workflows are not checked: go is missing (Debian: golang-go)'; fi
 
 # Download the packages that an installation needs: its tests have no network.
 wheelhouse: build/wheelhouse/complete $(RELEASE_PYTHON)
