@@ -181,10 +181,11 @@ uninstall:
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
 # Build the Debian package in dist/. It has the Python of Debian 12, and needs that of the machine to be the same.
-deb: build/wheelhouse/complete
+deb: build/wheelhouse/complete $(RELEASE_PYTHON) build/release-packages/complete
 	rm -rf build/deb/wheel
 	build/wheelhouse-venv/bin/python -B -m release.build --dist build/deb/wheel compiled
 	build/wheelhouse-venv/bin/python -B -m release.deb.build build/deb/wheel/*.whl build/wheelhouse
+	$(RELEASE).sbom build/release-packages/bin/python dist/rtc3d-gateway_*.deb
 
 # Renew the versions of the packages of Debian that the Debian package contains.
 DEB_LOCK := release/deb/packages.txt

@@ -12,12 +12,14 @@ import sys
 from importlib.metadata import Distribution
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
 from gateway import __version__
 from release.build import ROOT, reproducible_environment, run
+from release.deb.packages import contained_packages
 from release.licences import licence_of
 from release.packages import contents_of, mypy, packages_of
 
@@ -75,6 +77,15 @@ def bill_of_file(file: Path, packages: dict[str, Any]) -> dict[str, Any]:
         bill["components"].append(
             {**runtime, "description": "the runtime of the compiled modules", **described(mypy())}
         )
+    if file.suffix == ".deb":
+        bill["components"] += [
+            {
+                "type": "library", "name": package.name, "version": package.version,
+                "purl": f"pkg:deb/debian/{package.name}@{quote(package.version)}?arch=amd64&distro=bookworm",
+                "hashes": [{"alg": "SHA-256", "content": package.sha256}],
+            }
+            for package in contained_packages()
+        ]
     return bill
 
 

@@ -14,15 +14,14 @@ import hashlib
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from gateway import __version__
 from release.build import ROOT, reproducible_environment, run
+from release.deb.packages import LIST, contained_packages, debian_packages, download
 
 HERE: Final = Path(__file__).parent
 PREFIX: Final = "opt/rtc3d-gateway"
@@ -85,14 +84,6 @@ UNUSED_OF_PACKAGES: Final = (
 )
 
 
-class DebianPackage(NamedTuple):
-    """A line of packages.txt."""
-
-    name: str
-    version: str
-    sha256: str
-
-
 def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(
@@ -131,31 +122,6 @@ def main() -> None:
         )
 
 
-def debian_packages() -> Iterator[DebianPackage]:
-    """Yield the packages of Debian that packages.txt names."""
-    for line in (HERE / "packages.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            yield DebianPackage(*line.split())
-
-
-def download(package: DebianPackage) -> Path:
-    """Return the file of a package of Debian; apt downloads it if it is not there yet."""
-    folder = ROOT / "build/deb"
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{package.name}_{package.version}_amd64.deb"
-    if not path.exists():
-        command = ["apt-get", "download", "--quiet=2", f"{package.name}={package.version}"]
-        if subprocess.run(command, cwd=folder, check=False).returncode:
-            sys.exit(
-                f"apt-get has no {package.name} {package.version}: run `apt-get update`, or `make deb-lock`."
-            )
-    if (found := hashlib.sha256(path.read_bytes()).hexdigest()) != package.sha256:
-        sys.exit(
-            f"{path} has the SHA-256 {found}, not the one in release/deb/packages.txt. Delete it and retry."
-        )
-    return path
-
-
 def stage_python(debian: Path, stage: Path) -> None:
     """Stage the private Python, and a virtual environment without packages."""
     python, venv = stage / PYTHON, stage / VENV
@@ -188,9 +154,9 @@ def stage_packages(stage: Path, wheel: Path, wheelhouse: Path) -> None:
     """Install the packages of requirements-view.txt, the gateway, and the program that starts it."""
     packages = stage / VENV / LIBRARY / "site-packages"
     pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", "--no-deps", "--no-index")
-    pip += ("--find-links", str(wheelhouse), "--target", str(packages))
-    run(*pip, "--require-hashes", "--requirement", ROOT / "requirements-view.txt")
-    run(*pip, wheel)
+    folders = ("--find-links", wheelhouse, "--target", packages)
+    run(*pip, *folders, "--require-hashes", "--requirement", ROOT / "requirements-view.txt")
+    run(*pip, *folders, wheel)
     remove(packages, UNUSED_OF_PACKAGES)
     libraries = [path for path in packages.rglob("*") if re.search(r"\.so(\.[0-9.]+)?$", path.name)]
     run("strip", "--strip-unneeded", *libraries)  # a fifth of the size
@@ -229,12 +195,10 @@ def stage_documents(debian: Path, stage: Path, version: str) -> None:
     )
     for name in ("CHANGELOG.md", "changelog"):
         compress(documents / name)
-    for package in debian_packages():
-        if package.name != "patchelf":
-            # The folder of a package may be a link to that of another one.
-            original = debian / "usr/share/doc" / package.name / "copyright"
-            shutil.copyfile(original, documents / f"copyright.{package.name}")
-    shutil.copyfile(HERE / "packages.txt", documents / "debian-packages")
+    for package in contained_packages():
+        copyright_file = debian / "usr/share/doc" / package.name / "copyright"
+        shutil.copyfile(copyright_file, documents / f"copyright.{package.name}")
+    shutil.copyfile(LIST, documents / "debian-packages")
     overrides = stage / "usr/share/lintian/overrides/rtc3d-gateway"
     overrides.parent.mkdir(parents=True)
     shutil.copyfile(HERE / "lintian-overrides", overrides)

@@ -7,7 +7,8 @@ import asyncio
 import json
 import re
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -80,7 +81,7 @@ class Machine:
     async def run_shell(self, commands: str, check: bool = True) -> Outcome:
         """Run ``commands`` with a shell in CLONE; pip installs from the wheelhouse only."""
         environment = pip_environment(_REPOSITORY / WHEELHOUSE.relative_to(ROOT)) | {"PYTHON": SYSTEM_PYTHON}
-        script = f"cd {CLONE}\n{commands}"
+        script = f"mkdir -p {CLONE} && cd {CLONE}\n{commands}"
         return await self.run("sh", "-c", script, check=check, environment=environment)
 
     async def files(self) -> dict[str, str]:
@@ -124,6 +125,19 @@ class Machine:
         matches = (f"_SYSTEMD_INVOCATION_ID={invocation}", "+", f"INVOCATION_ID={invocation}")
         text = (await self.run("journalctl", "--output=json", "--all", *matches)).text
         return [json.loads(line) for line in text.splitlines()]
+
+
+@contextmanager
+def booted(root: Path | None = None) -> Iterator[Machine]:
+    """Boot a machine with the system in the folder ``root``, or else with that of this machine."""
+    options = () if root is None else ("--root", str(root))
+    # The machine runs until cat ends, which happens when this process closes the pipe or dies.
+    command = ["tests/systemd/with-systemd", *options, "sh", "-c", "echo $MACHINE; exec cat"]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        yield Machine(int(process.stdout.readline()))
 
 
 class Service:

@@ -20,6 +20,10 @@ PROGRAM = "/usr/local/bin/rtc3d-gateway"
 PREFIX = "/opt/rtc3d-gateway"
 VENV = f"{PREFIX}/venv"
 MAN_PAGE = "/usr/local/share/man/man1/rtc3d-gateway.1"
+COMPLETIONS = (
+    "/usr/local/share/bash-completion/completions/rtc3d-gateway",
+    "/usr/local/share/fish/vendor_completions.d/rtc3d-gateway.fish",
+)
 UNITS = "/usr/local/lib/systemd/system"
 SCHEMA = "/etc/rtc3d-gateway/gateway.schema.json"
 SECRETS = "/etc/rtc3d-gateway/gateway.env"
@@ -38,6 +42,7 @@ async def test_the_program_and_its_man_page_are_installed(machine: Machine) -> N
     assert page == (await machine.run(f"{VENV}/bin/python", "-P", "-m", "gateway.cli.man_page")).text
     assert ".SS config check" in page
     assert machine.path(MAN_PAGE).stat().st_mode & 0o777 == 0o644
+    assert all("_RTC3D_GATEWAY_COMPLETE=complete_" in machine.path(path).read_text() for path in COMPLETIONS)
     assert machine.left_in_clone == set()
     skip_if_plain(machine.install_output)
     assert version.endswith(" (compiled)\n")
@@ -45,7 +50,7 @@ async def test_the_program_and_its_man_page_are_installed(machine: Machine) -> N
 
 @pytest.mark.skipif(shutil.which("apt-get") is None, reason="the page names Debian packages")
 async def test_the_packages_that_the_page_names_exist(machine: Machine) -> None:
-    packages = commands("Install").partition("apt-get install ")[2].split()
+    packages = commands("Install from source").partition("apt-get install ")[2].split()
     assert packages
     await machine.run("apt-get", "install", "--simulate", *packages)
 
@@ -124,23 +129,22 @@ async def test_upgrading_and_removing_keep_the_configuration(machine: Machine) -
     mine = "sources: [{name: mine, host: 192.0.2.20}]\n"
     machine.path(CONFIG).write_text(mine)
     await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is fast
-    await machine.run_shell(WITHOUT_COMPILER + commands("Upgrade"))
+    await machine.run_shell(WITHOUT_COMPILER + commands("Upgrade", 1))
     assert "compiled" not in (await machine.run(PROGRAM, "--version")).text
     assert machine.path(CONFIG).read_text() == mine
     await machine.run("systemctl", "enable", UNIT, INSTANCE)
-    await machine.run_shell(commands("Remove"))
+    await machine.run_shell(commands("Remove", 2))
     try:
         units = (f"{UNITS}/{UNIT}", f"{UNITS}/rtc3d-gateway@.service")
-        assert not [
-            path for path in (PROGRAM, PREFIX, SCHEMA, MAN_PAGE, *units) if machine.path(path).exists()
-        ]
+        installed = (PROGRAM, PREFIX, SCHEMA, MAN_PAGE, *COMPLETIONS, *units)
+        assert not [path for path in installed if machine.path(path).exists()]
         left = await machine.run("systemctl", "list-unit-files", "rtc3d-gateway*", check=False)
         assert "0 unit files" in left.text
         assert machine.path(CONFIG).read_text() == mine
     finally:
         await machine.run("mkdir", "--parents", PREFIX)
         await machine.run("cp", "--archive", "--link", "/opt/kept", VENV)
-        await machine.run_shell(WITHOUT_COMPILER + commands("Install", 2))
+        await machine.run_shell(WITHOUT_COMPILER + commands("Install from source", 2))
         await machine.run("rm", "-r", VENV)
         await machine.run("mv", "/opt/kept", VENV)
     assert machine.path(CONFIG).read_text() == mine

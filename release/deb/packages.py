@@ -1,0 +1,50 @@
+"""The packages of Debian whose files are in the package of the gateway."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from release.build import ROOT
+
+LIST: Final = Path(__file__).with_name("packages.txt")
+
+
+class DebianPackage(NamedTuple):
+    """A line of packages.txt."""
+
+    name: str
+    version: str
+    sha256: str
+
+
+def debian_packages() -> Iterator[DebianPackage]:
+    """Yield the packages of Debian that packages.txt names."""
+    for line in LIST.read_text().splitlines():
+        if not line.startswith("#"):
+            yield DebianPackage(*line.split())
+
+
+def contained_packages() -> list[DebianPackage]:
+    """Return those whose files are in the package of the gateway."""
+    return [package for package in debian_packages() if package.name != "patchelf"]
+
+
+def download(package: DebianPackage) -> Path:
+    """Return the file of a package of Debian; apt downloads it if it is not there yet."""
+    folder = ROOT / "build/deb"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{package.name}_{package.version}_amd64.deb"
+    if not path.exists():
+        command = ["apt-get", "download", "--quiet=2", f"{package.name}={package.version}"]
+        if subprocess.run(command, cwd=folder, check=False).returncode:
+            sys.exit(
+                f"apt-get has no {package.name} {package.version}: run `apt-get update`, or `make deb-lock`."
+            )
+    if (found := hashlib.sha256(path.read_bytes()).hexdigest()) != package.sha256:
+        sys.exit(
+            f"{path} has the SHA-256 {found}, not the one in release/deb/packages.txt. Delete it and retry."
+        )
+    return path
