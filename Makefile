@@ -101,7 +101,7 @@ wheel:
 
 # Everything that a release publishes, in dist/: for each file a bill of materials, the licences, and the check sums.
 # A further kind of file is a further target in ARTEFACTS. It puts its files, with a bill of its own, into dist/.
-ARTEFACTS := wheels deb
+ARTEFACTS := wheels deb image
 RELEASE := $(RELEASE_PYTHON) -B -m release
 
 release: $(RELEASE_PYTHON) build/release-packages/complete
@@ -209,13 +209,7 @@ image: deb
 	    podman save --quiet --format oci-dir --output build/image rtc3d-gateway:$(VERSION); \
 	    tar --create --file $(OCI) --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner \
 	        --mode=u=rwX,go=rX --directory build/image blobs index.json oci-layout
-
-# A minimal Debian 12 as the base of the image in tests, which have no registry.
-build/debian/root.tar:
-	rm -rf build/debian && mkdir -p build/debian
-	debootstrap --variant=minbase --include=libssl3 bookworm build/debian/root >build/debian/log
-	tar --create --file $@ --directory build/debian/root --exclude=./var/cache/apt/archives/*.deb .
-	rm -rf build/debian/root
+	$(RELEASE).sbom build/release-packages/bin/python $(OCI)
 
 # Check the workflows and the shell scripts. Building actionlint takes 10 s, once, and needs go; without it or without
 # shellcheck, a message says so.

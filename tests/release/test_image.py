@@ -1,6 +1,6 @@
 """The container image, built from the Debian package and run with podman as docs/how-to/container.md says.
 
-Neither needs a network: the base is build/debian/root.tar instead of an image of a registry.
+The base is the bare system of the tests of the package instead of an image of a registry.
 """
 
 import os
@@ -17,17 +17,20 @@ from gateway import __version__
 from tests.support.configurations import write_config
 from tests.support.documents import ROOT
 from tests.support.gateway_process import simulator
-from tests.support.needs import need, need_programs
+from tests.support.needs import need_programs
 from tests.support.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.support.waiting import wait_until
+from tests.systemd.test_debian_package import bare_root, build_package
 
-BASE: Final = ROOT / "build/debian/root.tar"
-PACKAGE: Final = ROOT / f"dist/rtc3d-gateway_{__version__}_amd64.deb"
+__all__ = ["bare_root"]  # a fixture
+
+pytestmark = [pytest.mark.netns, pytest.mark.wheelhouse, pytest.mark.xdist_group("debian_package")]
+
 IMAGE: Final = f"localhost/rtc3d-gateway:{__version__}"
 NAME: Final = "gateway"
 
-# crun rejects a machine that has cgroups of both versions, so it sees only version 2. Images are written and deleted
-# faster in memory.
+# crun rejects a machine that has cgroups of both versions, so it sees only version 2. In memory, images are
+# written and deleted faster.
 NAMESPACE: Final = "mount -t cgroup2 none /sys/fs/cgroup && mount -t tmpfs none $1 && echo $$ && exec cat"
 
 # An engine that runs in a container itself may have no cgroups, and may not raise limits: these are those of
@@ -75,11 +78,10 @@ class Podman:
 
 
 @pytest.fixture(scope="module")
-def podman() -> Iterator[Podman]:
+def podman(bare_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Podman]:
     """Return an engine that has the image."""
     need_programs("podman", "crun", "unshare", packages="podman, crun and util-linux")
-    need(os.geteuid() == 0, "needs root, because of the mount namespace")
-    need(BASE.exists() and PACKAGE.exists(), "needs a package and a base: run make build/debian/root.tar deb")
+    package = build_package(tmp_path_factory.mktemp("package"))
     pipe = subprocess.PIPE
     with (
         tempfile.TemporaryDirectory(prefix="rtc3d-image-") as folder,
@@ -89,13 +91,13 @@ def podman() -> Iterator[Podman]:
     ):
         assert namespace.stdout is not None
         podman = Podman(folder, namespace.stdout.readline().strip())
-        podman.check("podman", "import", "--quiet", BASE, "localhost/debian")
-        podman.check(ROOT / "release/image/build", PACKAGE, "--build-arg=BASE=localhost/debian")
+        files = f"tar --create --directory={bare_root} . | podman import --quiet - localhost/debian"
+        podman.check("sh", "-c", files)
+        podman.check(ROOT / "release/image/build", package, "--build-arg=BASE=localhost/debian")
         yield podman
         podman.run("podman", "kill", NAME)  # if the test has failed
 
 
-@pytest.mark.netns
 def test_a_container_without_any_rights_delivers_data_and_ends_when_told_to(
     podman: Podman, tmp_path: Path
 ) -> None:
