@@ -43,5 +43,6 @@ def _dpkg_status(archive: Path) -> str:
 def _open(archive: tarfile.TarFile, member: str | tarfile.TarInfo) -> IO[bytes]:
     """Return the content of a file, which must be a regular one."""
     content = archive.extractfile(member)
-    assert content is not None, member
+    if content is None:
+        raise ValueError(f"{member} is not a regular file")
     return content
