@@ -22,7 +22,7 @@ RELEASE_PYTHON := build/release-venv/bin/python
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
+.PHONY: demo lock test test-slow test-install test-compiled check lint types contracts generated docs lcm-types examples samples \
     screenshots fuzz soak stops hiroz mutants bench bench-quick bench-sites bench-sites-quick zenohd release check-sums wheels reproducible wheel compiled wheelhouse \
     install install-files uninstall deb deb-lock image workflows clone-url clean
 
@@ -140,6 +140,8 @@ build/compiled/complete: .venv/installed $(shell find $(SOURCES) ! -path '*__pyc
 
 # Run as root. The service's user cannot read home directories, so its Python must not be in one.
 install:
+	@[ ! -e /usr/lib/systemd/system/rtc3d-gateway.service ] || { \
+	    echo 'The Debian package is installed, with its files in the same place: apt remove rtc3d-gateway' >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; home = sys.base_prefix.startswith(("/home/", "/root/")); \
 	    sys.exit(f"the service cannot read {sys.base_prefix}, which is in a home directory; run make with PYTHON=/usr/bin/python3" if home else 0)'
 	$(PYTHON) -m venv $(PREFIX)/venv

@@ -12,7 +12,6 @@ import email.utils
 import gzip
 import hashlib
 import os
-import re
 import shutil
 import sys
 import tempfile
@@ -82,6 +81,10 @@ UNUSED_OF_PACKAGES: Final = (
     *("numpy/f2py", "numpy/distutils", "numpy/_core/*tests*.so"),
     *("*.dist-info/RECORD", "*.dist-info/REQUESTED", "*.dist-info/INSTALLER", "*.dist-info/direct_url.json"),
 )
+
+
+# The largest libraries with symbols. What auditwheel has changed, such as numpy, does not survive stripping.
+STRIPPED: Final = ("foxglove/*.so", "uvloop/*.so", "zenoh/*.so")
 
 
 def main() -> None:
@@ -158,8 +161,7 @@ def stage_packages(stage: Path, wheel: Path, wheelhouse: Path) -> None:
     run(*pip, *folders, "--require-hashes", "--requirement", ROOT / "requirements-view.txt")
     run(*pip, *folders, wheel)
     remove(packages, UNUSED_OF_PACKAGES)
-    libraries = [path for path in packages.rglob("*") if re.search(r"\.so(\.[0-9.]+)?$", path.name)]
-    run("strip", "--strip-unneeded", *libraries)  # a fifth of the size
+    run("strip", "--strip-unneeded", *(path for pattern in STRIPPED for path in packages.glob(pattern)))
     program = stage / VENV / "bin/rtc3d-gateway"
     program.write_text(
         f"#!/{VENV}/bin/python\nimport sys\n\nfrom gateway.__main__ import main\n\n"

@@ -129,7 +129,7 @@ async def test_upgrading_and_removing_keep_the_configuration(machine: Machine) -
     mine = "sources: [{name: mine, host: 192.0.2.20}]\n"
     machine.path(CONFIG).write_text(mine)
     await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is fast
-    await machine.run_shell(WITHOUT_COMPILER + commands("Upgrade", 1))
+    await machine.run_shell(WITHOUT_COMPILER + commands("Upgrade"))
     assert "compiled" not in (await machine.run(PROGRAM, "--version")).text
     assert machine.path(CONFIG).read_text() == mine
     await machine.run("systemctl", "enable", UNIT, INSTANCE)
