@@ -200,7 +200,7 @@ deb-lock:
 
 # Build the container image from the Debian package, in dist/ as an OCI archive; it needs podman, and the registry of the base.
 # The archive is the same for the same package and base. IMAGE_OPTIONS=--build-arg=BASE=… takes another base.
-IMAGE_OPTIONS :=
+IMAGE_OPTIONS ?=
 VERSION = $(shell sed -n 's/^__version__.*"\(.*\)"/\1/p' gateway/__init__.py)
 OCI = dist/rtc3d-gateway_$(VERSION)_amd64.oci.tar
 
