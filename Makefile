@@ -25,7 +25,8 @@ SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-install test-compiled check lint types contracts generated docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
-    wheels reproducible deb deb-lock wheel compiled wheelhouse install install-files uninstall clone-url clean
+    check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
+    clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -54,7 +55,7 @@ test-compiled: build/compiled/complete
 
 # The tests use both cores, and wait often enough for the compiler and mypy to run beside them.
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint contracts generated docs wheelhouse
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs wheelhouse
 	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types
 	$(MAKE) --no-print-directory test-slow
 	$(MAKE) --no-print-directory test-compiled
@@ -110,7 +111,7 @@ wheel:
 
 # Everything that a release publishes, in dist/: for each file a bill of materials, the licences, and the check sums.
 # A further kind of file is a further target in ARTEFACTS. It puts its files, with a bill of its own, into dist/.
-ARTEFACTS := wheels deb
+ARTEFACTS := wheels deb image
 RELEASE := $(RELEASE_PYTHON) -B -m release
 
 release: $(RELEASE_TOOLS) build/release-packages/complete
@@ -119,8 +120,13 @@ release: $(RELEASE_TOOLS) build/release-packages/complete
 	$(RELEASE).audit requirements-view.txt
 	$(RELEASE).licences build/release-packages/bin/python dist/THIRD_PARTY.txt
 	$(MAKE) --no-print-directory $(ARTEFACTS)
-	cd dist && LC_ALL=C sha256sum * >../build/SHA256SUMS && mv ../build/SHA256SUMS .
+	$(MAKE) --no-print-directory check-sums
 	@echo "Built in dist/: $$(ls dist | wc -l) files."
+
+# The check sums of all files in dist/, also of those that were built on other machines.
+check-sums:
+	mkdir -p build; rm -f dist/SHA256SUMS
+	cd dist && LC_ALL=C sha256sum * >../build/SHA256SUMS && mv ../build/SHA256SUMS .
 
 # The sdist, a wheel for any Python, and a compiled wheel for each Python that this machine has.
 wheels: $(RELEASE_TOOLS) build/release-packages/complete
@@ -201,6 +207,34 @@ deb-lock:
 	names=$$(sed -n 's/^\([^# ]*\) .*/\1/p' $(DEB_LOCK)); comments=$$(grep '^#' $(DEB_LOCK)); \
 	{ echo "$$comments"; apt-cache show --no-all-versions $$names | awk '/^Package:/ { name = $$2 } \
 	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
+
+# Build the container image from the Debian package, in dist/ as an OCI archive; it needs podman, and the registry of the base.
+# The archive is the same for the same package and base. IMAGE_OPTIONS=--build-arg=BASE=… takes another base.
+IMAGE_OPTIONS ?=
+VERSION = $(shell sed -n 's/^__version__.*"\(.*\)"/\1/p' gateway/__init__.py)
+OCI = dist/rtc3d-gateway_$(VERSION)_amd64.oci.tar
+
+image: deb
+	rm -rf build/image $(OCI)
+	set -e; export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct); \
+	    release/image/build dist/rtc3d-gateway_$(VERSION)_amd64.deb $(IMAGE_OPTIONS); \
+	    podman save --quiet --format oci-dir --output build/image rtc3d-gateway:$(VERSION); \
+	    tar --create --file $(OCI) --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner \
+	        --mode=u=rwX,go=rX --directory build/image blobs index.json oci-layout
+	$(RELEASE).sbom build/release-packages/bin/python $(OCI)
+
+# Check the workflows and the shell scripts. Building actionlint takes 10 s, once, and needs go; without it or without
+# shellcheck, a message says so.
+ACTIONLINT := github.com/rhysd/actionlint/cmd/actionlint@v1.7.7
+SHELL_SCRIPTS := .ci/run config/certificates.sh release/image/build release/image/healthz tests/quick-cc $(wildcard release/deb/p??inst release/deb/p??rm)
+
+workflows: build/bin/actionlint
+	@if command -v shellcheck >/dev/null; then shellcheck --severity=warning $(SHELL_SCRIPTS); else echo 'shellcheck is missing (Debian: shellcheck)'; fi
+	@if [ -x $< ]; then $<; fi
+
+build/bin/actionlint:
+	@if command -v go >/dev/null; then GOBIN=$(CURDIR)/build/bin go install $(ACTIONLINT); \
+	else echo 'The workflows are not checked: go is missing (Debian: golang-go)'; fi
 
 # Download the packages that an installation needs: its tests have no network.
 wheelhouse: build/wheelhouse/complete $(RELEASE_TOOLS)

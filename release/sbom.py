@@ -12,14 +12,14 @@ import sys
 from importlib.metadata import Distribution
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
 from gateway import __version__
 from release.build import ROOT, reproducible_environment, run
-from release.deb.packages import contained_packages
+from release.deb.packages import contained_packages, debian_purl
+from release.image.contents import image_packages
 from release.licences import licence_of
 from release.packages import contents_of, mypy, packages_of
 
@@ -78,17 +78,20 @@ def bill_of_file(file: Path, packages: dict[str, Any]) -> dict[str, Any]:
         bill["components"].append(
             {**runtime, "description": "the runtime of the compiled modules", **described(mypy())}
         )
-    if file.suffix == ".deb":
+    if file.suffix == ".deb" or file.name.endswith(".oci.tar"):  # the image has the files of the package
         bill["components"] += [
             {
                 "type": "library",
                 "name": package.name,
                 "version": package.version,
-                "purl": f"pkg:deb/debian/{package.name}@{quote(package.version)}?arch=amd64&distro=bookworm",
+                "purl": debian_purl(package.name, package.version, "amd64"),
                 "hashes": [{"alg": "SHA-256", "content": package.sha256}],
             }
             for package in contained_packages()
         ]
+    if file.name.endswith(".oci.tar"):
+        contained = {component["purl"] for component in bill["components"]}
+        bill["components"] += [each for each in image_packages(file) if each["purl"] not in contained]
     return bill
 
 

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
+from urllib.parse import quote
 
 from release.build import ROOT
 
@@ -30,6 +31,11 @@ def debian_packages() -> Iterator[DebianPackage]:
 def contained_packages() -> list[DebianPackage]:
     """Return those whose files are in the package of the gateway."""
     return [package for package in debian_packages() if package.name != "patchelf"]
+
+
+def debian_purl(name: str, version: str, architecture: str) -> str:
+    """Return the package URL of a package of Debian 12."""
+    return f"pkg:deb/debian/{name}@{quote(version)}?arch={architecture}&distro=bookworm"
 
 
 def download(package: DebianPackage) -> Path:
