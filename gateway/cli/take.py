@@ -14,7 +14,7 @@ from gateway.cli.main import exit_with, print_json
 from gateway.config.words import join_or
 from gateway.errors import QueryError
 from gateway.logs.safe_text import safe_text
-from gateway.takes.export.job import FORMATS, ExportJob, export_take
+from gateway.takes.export.job import FORMATS, BidsNames, ExportJob, export_take
 
 if TYPE_CHECKING:
     from gateway.cli.take_report import ListedTake
@@ -219,17 +219,37 @@ def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], 
 def export(
     file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
     out: Annotated[
-        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
+        Path,
+        typer.Argument(
+            help=f"The new file; its extension is the format: {join_or(FORMATS)}. With --bids, a folder."
+        ),
     ],
+    *,
+    bids: Annotated[
+        bool, typer.Option("--bids", help="Write to a Motion-BIDS data set; OUT is its folder, new or not.")
+    ] = False,
+    subject: Annotated[
+        str | None, typer.Option(help="The subject in BIDS; the default is that of the take.")
+    ] = None,
+    session: Annotated[
+        str | None, typer.Option(help="The session in BIDS; the default is that of the take.")
+    ] = None,
+    task: Annotated[str | None, typer.Option(help="The task in BIDS, such as walking.")] = None,
+    run: Annotated[
+        int | None, typer.Option(min=1, help="The number of the run in BIDS; the default is the next one.")
+    ] = None,
     source: options.SourceOption = None,
     from_s: options.FromOption = None,
     to_s: options.ToOption = None,
     quiet: options.NoProgressOption = False,
 ) -> None:
-    """Convert a take to a file of another program, such as C3D; never overwrite a file."""
+    """Convert a take to the files of other programs, such as C3D; never overwrite a file."""
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
-    job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
+    names = BidsNames(subject, session, task, run)
+    if names != BidsNames() and not bids:
+        raise typer.BadParameter("--subject, --session, --task and --run need --bids")
+    job = ExportJob(file, out, "bids" if bids else "", source=source, from_s=from_s, to_s=to_s, bids=names)
     with progress_bar(quiet=quiet, counts_bytes=False) as job.progress:
         paths = export_take(job)
     for note in job.notes:

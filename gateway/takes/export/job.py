@@ -25,6 +25,9 @@ FORMATS: Final = {
 }
 """The module and the function that write the files of a job, by the extension of its ``out``."""
 
+FOLDERS: Final = {"bids": ("bids", "export_bids")}
+"""The same for the formats that are several files in a folder: ``out`` is that folder."""
+
 _INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
 _MAX_NAMED: Final = 10
 
@@ -32,9 +35,9 @@ _MAX_NAMED: Final = 10
 def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     extension = job.out.suffix.lower()
-    if extension not in FORMATS:
+    if not job.folder_format and extension not in FORMATS:
         raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
-    module, function = FORMATS[extension]
+    module, function = FOLDERS[job.folder_format] if job.folder_format else FORMATS[extension]
     with job.files:
         try:
             write = getattr(import_module(f"gateway.takes.export.{module}"), function)
@@ -48,10 +51,21 @@ def export_take(job: "ExportJob") -> list[Path]:
     return job.files.paths
 
 
+@dataclass(frozen=True)
+class BidsNames:
+    """What the files of a BIDS data set are called after; None is what the take says, or the next number."""
+
+    subject: str | None = None
+    session: str | None = None
+    task: str | None = None
+    run: int | None = None
+
+
 @dataclass
 class ExportJob:
     """What to export, and where it goes.
 
+    ``folder_format`` is a key of FOLDERS; "" means that ``out`` is a file, whose extension says the format.
     ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
     the take. ``progress`` is called with what is being done, how much of it is done, and how much there is
     (0: that is not known). ``notes`` are sentences about what was changed or left out.
@@ -59,11 +73,13 @@ class ExportJob:
 
     take: Path
     out: Path
+    folder_format: str = ""
     source: str | None = None
     from_s: float | None = None
     to_s: float | None = None
     progress: Callable[[str, int, int], None] = lambda *_: None
     notes: list[str] = field(default_factory=list)
+    bids: BidsNames = BidsNames()
     files: NewFiles = field(default_factory=NewFiles)
 
     def note(self, text: str) -> None:
@@ -128,6 +144,10 @@ def nothing_to_export(job: ExportJob, what: str) -> TakeError:
     source = "" if job.source is None else f" of {job.source}"
     error = SelectionError if part else TakeError
     return error(
-        f"{job.take} has no {what}{source}{part}, and {job.out.suffix} holds nothing else; "
+        f"{job.take} has no {what}{source}{part}, and {_format_name(job)} holds nothing else; "
         "`rtc3d-gateway take info` lists what the take has"
     )
+
+
+def _format_name(job: ExportJob) -> str:
+    return f"--{job.folder_format}" if job.folder_format else job.out.suffix
