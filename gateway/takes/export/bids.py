@@ -74,8 +74,10 @@ class _Recording(NamedTuple):
     def stop_s(self) -> float:
         return self.start_s + self.measurement.grid.num_rows / self.measurement.grid.rate_hz
 
-    def overlap_s(self, other: "_Recording") -> float:
-        return min(self.stop_s, other.stop_s) - max(self.start_s, other.start_s)
+    def is_of_time_of(self, other: "_Recording") -> bool:
+        """Whether the two overlap by half of the shorter one: the ends of others overlap by a jitter."""
+        overlap_s = min(self.stop_s, other.stop_s) - max(self.start_s, other.start_s)
+        return overlap_s >= min(self.stop_s - self.start_s, other.stop_s - other.start_s) / 2
 
 
 class _Channel(NamedTuple):
@@ -113,7 +115,7 @@ def export_bids(job: ExportJob) -> None:
 
 
 def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
-    """Return the recordings of each run: those that overlap in time, at most one of a tracking system.
+    """Return the recordings of each run: those of the same time, at most one of each tracking system.
 
     So what all sources recorded at the same time is one run. If the labels of the markers change while the
     analog channels go on, a new run begins that has no analog channels.
@@ -132,14 +134,15 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
             "choose a part by --from and --to"
         )
     runs: list[list[_Recording]] = []
-    for recording in found:
-        free = [run for run in runs if all(each.label != recording.label for each in run)]
-        overlaps = [max(map(recording.overlap_s, run)) for run in free]
-        if max(overlaps, default=0.0) > 0:
-            free[int(np.argmax(overlaps))].append(recording)
+    for recording in sorted(found, key=lambda each: each.start_s):
+        for run in runs:
+            is_new = all(each.label != recording.label for each in run)
+            if is_new and any(map(recording.is_of_time_of, run)):
+                run.append(recording)
+                break
         else:
             runs.append([recording])
-    return sorted(runs, key=lambda run: min(each.start_s for each in run))
+    return runs
 
 
 def _tracking_system(source: TakeSource, series: Series) -> str:
@@ -294,7 +297,7 @@ def _write_events(
     if events is None:
         return
     firsts = [
-        (number, own[0])
+        (number, min(own, key=lambda each: [*_LABELS].index(each.measurement.base.key)))
         for number, run in runs
         if (own := [each for each in run if each.measurement.source is source])
     ]
