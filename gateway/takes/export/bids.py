@@ -60,7 +60,7 @@ _NUM_FORCES: Final = 3
 _EVENT_MARGIN_S: Final = 1.0
 """An event within this time before the first sample or after the last one belongs to the run."""
 
-_BLOCK_VALUES: Final = 500_000  # values that become text at once: 30 MB in all
+_BLOCK_VALUES: Final = 50_000  # values that become text at once: few MB, which the caches of a CPU hold
 
 
 class _Recording(NamedTuple):
@@ -161,8 +161,7 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
     for start in range(0, grid.num_rows, size):
         stop = min(start + size, grid.num_rows)
         values = (placed.block(start, stop).reshape(-1, *factors.shape) * factors).reshape(stop - start, -1)
-        text = encode_rows([b""] * len(values), values, NOT_AVAILABLE.encode(), b"\n")
-        file.write(text.replace(b"\n\t", b"\n").removeprefix(b"\t"))
+        file.write(encode_rows(values, NOT_AVAILABLE.encode(), b"\n"))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
     note_missing(job, path, measurement, 0, grid.num_rows)
     channels = _channels(job, measurement, conversions)

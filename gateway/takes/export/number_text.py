@@ -24,18 +24,20 @@ _EXPONENT: Final = _CELL_BYTES - 4
 _ZERO, _TAB, _MINUS, _PLUS, _POINT, _E = b"0\t-+.e"
 
 
-def encode_rows(heads: Sequence[bytes], values: Array, missing: bytes, end: bytes) -> bytes:
-    """Return rows as text: the head of each, a tab and a number for each value, and the end.
+def encode_rows(values: Array, missing: bytes, end: bytes, heads: Sequence[bytes] = ()) -> bytes:
+    """Return rows as text: a number for each value, separated by tabs, and the end.
 
-    ``heads`` are the first cells of the rows, and ``values`` has the shape (rows, columns). ``missing`` (up
-    to 3 bytes) stands for NaN and infinity.
+    ``values`` has the shape (rows, columns). ``missing`` (up to 3 bytes) stands for NaN and infinity.
+    ``heads`` are further first cells of the rows, if there are any.
     """
-    num_rows = len(heads)
-    parts = [
-        np.array(heads, np.bytes_).view(np.uint8).reshape(num_rows, -1),
-        _cells(values.astype(np.float64).ravel(), missing).reshape(num_rows, -1),
-        np.tile(np.frombuffer(end, np.uint8), (num_rows, 1)),
-    ]
+    num_rows = len(values)
+    with np.errstate(invalid="ignore"):  # any bits that are a NaN
+        cells = _cells(values.astype(np.float64).ravel(), missing).reshape(num_rows, -1)
+    parts = [cells, np.tile(np.frombuffer(end, np.uint8), (num_rows, 1))]
+    if heads:
+        parts.insert(0, np.array(heads, np.bytes_).view(np.uint8).reshape(num_rows, -1))
+    else:
+        cells[:, 0] = 0  # no tab
     return np.concatenate(parts, axis=1).tobytes().translate(None, b"\0")
 
 
