@@ -57,9 +57,6 @@ _FIELDS: Final = {
 _TYPES: Final = ("ACCEL", "ANGACCEL", "GYRO", "JNTANG", "LATENCY", "MAGN", "MISC", "ORNT", "POS", "VEL")
 _MAX_NAME_BYTES: Final = 200
 _NUM_FORCES: Final = 3
-_EVENT_MARGIN_S: Final = 1.0
-"""An event within this time before the first sample or after the last one belongs to the run."""
-
 _BLOCK_VALUES: Final = 50_000  # values that become text at once: few MB, which the caches of a CPU hold
 
 
@@ -303,11 +300,11 @@ def _write_events(
     seconds = np.array([event_seconds(each.measurement) for _, each in firsts]).reshape(-1, len(events))
     durations = np.array([[each.stop_s - each.start_s] for _, each in firsts]).reshape(-1, 1)
     outside = np.nan_to_num(np.maximum(np.maximum(-seconds, seconds - durations), 0.0), nan=np.inf)
-    is_near = outside.min(axis=0, initial=np.inf) <= _EVENT_MARGIN_S
-    if not is_near.all():
-        job.note(f"events of {source.name} that are of no run were left out: {int((~is_near).sum())}")
+    belongs = np.isfinite(outside).any(axis=0)
+    if not belongs.all():
+        job.note(f"events of {source.name} that are of no run were left out: {int((~belongs).sum())}")
     for position, (number, recording) in enumerate(firsts):
-        (chosen,) = np.nonzero(is_near & (outside.argmin(axis=0) == position))
+        (chosen,) = np.nonzero(belongs & (outside.argmin(axis=0) == position))
         if not len(chosen):
             continue
         rows = []

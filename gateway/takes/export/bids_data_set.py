@@ -131,9 +131,8 @@ def _describe(job: ExportJob) -> None:
         "GeneratedBy": [{"Name": "rtc3d-gateway", "Version": __version__}],
     }
     write_json(job, job.out / _DESCRIPTION, description)
-    if not any(job.out.glob("README*")):
-        text = _README.format(name=name, version=_VERSION, program=__version__)
-        job.files.create(job.out / "README.md").write(text.encode())
+    readme = _README.format(name=name, version=_VERSION, program=__version__)
+    job.files.create(job.out / "README.md").write(readme.encode())
 
 
 def write_json(job: ExportJob, path: Path, content: dict[str, Any]) -> None:

@@ -22,7 +22,16 @@ from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import BidsNames, ExportJob
 from gateway.takes.files.new_file import NewFiles
-from tests.support.takes import START_UTIME, Message, details, frame, markers, parameters, scene_messages
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    details,
+    frame,
+    markers,
+    parameters,
+    scene_messages,
+)
 from tests.unit.takes.export.exported import NAN, export_messages, float32, labelled
 
 SCENE = SyntheticScene(markers=3, tools=2, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000, seed=5)
@@ -221,20 +230,43 @@ def test_components_whose_ends_overlap_by_a_jitter_are_of_different_runs(tmp_pat
     assert runs_of(tmp_path) == {("labMarkers", "1"), ("labTools", "2")}
 
 
-def test_events_count_from_the_first_sample_of_their_run(tmp_path: Path) -> None:
-    def event(number: int, sequence: int, timestamp_us: int) -> Message:
-        item = (number, timestamp_us, -1, -1, -1)
-        return frame(ComponentType.EVENT, [item], sequence, timestamp_us=timestamp_us)
+def test_runs_are_numbered_in_the_order_of_time(tmp_path: Path) -> None:
+    """The sources are in the order of their first messages, which can be parameters."""
+    messages = [description("later"), *(markers(1, number, source="first") for number in range(5))]
+    export(tmp_path, [*messages, *(markers(1, number, source="later") for number in range(100, 105))])
+    assert runs_of(tmp_path) == {("firstMarkers", "1"), ("laterMarkers", "2")}
 
+
+def event(number: int, timestamp_us: int) -> Message:
+    item = (number, timestamp_us, -1, -1, -1)
+    return frame(ComponentType.EVENT, [item], timestamp_us // 10_000, timestamp_us=timestamp_us)
+
+
+def events_of(folder: Path, name: str) -> list[tuple[str, str]]:
+    """Return onsets and labels of the events of a file."""
+    return [(row["onset"], row["trial_type"]) for row in table(only(folder, f"*_{name}_events.tsv"))]
+
+
+def test_events_count_from_the_first_sample_of_their_run(tmp_path: Path) -> None:
     measured = [markers(1, number) for number in [*range(10, 60), *range(2010, 2060)]]
-    events = [event(7, 2030, 20_300_000), event(5, 30, 300_000), event(6, 1000, 10_000_000)]
+    events = [event(7, 20_300_000), event(8, 400_000), event(5, 300_000), event(6, 10_000_000)]
     job = export(tmp_path, [*measured, *events])
-    first, second = (table(only(tmp_path, f"*labMarkers_run-{run}_events.tsv")) for run in (1, 2))
-    assert [(row["onset"], row["duration"], row["trial_type"]) for row in first] == [
-        ("0.200000", "0", "event 5")
+    assert events_of(tmp_path, "tracksys-labMarkers_run-1") == [
+        ("0.200000", "event 5"),
+        ("0.300000", "event 8"),
     ]
-    assert [(row["onset"], row["value"]) for row in second] == [("0.200000", "7")]
+    assert events_of(tmp_path, "tracksys-labMarkers_run-2") == [("0.200000", "event 7")]
+    assert {*column(only(tmp_path, "*_run-2_events.tsv"), "value")} == {"7"}
     assert "events of lab that are of no run were left out: 1" in job.notes
+
+
+def test_an_event_is_in_the_nearest_run_only_beside_the_markers(tmp_path: Path) -> None:
+    """An event within 1 s of a measurement belongs to it, unless it is in another one."""
+    analog = [frame(ComponentType.ANALOG, [number], number) for number in range(20)]
+    before, after = [markers(1, number) for number in range(5, 20)], [markers(2, n) for n in range(20, 40)]
+    export(tmp_path, [*analog, *before, *after, event(1, 100_000), event(2, 250_000), event(3, 900_000)])
+    assert events_of(tmp_path, "tracksys-labMarkers_run-1") == [("0.050000", "event 1")]
+    assert events_of(tmp_path, "run-2") == [("0.050000", "event 2"), ("0.700000", "event 3")]
 
 
 def test_subject_and_session_come_from_the_take_in_letters_and_digits(tmp_path: Path) -> None:
