@@ -6,6 +6,7 @@ a regular grid, as in C3D; all tracking systems of a run have their own time of 
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ _FIELDS: Final = {
 """The end of the name, the component and the type of the channels of each item."""
 
 _TYPES: Final = ("ACCEL", "ANGACCEL", "GYRO", "JNTANG", "LATENCY", "MAGN", "MISC", "ORNT", "POS", "VEL")
-_MAX_NAME_BYTES: Final = 200
+_MAX_NAME_BYTES: Final = 100
 _NUM_FORCES: Final = 3
 _BLOCK_VALUES: Final = 50_000  # values that become text at once: few MB, which the caches of a CPU hold
 
@@ -99,8 +100,7 @@ def export_bids(job: ExportJob) -> None:
     scans = []
     for number, run in enumerate(runs, start=first_run):
         for recording in run:
-            path = data_set.path(recording.label, number, "motion.tsv")
-            _write_motion(job, data_set, number, recording)
+            path = _write_motion(job, data_set, number, recording)
             name = path.relative_to(data_set.folder).as_posix()
             scans.append({"filename": name, "acq_time": utc_text(recording.measurement, recording.start_s)})
     for source in take.sources.values():
@@ -117,9 +117,12 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
     So what all sources recorded at the same time is one run. If the labels of the markers change while the
     analog channels go on, a new run begins that has no analog channels.
     """
+    names = fitting_labels([*take.sources], bids_label, _MAX_NAME_BYTES, "source")
     found = [
-        _Recording(_tracking_system(source, measurement.base), measurement, seconds_of_row(measurement, 0))
-        for source in take.sources.values()
+        _Recording(
+            bids_label(name) + _LABELS[measurement.base.key], measurement, seconds_of_row(measurement, 0)
+        )
+        for name, source in zip(names, take.sources.values(), strict=True)
         for measurements in measurements_by_component(source, tuple(_LABELS))
         for measurement in measurements
     ]
@@ -142,12 +145,8 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
     return runs
 
 
-def _tracking_system(source: TakeSource, series: Series) -> str:
-    return bids_label(source.name) + _LABELS[series.key]
-
-
-def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recording) -> None:
-    """Write the files of a tracking system in one run."""
+def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recording) -> Path:
+    """Write the files of a tracking system in one run, and return the path of motion.tsv."""
     measurement = recording.measurement
     series, grid = measurement.base, measurement.grid
     conversions = _conversions(job, series)
@@ -170,6 +169,7 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
     else:
         frames = {"reference_frame": {"Levels": {measurement.source.name: _reference_frame(measurement)}}}
         write_json(job, data_set.path(recording.label, run, "channels.json"), frames)
+    return path
 
 
 def _conversions(job: ExportJob, series: Series) -> list[list[tuple[str, float]]]:
@@ -180,7 +180,8 @@ def _conversions(job: ExportJob, series: Series) -> list[list[tuple[str, float]]
         job.note("forces and moments have the type MISC: Motion-BIDS has no type for them")
         force = series.parameters_of(0).force
         plates = [*force.plates] if force else []
-        units = [units_of(plate) for plate in plates] + [(1.0, 1.0)] * (len(series.labels) - len(plates))
+        units = [units_of(plate) for plate in plates[: len(series.labels)]]
+        units += [(1.0, 1.0)] * (len(series.labels) - len(units))
         if any(unit != (1.0, 1.0) for unit in units):
             job.note("forces and moments were converted to N and N.m")
         return [[("N", force)] * _NUM_FORCES + [("N.m", moment)] * _NUM_FORCES for force, moment in units]

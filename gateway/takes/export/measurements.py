@@ -1,8 +1,8 @@
 """The measurements of a take: parts that have one rate, one set of labels and one count of the server's
 time.
 
-C3D and TRC have a rate and no times. A frame that is missing becomes a row without values, so that all others
-keep their places. The times of capture are not used: their jitter would bend the grid.
+C3D, TRC and BIDS have a rate and no times. A frame that is missing becomes a row without values, so that all
+others keep their places. The times of capture are not used: their jitter would bend the grid.
 """
 
 from collections.abc import Iterator
@@ -91,6 +91,8 @@ _SAME_CLOCK_S: Final = 0.2
 this."""
 
 MAX_FILES: Final = 1000
+"""The most measurements in one export: each becomes a file."""
+
 _COMPARED: Final = 9
 """How many pairs of frames are compared to decide this."""
 

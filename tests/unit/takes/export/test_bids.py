@@ -169,6 +169,11 @@ def test_other_units_become_si_units(tmp_path: Path) -> None:
     assert "forces and moments were converted to N and N.m" in job.notes
 
 
+def test_a_plate_that_sends_nothing_has_no_channels(tmp_path: Path) -> None:
+    export(tmp_path, [parameters(SCENE.parameters), frame(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])])
+    assert len(table(only(tmp_path, "*_channels.tsv"))) == 6
+
+
 def test_an_unknown_unit_of_length_stays_and_is_reported(tmp_path: Path) -> None:
     job = export(tmp_path, [labelled("a", unit="cubit"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)])])
     assert read_motion(only(tmp_path, "*_motion.tsv")).tolist() == [[1, 2, 3, 0]]
@@ -205,6 +210,11 @@ def test_what_sources_record_at_the_same_time_is_one_run(tmp_path: Path) -> None
     assert times["labaMarkers_run-1_motion.tsv"] == "2023-11-14T22:13:19.998000Z"
     assert times["labaMarkers_run-2_motion.tsv"] == "2023-11-14T22:13:20.998000Z"
     assert "there are 2 measurements, so there are 2 runs" in job.notes
+
+
+def test_sources_whose_names_have_equal_letters_are_different_tracking_systems(tmp_path: Path) -> None:
+    export(tmp_path, [markers(1, number, source=name) for number in range(5) for name in ("a1", "a_1")])
+    assert runs_of(tmp_path) == {("a1Markers", "1"), ("a12Markers", "1")}
 
 
 def test_new_labels_begin_a_run_while_other_components_go_on(tmp_path: Path) -> None:
