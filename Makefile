@@ -38,7 +38,7 @@ test: .venv/installed
 
 # What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
 # commands in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site)
+SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))

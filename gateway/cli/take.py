@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +15,7 @@ from gateway.cli.main import exit_with, print_json
 from gateway.config.words import join_or
 from gateway.errors import QueryError
 from gateway.logs.safe_text import safe_text
-from gateway.takes.export.job import FORMATS, Axis, ExportJob, OpenSimOptions, export_take
+from gateway.takes.export.job import FORMATS, Axis, BidsNames, ExportJob, OpenSimOptions, export_take
 
 if TYPE_CHECKING:
     from gateway.cli.take_report import ListedTake
@@ -219,8 +220,12 @@ def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], 
 def export(
     file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
     out: Annotated[
-        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
+        Path,
+        typer.Argument(
+            help=f"The new file; its extension is the format: {join_or(FORMATS)}. With --opensim or --bids, a folder."
+        ),
     ],
+    *,
     source: options.SourceOption = None,
     from_s: options.FromOption = None,
     to_s: options.ToOption = None,
@@ -252,31 +257,55 @@ def export(
             help="The model's bodies that step on the plates, in the order of the plates: calcn_r,calcn_l."
         ),
     ] = None,
+    bids: Annotated[
+        bool, typer.Option("--bids", help="Write to a Motion-BIDS data set; OUT is its folder, new or not.")
+    ] = False,
+    subject: Annotated[
+        str | None, typer.Option(help="The subject in BIDS; the default is that of the take.")
+    ] = None,
+    session: Annotated[
+        str | None, typer.Option(help="The session in BIDS; the default is that of the take.")
+    ] = None,
+    task: Annotated[str | None, typer.Option(help="The task in BIDS, such as walking.")] = None,
+    run: Annotated[
+        int | None, typer.Option(min=1, help="The number of the run in BIDS; the default is the next one.")
+    ] = None,
     quiet: options.NoProgressOption = False,
 ) -> None:
-    """Convert a take to a file of another program, such as C3D; never overwrite a file."""
+    """Convert a take to the files of other programs, such as C3D; never overwrite a file."""
     from rich.console import Console
 
     from gateway.display.terminal import print_list
 
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise typer.BadParameter(f"--from {from_s:g} is not before --to {to_s:g}")
-    formats = [name for name, is_chosen in (("opensim", opensim), ("ros2", ros2)) if is_chosen]
+    chosen = {"opensim": opensim, "bids": bids, "ros2": ros2}
+    formats = [name for name, is_chosen in chosen.items() if is_chosen]
     if len(formats) > 1:
         raise typer.BadParameter(f"--{formats[0]} and --{formats[1]} are different formats; choose one")
     chosen_format = formats[0] if formats else ""
     kind = f"--{chosen_format}" if chosen_format else out.suffix.lower()
-    for name, value, kinds in (
+    names = BidsNames(subject, session, task, run)
+    for option, value, kinds in (
         ("--up", up, (".trc", ".mot", "--opensim")),
         ("--forward", forward, (".trc", ".mot", "--opensim")),
         ("--min-force", min_force, (".mot", "--opensim")),
         ("--bodies", bodies, ("--opensim",)),
+        *((f"--{name}", value, ("--bids",)) for name, value in asdict(names).items()),
     ):
         if value is not None and kind not in kinds:
-            raise typer.BadParameter(f"{name} is for {join_or(kinds)} only")
-    names = tuple(body.strip() for body in bodies.split(",")) if bodies else ()
-    chosen = OpenSimOptions(up, forward, min_force, names)
-    job = ExportJob(file, out, chosen_format, source=source, from_s=from_s, to_s=to_s, opensim=chosen)
+            raise typer.BadParameter(f"{option} is for {join_or(kinds)} only")
+    bodies_of_plates = tuple(body.strip() for body in bodies.split(",")) if bodies else ()
+    job = ExportJob(
+        file,
+        out,
+        chosen_format,
+        source=source,
+        from_s=from_s,
+        to_s=to_s,
+        opensim=OpenSimOptions(up, forward, min_force, bodies_of_plates),
+        bids=names,
+    )
     with progress_bar(quiet=quiet, counts_bytes=False) as job.progress:
         paths = export_take(job)
     print_list(Console(stderr=True), ["file", "changed, rounded or left out", "how much"], job.notes)

@@ -104,6 +104,13 @@ def test_every_command_from_a_take_to_robotics_prints_the_output_on_the_page(
     assert {"/lab/markers", "/lab/tools", "/lab/forces"} < read_mcap(folder / "walk.mcap").topics.keys()
 
 
+def test_every_command_of_take_to_bids_prints_the_output_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow("docs/how-to/take-to-bids.md", folder, terminals) == 5
+    assert {path.name for path in (folder / "study").glob("sub-*")} == {"sub-01", "sub-02"}
+
+
 @pytest.mark.wheelhouse
 def test_the_output_of_a_package_of_ones_own_works_as_on_the_page(
     folder: Path, terminals: dict[str, Terminal], monkeypatch: pytest.MonkeyPatch

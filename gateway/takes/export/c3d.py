@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from gateway import version_text
 from gateway.descriptions.force_plates import ADDED_LABELS, CALIBRATED, calibration_of
-from gateway.descriptions.labels import MAX_EVENT_AGE_US, EventText, event_text, fitting_labels, printable
+from gateway.descriptions.labels import EventText, event_text, fitting_labels, printable
 from gateway.errors import TakeError
 from gateway.takes.export.c3d_content import (
     MAX_LIST,
@@ -29,7 +29,13 @@ from gateway.takes.export.c3d_content import (
     residual_step,
 )
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, named_measurements, note_missing, utc_text
+from gateway.takes.export.measurements import (
+    Measurement,
+    event_seconds,
+    named_measurements,
+    note_missing,
+    utc_text,
+)
 from gateway.takes.export.plates import PlatePlan
 from gateway.takes.files.component_rows import Array
 
@@ -231,18 +237,12 @@ _MARGIN_S: Final = 1.0
 
 
 def _event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> _Group:
-    """Return the group EVENT with the events of these rows; {} if there are none.
-
-    The time of an event is its own, or that of its frame if it is far from that.
-    """
+    """Return the group EVENT with the events of these rows; {} if there are none."""
     events = measurement.source.events
     if events is None:
         return {}
     rate_hz = measurement.grid.rate_hz
-    own_us = events.items["timestamp"]
-    is_near = abs(own_us.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
-    times_us = np.where(is_near, own_us, events.timestamp_us)
-    seconds = measurement.seconds_of(times_us, events.capture_utime) - first_row / rate_hz
+    seconds = event_seconds(measurement) - first_row / rate_hz
     (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
     chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
     if len(chosen) > MAX_LIST:

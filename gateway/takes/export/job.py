@@ -27,7 +27,11 @@ FORMATS: Final = {
 }
 """The module and the function that write the files of a job, by the extension of its ``out``."""
 
-CHOSEN_FORMATS: Final = {"opensim": ("opensim", "export_opensim"), "ros2": ("rosbag", "export_rosbag")}
+CHOSEN_FORMATS: Final = {
+    "opensim": ("opensim", "export_opensim"),
+    "bids": ("bids", "export_bids"),
+    "ros2": ("rosbag", "export_rosbag"),
+}
 """The same for the formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
 
 _INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
@@ -87,6 +91,16 @@ class OpenSimOptions:
         return self.up is not None or self.forward is not None
 
 
+@dataclass(frozen=True)
+class BidsNames:
+    """What the files of a BIDS data set are called after; None is what the take says, or the next number."""
+
+    subject: str | None = None
+    session: str | None = None
+    task: str | None = None
+    run: int | None = None
+
+
 @dataclass
 class ExportJob:
     """What to export, and where it goes.
@@ -106,6 +120,7 @@ class ExportJob:
     progress: Callable[[str, int, int], None] = lambda *_: None
     notes: list[Note] = field(default_factory=list)
     opensim: OpenSimOptions = OpenSimOptions()
+    bids: BidsNames = BidsNames()
     files: NewFiles = field(default_factory=NewFiles)
 
     def note(self, what: str, file: str = "", amount: object = "") -> None:

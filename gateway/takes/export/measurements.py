@@ -1,16 +1,18 @@
 """The measurements of a take: parts that have one rate, one set of labels and one count of the server's
 time.
 
-C3D and TRC have a rate and no times. A frame that is missing becomes a row without values, so that all others
-keep their places. The times of capture are not used: their jitter would bend the grid.
+C3D, TRC and BIDS have a rate and no times. A frame that is missing becomes a row without values, so that all
+others keep their places. The times of capture are not used: their jitter would bend the grid.
 """
 
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from gateway.descriptions.labels import MAX_EVENT_AGE_US
 from gateway.errors import TakeError
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import Array
@@ -147,7 +149,9 @@ _SAME_CLOCK_S: Final = 0.2
 """Two time stamps are of the same measurement if they differ from the times of capture equally, within
 this."""
 
-_MAX_FILES: Final = 1000
+MAX_FILES: Final = 1000
+"""The most measurements in one export: each becomes a file."""
+
 _COMPARED: Final = 9
 """How many pairs of frames are compared to decide this."""
 
@@ -289,12 +293,12 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     by_source = {
         source.name: found
         for source in job.open_take().sources.values()
-        if (found := _measurements(source, keys))
+        if (found := next(measurements_by_component(source, keys), []))
     }
     total = sum(map(len, by_source.values()))
     if not total:
         raise nothing_to_export(job, what)
-    if total > _MAX_FILES:
+    if total > MAX_FILES:
         raise TakeError(
             f"{job.take} has {total} measurements, and each becomes a file; choose a part by --from and --to"
         )
@@ -308,11 +312,28 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     return named
 
 
-def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement]:
+def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iterator[list[Measurement]]:
+    """Yield the measurements of each of the components that a source has, with its frames as their base."""
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
     runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
-    base_runs = next((runs[key] for key in keys if key in runs), [])
-    return [Measurement(source, runs, run, grid) for run in base_runs for grid in place(run)]
+    for key in keys:
+        if key in runs:
+            yield [Measurement(source, runs, run, grid) for run in runs[key] for grid in place(run)]
+
+
+def event_seconds(measurement: Measurement) -> Array:
+    """Return when the events of the source were, in s from the first row of a measurement.
+
+    Those of another measurement are NaN. The time of an event is its own, or that of its frame if it is far
+    from that.
+    """
+    events = measurement.source.events
+    if events is None:
+        return np.empty(0)
+    own_us = events.items["timestamp"]
+    is_near = abs(own_us.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
+    times_us = np.where(is_near, own_us, events.timestamp_us)
+    return measurement.seconds_of(times_us, events.capture_utime)
 
 
 _ALONE: Final = {"analog": ".sto", "force": ".mot"}

@@ -35,7 +35,8 @@ from gateway.takes.export.measurements import (
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.opensim_text import encode_rows, opensim_labels
+from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.opensim_labels import opensim_labels
 from gateway.takes.export.plates import PlatePlan, plan_plates
 from gateway.takes.export.trc import write_trc
 from gateway.takes.files.component_rows import Array
@@ -307,7 +308,8 @@ def _write_table(
     num_rows, num_expected = 0, samples.placed.last_row - samples.placed.first_row + 1
     num_done = 0
     for times, values in blocks:
-        file.write(encode_rows([b"%.6f" % time_s for time_s in times.tolist()], values, b"nan", b"\n"))
+        heads = [b"%.6f" % time_s for time_s in times.tolist()]
+        file.write(encode_rows(values, b"nan", b"\n", heads))
         num_rows += len(times)
         num_done = min(num_done + _BLOCK_ROWS, num_expected)
         job.progress(f"writing {path.name}", num_done, num_expected)

@@ -14,7 +14,8 @@ from gateway.takes.export.measurements import (
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.opensim_text import NOT_IN_LABELS, encode_rows, opensim_labels
+from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.opensim_labels import NOT_IN_LABELS, opensim_labels
 from gateway.takes.files.component_rows import Array
 
 _KNOWN_UNITS: Final = ("mm", "m")
@@ -66,7 +67,7 @@ def write_trc(
             with np.errstate(invalid="ignore"):  # infinity, which becomes an empty cell
                 rotated = positions.astype(np.float64) * factor @ rotation.T
             rows = rotated.reshape(stop - start, -1)
-            file.write(encode_rows([head.encode() for head in heads], rows, b"", b"\t\n"))
+            file.write(encode_rows(rows, b"", b"\t\n", [head.encode() for head in heads]))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
     note_missing(job, path, measurement, 0, grid.num_rows)
 

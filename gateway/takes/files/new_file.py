@@ -74,7 +74,9 @@ class NewFiles:
         self.paths: list[Path] = []
         """The files, in the order of their creation."""
         self._temporary: list[Path] = []
+        self._replacing: set[Path] = set()
         self._folders: list[Path] = []
+        self._locks = contextlib.ExitStack()
         self._open: list[IO[bytes]] = []
 
     def __enter__(self) -> Self:
@@ -93,9 +95,10 @@ class NewFiles:
                         file.close()
                 for temporary in self._temporary:
                     temporary.unlink(missing_ok=True)
-                for folder in self._folders:
+                for folder in reversed(self._folders):
                     with contextlib.suppress(OSError):  # it has files: those of this block, or of others
                         folder.rmdir()
+                self._locks.close()
         except OSError as failure:
             raise self._as_take_error(failure) from failure
         if isinstance(error, OSError):
@@ -107,9 +110,29 @@ class NewFiles:
             path.mkdir()
             self._folders.append(path)
 
+    def lock_folder(self, path: Path) -> None:
+        """Lock a folder until the block ends. Raises TakeError if another process has locked it."""
+        import fcntl  # noqa: PLC0415 - `open_take` also runs on Windows, which has none
+
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._locks.callback(os.close, descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise TakeError(f"another program is writing to {path}; try again when it has ended") from None
+
+    def replace(self, path: Path) -> IO[bytes]:
+        """Open a file for writing that takes the place of an existing one when the block ends.
+
+        The files get their names in the order of their creation. If one of them cannot, those that are new
+        are removed, but what has been replaced stays so.
+        """
+        self._replacing.add(path)
+        return self.create(path)
+
     def create(self, path: Path) -> IO[bytes]:
         """Open a new file for writing. It has its name when the block ends. Raises TakeError."""
-        if os.path.lexists(path) or path in self.paths:
+        if path in self.paths or (os.path.lexists(path) and path not in self._replacing):
             raise _exists(path)
         temporary = path.with_name(f".{secrets.token_hex(8)}.part{path.suffix}")
         self.paths.append(path)
@@ -126,8 +149,11 @@ class NewFiles:
         done: list[Path] = []
         try:
             for temporary, path in zip(self._temporary, self.paths, strict=True):
-                _rename(temporary, path)
-                done.append(path)
+                if path in self._replacing:
+                    temporary.replace(path)
+                else:
+                    _rename(temporary, path)
+                    done.append(path)
         except BaseException:
             for path in done:
                 path.unlink(missing_ok=True)

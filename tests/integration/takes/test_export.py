@@ -45,6 +45,28 @@ def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -
     assert "\tthe take is damaged at 2 places\t" in done.stderr
 
 
+WALK = Path(__file__).parents[3] / "examples/walk.lcmlog"
+BIDS = ("--bids", "--subject", "01", "--task", "walking")
+
+
+def test_a_bids_data_set_is_a_folder_that_grows(tmp_path: Path) -> None:
+    study = tmp_path / "study"
+    done = run_in_process("export", WALK, study, *BIDS)
+    assert done.returncode == 0
+    assert f"{study}/sub-01/sub-01_scans.tsv (0.4 kB)\n" in done.stdout
+    assert "positions converted from mm to m" in done.stderr
+    done = run_in_process("export", WALK, study, *BIDS, "--session", "2", "--run", "3")
+    assert f"{study}/sub-01/ses-2/sub-01_ses-2_scans.tsv (0.4 kB)\n" in done.stdout
+    assert len(list(study.rglob("*_run-3_motion.tsv"))) == 4
+
+
+@pytest.mark.parametrize("option", ["--subject", "--session", "--task"])
+def test_options_of_bids_need_it(tmp_path: Path, option: str) -> None:
+    done = run_in_process("export", WALK, tmp_path / "walk.c3d", option, "x")
+    assert done.returncode == 2
+    assert f"{option} is for --bids only" in done.stderr
+
+
 EXISTS = "exists already, and nothing is overwritten"
 
 

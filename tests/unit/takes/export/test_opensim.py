@@ -25,7 +25,6 @@ from gateway.rtc3d.parameters import (
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import Axis, ExportJob, OpenSimOptions, export_take
-from gateway.takes.export.opensim_text import encode_rows
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -350,18 +349,3 @@ def test_a_take_without_loads_or_channels_is_an_error(tmp_path: Path, name: str)
     messages = step_messages(STEP, plate=plate) if name == "walk.mot" else [description(), labelled("a")]
     with pytest.raises(TakeError, match=rf"take\.lcmlog has no .*, and \{name[4:]} holds nothing else"):
         export_messages(tmp_path, messages, name)
-
-
-def test_numbers_are_read_back_exactly() -> None:
-    """Any 32-bit float has the same bits after it was text: 9 digits are enough."""
-    bits = np.random.default_rng(6).integers(0, 2**32, 20_000, np.uint32)
-    edges = [0, 1e-45, -1.17549435e-38, 3.4028235e38, 1, 9.9999999e9, 0.1, -999999999, 1e23, NAN, np.inf]
-    values = np.concatenate([bits.view(np.float32), np.array(edges, np.float32)])
-    text = encode_rows([b"7"] * len(values), values[:, None], b"nan", b"\n")
-    rows = [line.split(b"\t") for line in text.splitlines()]
-    assert {head for head, _ in rows} == {b"7"}
-    found = np.array([float(cell) for _, cell in rows]).astype(np.float32)
-    assert np.array_equal(found, np.where(np.isfinite(values), values, NAN), equal_nan=True)
-    assert text.splitlines()[-11] == b"7\t0.00000000e+00"
-    assert encode_rows([b"7"], np.array([[0.99999999996]]), b"", b"\n") == b"7\t1.00000000e+00\n"
-    assert encode_rows([b"7"], np.array([[1e-90, -1e90]]), b"", b"\t\n") == b"7\t0.00000000e+00\t\t\n"

@@ -91,3 +91,48 @@ def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(TakeError, match="exists already"):
         create(tmp_path, appears=True)
     assert names(tmp_path) == {"other", "walk-2.c3d"}
+
+
+def test_folders_are_removed_after_an_error_unless_others_use_them(tmp_path: Path) -> None:
+    def create_folders() -> None:
+        with NewFiles() as files:
+            for folder in ("a", "a/b", "c"):
+                files.create_folder(tmp_path / folder)
+            files.create(tmp_path / "a/b/walk.tsv").write(b"x")
+            (tmp_path / "c/mine").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        create_folders()
+    assert names(tmp_path) == {"c"}
+
+
+def test_a_replaced_file_keeps_its_content_until_the_end(tmp_path: Path) -> None:
+    table = tmp_path / "table.tsv"
+    table.write_bytes(b"old")
+
+    def stop() -> None:
+        with NewFiles() as files:
+            files.replace(table).write(b"new")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stop()
+    assert table.read_bytes() == b"old"
+    with NewFiles() as files:
+        files.replace(table).write(b"new")
+        assert table.read_bytes() == b"old"
+    assert table.read_bytes() == b"new"
+    assert names(tmp_path) == {"table.tsv"}
+
+
+def test_a_locked_folder_is_free_when_the_block_ends(tmp_path: Path) -> None:
+    with NewFiles() as files:
+        files.lock_folder(tmp_path)
+        with (
+            NewFiles() as others,
+            pytest.raises(TakeError, match=f"another program is writing to {tmp_path}"),
+        ):
+            others.lock_folder(tmp_path)
+    with NewFiles() as files:
+        files.lock_folder(tmp_path)

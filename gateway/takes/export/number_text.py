@@ -1,38 +1,15 @@
-"""What the text files of OpenSim have in common: labels, and rows of numbers, many at once.
+"""Rows of numbers as text, many at once.
 
 Formatting each number by itself would take most of an hour for an hour of a gait laboratory. Here, numpy
 computes the digits of whole blocks, which takes a tenth of the time.
 """
 
-import re
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
-from gateway.descriptions.labels import fitting_labels
-from gateway.takes.export.job import ExportJob
 from gateway.takes.files.component_rows import Array
-
-NOT_IN_LABELS: Final = re.compile(r"[^\w.:+-]+")
-_MAX_LABEL_BYTES: Final = 100
-_TIME: Final = "time"
-"""The label of the first column, which no other may have."""
-
-
-def opensim_labels(job: ExportJob, file: str, labels: Sequence[str], noun: str) -> tuple[str, ...]:
-    """Return labels as OpenSim can read them, each different, and report those that were changed."""
-
-    def fit(label: str) -> str:
-        text = NOT_IN_LABELS.sub("_", label.strip())
-        return f"{noun}_{text}" if text.casefold() == _TIME else text
-
-    fitted = fitting_labels(labels, fit, _MAX_LABEL_BYTES, noun)
-    changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
-    if changed:
-        job.note(f"labels of {noun}s: spaces and special characters replaced", file, changed)
-    return fitted
-
 
 _NUM_DIGITS: Final = 9
 """As many digits as any 32-bit float needs to be read back exactly."""
@@ -47,21 +24,20 @@ _EXPONENT: Final = _CELL_BYTES - 4
 _ZERO, _TAB, _MINUS, _PLUS, _POINT, _E = b"0\t-+.e"
 
 
-def encode_rows(heads: Sequence[bytes], values: Array, missing: bytes, end: bytes) -> bytes:
-    """Return rows as text: the head of each, a tab and a number for each value, and the end.
+def encode_rows(values: Array, missing: bytes, end: bytes, heads: Sequence[bytes] = ()) -> bytes:
+    """Return rows as text: a number for each value, separated by tabs, and the end.
 
-    ``heads`` are the first cells of the rows, and ``values`` has the shape (rows, columns). ``missing`` (up
-    to 3 bytes) stands for NaN, infinity and numbers that no
-    32-bit float can hold.
+    ``values`` has the shape (rows, columns). ``missing`` (up to 3 bytes) stands for NaN, infinity and numbers
+    that no 32-bit float can hold. ``heads`` are further first cells of the rows, if there are any.
     """
-    num_rows = len(heads)
+    num_rows = len(values)
     with np.errstate(invalid="ignore"):  # any bits that are a NaN
-        cells = _cells(values.astype(np.float64).ravel(), missing)
-    parts = [
-        np.array(heads, np.bytes_).view(np.uint8).reshape(num_rows, -1),
-        cells.reshape(num_rows, -1),
-        np.tile(np.frombuffer(end, np.uint8), (num_rows, 1)),
-    ]
+        cells = _cells(values.astype(np.float64).ravel(), missing).reshape(num_rows, -1)
+    parts = [cells, np.tile(np.frombuffer(end, np.uint8), (num_rows, 1))]
+    if heads:
+        parts.insert(0, np.array(heads, np.bytes_).view(np.uint8).reshape(num_rows, -1))
+    else:
+        cells[:, 0] = 0  # no tab
     return np.concatenate(parts, axis=1).tobytes().translate(None, b"\0")
 
 
