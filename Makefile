@@ -20,6 +20,9 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 RELEASE_TOOLS := build/release-venv/complete
 RELEASE_PYTHON := build/release-venv/bin/python
 
+# A bare Debian 12, in which tests install the Debian package.
+BARE := build/bare-debian-12/complete
+
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
@@ -40,8 +43,13 @@ test: .venv/installed
 # commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
-test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
+test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
+
+# The whole test of the Debian package: the one of `make deb`, an upgrade from that of the previous commit, lintian, and a
+# second build. It takes ten minutes, and is not part of the check.
+test-install: .venv/installed $(BARE)
+	MAKEFLAGS= FULL_INSTALLATION=1 exec $(BIN)/python tests/run.py -n 1 tests/systemd/test_debian_package.py tests/systemd/full_package.py
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -204,9 +212,7 @@ DEB_LOCK := release/deb/packages.txt
 
 deb-lock:
 	apt-get update
-	names=$$(sed -n 's/^\([^# ]*\) .*/\1/p' $(DEB_LOCK)); comments=$$(grep '^#' $(DEB_LOCK)); \
-	{ echo "$$comments"; apt-cache show --no-all-versions $$names | awk '/^Package:/ { name = $$2 } \
-	    /^Version:/ { version = $$2 } /^SHA256:/ { print name, version, $$2 }'; } >$(DEB_LOCK)
+	$(PYTHON) -B -m release.deb.packages --newest >build/packages.txt && mv build/packages.txt $(DEB_LOCK)
 
 # Build the container image from the Debian package, in dist/ as an OCI archive; it needs podman, and the registry of the base.
 # The archive is the same for the same package and base. IMAGE_OPTIONS=--build-arg=BASE=… takes another base.
@@ -237,7 +243,13 @@ build/bin/actionlint:
 	else echo 'The workflows are not checked: go is missing (Debian: golang-go)'; fi
 
 # Download the packages that an installation needs: its tests have no network.
-wheelhouse: build/wheelhouse/complete $(RELEASE_TOOLS)
+wheelhouse: build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE)
+
+# Debian may have replaced a package of $(DEB_LOCK) since the last `make deb-lock`: the tests then use the newer one.
+$(BARE): $(DEB_LOCK) tests/support/bare_debian.py | .venv/installed
+	@if command -v debootstrap apt-get >/dev/null && [ "$$(id -u)" = 0 ]; then \
+	    echo 'Making a bare Debian 12 for tests (about 30 s) …'; $(BIN)/python -B -m tests.support.bare_debian; \
+	else echo 'The Debian package is not tested: that needs root, apt-get and debootstrap'; fi
 
 build/wheelhouse/complete: pyproject.toml requirements-view.txt release/build-requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv

@@ -222,7 +222,8 @@ def export(
     out: Annotated[
         Path,
         typer.Argument(
-            help=f"The new file; its extension is the format: {join_or(FORMATS)}. With --opensim or --bids, a folder."
+            help=f"The new file; its extension is the format: {join_or(FORMATS)}. "
+            "With --opensim or --bids, a folder."
         ),
     ],
     *,

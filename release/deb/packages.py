@@ -1,6 +1,10 @@
-"""The packages of Debian whose files are in the package of the gateway."""
+"""The packages of Debian whose files are in the package of the gateway.
+
+python -m release.deb.packages --newest    print the list with the versions that apt has now
+"""
 
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,7 +14,8 @@ from urllib.parse import quote
 
 from release.build import ROOT
 
-LIST: Final = Path(__file__).with_name("packages.txt")
+LIST: Final = Path(os.environ.get("DEB_PACKAGES", Path(__file__).with_name("packages.txt")))
+"""Tests may use newer versions than a release: their list is elsewhere."""
 
 
 class DebianPackage(NamedTuple):
@@ -44,7 +49,14 @@ def download(package: DebianPackage) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{package.name}_{package.version}_amd64.deb"
     if not path.exists():
-        command = ["apt-get", "download", "--quiet=2", f"{package.name}={package.version}"]
+        command = [
+            "apt-get",
+            "--option",
+            "APT::Sandbox::User=root",
+            "download",
+            "--quiet=2",
+            f"{package.name}={package.version}",
+        ]
         if subprocess.run(command, cwd=folder, check=False).returncode:
             sys.exit(
                 f"apt-get has no {package.name} {package.version}: run `apt-get update`, or `make deb-lock`."
@@ -54,3 +66,20 @@ def download(package: DebianPackage) -> Path:
             f"{path} has the SHA-256 {found}, not the one in release/deb/packages.txt. Delete it and retry."
         )
     return path
+
+
+def newest_list() -> str:
+    """Return the list with the versions that apt has now."""
+    lines = [line for line in LIST.read_text().splitlines() if line.startswith("#")]
+    for package in debian_packages():
+        command = ("apt-cache", "show", "--no-all-versions", package.name)
+        shown = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+        fields = dict(line.split(": ", 1) for line in shown.splitlines() if ": " in line and line[0] != " ")
+        lines.append(f"{package.name} {fields['Version']} {fields['SHA256']}")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] != ["--newest"]:
+        sys.exit(__doc__)
+    print(newest_list(), end="")

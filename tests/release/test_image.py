@@ -14,15 +14,13 @@ import pytest
 import zenoh
 
 from gateway import __version__
+from tests.support.bare_debian import bare_root, quick_package
 from tests.support.configurations import write_config
 from tests.support.documents import ROOT
 from tests.support.gateway_process import simulator
 from tests.support.needs import need_programs
 from tests.support.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.support.waiting import wait_until
-from tests.systemd.test_debian_package import bare_root, build_package
-
-__all__ = ["bare_root"]  # a fixture
 
 pytestmark = [pytest.mark.netns, pytest.mark.wheelhouse, pytest.mark.xdist_group("debian_package")]
 
@@ -78,10 +76,10 @@ class Podman:
 
 
 @pytest.fixture(scope="module")
-def podman(bare_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Podman]:
+def podman() -> Iterator[Podman]:
     """Return an engine that has the image."""
     need_programs("podman", "crun", "unshare", packages="podman, crun and util-linux")
-    package = build_package(tmp_path_factory.mktemp("package"))
+    package = quick_package()
     pipe = subprocess.PIPE
     with (
         tempfile.TemporaryDirectory(prefix="rtc3d-image-") as folder,
@@ -91,7 +89,7 @@ def podman(bare_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     ):
         assert namespace.stdout is not None
         podman = Podman(folder, namespace.stdout.readline().strip())
-        files = f"tar --create --directory={bare_root} . | podman import --quiet - localhost/debian"
+        files = f"tar --create --directory={bare_root()} . | podman import --quiet - localhost/debian"
         podman.check("sh", "-c", files)
         podman.check(ROOT / "release/image/build", package, "--build-arg=BASE=localhost/debian")
         yield podman

@@ -1,11 +1,9 @@
 """The Debian package, on a bare Debian 12: systemd, no compiler, no Python, no network.
 
-With FULL_INSTALLATION=1 (`make test-install`), the package is that of `make deb`, the upgrade begins with the
-package of the previous commit, lintian checks it, and a second build must give the same bytes.
+With FULL_INSTALLATION=1 (`make test-install`), the package is that of `make deb`, and the upgrade begins with
+the package of the previous commit.
 """
 
-import fcntl
-import hashlib
 import os
 import shutil
 import subprocess
@@ -16,8 +14,8 @@ from typing import Final
 import pytest
 
 from gateway import __version__
-from tests.support.fresh_clones import QUICK_CC, ROOT, WHEELHOUSE, WHEELHOUSE_PYTHON, pip_environment
-from tests.support.needs import need, need_programs
+from tests.support.bare_debian import bare_root, build_package, quick_package
+from tests.support.fresh_clones import ROOT
 from tests.systemd.machine import CLONE, CONFIG, UNIT, Machine, booted, commands
 
 pytestmark = [
@@ -39,55 +37,10 @@ OF_OTHERS: Final = ("/var/cache/apt", "/var/lib/apt", "/var/lib/systemd", "/var/
 
 
 @pytest.fixture(scope="module")
-def bare_root() -> Path:
-    """Return the folder of a bare Debian 12 with systemd. It is made once and then kept in build/."""
-    need_programs("debootstrap", packages="debootstrap")
-    need(os.geteuid() == 0, "debootstrap and systemd need root")
-    root = ROOT / "build/bare-debian-12"
-    root.parent.mkdir(exist_ok=True)
-    with root.with_suffix(".lock").open("w") as lock:  # for tests in several workers
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not root.exists():
-            shutil.rmtree(unfinished := root.with_suffix(".new"), ignore_errors=True)
-            debootstrap = ("debootstrap", "--variant=minbase", "--include=systemd-sysv", "bookworm")
-            subprocess.run(["unshare", "--mount", *debootstrap, unfinished, mirror()], check=True)
-            (unfinished / "etc/apt/apt.conf.d/yes").write_text('APT::Get::Assume-Yes "true";\n')
-            unfinished.rename(root)
-    return root
-
-
-def mirror() -> str:
-    """Return the mirror of Debian 12 that this machine uses."""
-    command = (
-        "apt-get",
-        "indextargets",
-        "--format=$(REPO_URI)",
-        "Codename: bookworm",
-        "Created-By: Packages",
-    )
-    return subprocess.check_output(command, text=True).split()[0]
-
-
-def build_package(folder: Path, version: str = __version__, repository: Path = ROOT) -> Path:
-    """Build the package without compressing it; without FULL, of the sources as they are."""
-    kind = "compiled" if FULL else "pure"
-    python = (str(WHEELHOUSE_PYTHON), "-B", "-m")
-    environment = {**os.environ, **pip_environment(), "CC": QUICK_CC}
-    wheel = ("release.build", "--dist", str(folder), kind)
-    subprocess.run([*python, *wheel], cwd=repository, env=environment, check=True)
-    [built] = folder.glob("*.whl")
-    options = ("--compression=none", f"--version={version}", f"--output={folder}")
-    package = ("release.deb.build", str(built), str(WHEELHOUSE), *options)
-    subprocess.run([*python, *package], cwd=repository, env=environment, check=True)
-    [path] = folder.glob("*.deb")
-    return path
-
-
-@pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def package() -> Path:
     """Return the package of this repository."""
     if not FULL:
-        return build_package(tmp_path_factory.mktemp("package"))
+        return quick_package()
     subprocess.run(["make", "--silent", "deb"], cwd=ROOT, check=True, env={**os.environ, "MAKEFLAGS": ""})
     return ROOT / f"dist/rtc3d-gateway_{__version__}_amd64.deb"
 
@@ -110,8 +63,8 @@ async def all_files(machine: Machine) -> set[str]:
 
 
 @pytest.fixture
-def bare_machine(bare_root: Path) -> Iterator[Machine]:
-    with booted(bare_root) as machine:
+def bare_machine() -> Iterator[Machine]:
+    with booted(bare_root()) as machine:
         yield machine
 
 
@@ -219,20 +172,6 @@ async def test_the_package_refuses_to_replace_an_installation_from_source(
     assert not bare_machine.path("/opt/rtc3d-gateway/venv").exists()
 
 
-@pytest.mark.skipif(not FULL, reason="takes a minute: make test-install")
-def test_lintian_finds_no_error(package: Path) -> None:
-    need_programs("lintian", packages="lintian")
-    subprocess.run(["lintian", "--allow-root", "--fail-on=error", package], check=True)
-
-
-@pytest.mark.skipif(not FULL, reason="takes minutes: make test-install")
-def test_a_second_build_gives_the_same_bytes(package: Path) -> None:
-    first = hashlib.sha256(package.read_bytes()).hexdigest()
-    command = ["sh", "-c", "umask 077; exec make --silent deb"]
-    subprocess.run(command, cwd=ROOT, check=True, env={**os.environ, "MAKEFLAGS": "", "TZ": "Asia/Tokyo"})
-    assert hashlib.sha256(package.read_bytes()).hexdigest() == first
-
-
 def with_version(package: Path, version: str, folder: Path) -> Path:
     """Return a copy of a package, uncompressed, that has another version."""
     files = folder / version
@@ -255,6 +194,6 @@ def previous_package(folder: Path) -> Path | None:
     try:
         if not (previous / "release/deb/build.py").exists():
             return None
-        return build_package(output, f"{__version__}~previous", previous)
+        return build_package(output, "compiled", f"{__version__}~previous", previous)
     finally:
         subprocess.run([*git, "worktree", "remove", "--force", previous], check=True)

@@ -1,0 +1,24 @@
+"""What `make test-install` checks of the Debian package besides test_debian_package.py."""
+
+import hashlib
+import os
+import subprocess
+from pathlib import Path
+
+from tests.support.fresh_clones import ROOT
+from tests.support.needs import need_programs
+from tests.systemd.test_debian_package import package
+
+__all__ = ["package"]  # a fixture
+
+
+def test_lintian_finds_no_error(package: Path) -> None:
+    need_programs("lintian", packages="lintian")
+    subprocess.run(["lintian", "--allow-root", "--fail-on=error", package], check=True)
+
+
+def test_a_second_build_gives_the_same_bytes(package: Path) -> None:
+    first = hashlib.sha256(package.read_bytes()).hexdigest()
+    command = ["sh", "-c", "umask 077; exec make --silent deb"]
+    subprocess.run(command, cwd=ROOT, check=True, env={**os.environ, "MAKEFLAGS": "", "TZ": "Asia/Tokyo"})
+    assert hashlib.sha256(package.read_bytes()).hexdigest() == first
