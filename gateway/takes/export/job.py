@@ -19,13 +19,16 @@ if TYPE_CHECKING:
 
 FORMATS: Final = {
     ".c3d": ("c3d", "export_c3d"),
-    ".trc": ("text_files", "export_trc"),
-    ".csv": ("text_files", "export_csv"),
+    ".trc": ("trc", "export_trc"),
+    ".csv": ("csv_files", "export_csv"),
+    ".parquet": ("parquet", "export_parquet"),
     ".mcap": ("mcap", "export_mcap"),
 }
 """The module and the function that write the files of a job, by the extension of its ``out``."""
 
-_INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
+_EXTRAS: Final = {"mcap": ("foxglove-sdk", "foxglove"), "parquet": ("pyarrow", "parquet")}
+"""The package that a module needs, and the extra that installs it."""
+
 _MAX_NAMED: Final = 10
 
 
@@ -39,10 +42,12 @@ def export_take(job: "ExportJob") -> list[Path]:
         try:
             write = getattr(import_module(f"gateway.takes.export.{module}"), function)
         except ImportError as error:
-            if module != "mcap":
+            if module not in _EXTRAS:
                 raise
+            package, extra = _EXTRAS[module]
             raise TakeError(
-                f"{job.out} cannot be written without foxglove-sdk; install it: {_INSTALL}"
+                f"{job.out} cannot be written without {package}; "
+                f"install it: pip install 'rtc3d-gateway[{extra}]'"
             ) from error
         write(job)
     return job.files.paths

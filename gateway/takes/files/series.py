@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import rtc3d
@@ -24,7 +24,14 @@ from gateway.takes.files.component_rows import (
 )
 from gateway.takes.files.row import ItemValues
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray
+
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
+
+MAX_GAP_S: Final = 0.1
+"""Resampling interpolates across gaps up to this, unless told otherwise: 20 frames at 200 Hz."""
 
 _MAX_PADDING: Final = 4
 """How many times as large as what was recorded ``items`` may become, when the labels change."""
@@ -102,17 +109,27 @@ class Series(ItemValues):
         recorded: dict[int, Array],
         parameters: Sequence[ParametersEntry],
         start_utime: int,
+        entries: Array | None = None,
+        resampled_hz: float | None = None,
     ) -> None:
         self.component = component
         self.key = component.key
         self.start_utime = start_utime
-        self._parameters = parameters
-        self._recorded = recorded  # items by their number, as in Rows; of events, all below 1
-        self._columns = columns
+        self.columns = columns
+        """The columns of the table above by name, and ``num_items``."""
+        self.recorded = recorded
+        """The items by their number, as in ``Rows``; of events, all below 1."""
+        self.parameters = parameters
+        self.entries = (
+            _entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
+            if entries is None
+            else entries
+        )
+        """The index in ``parameters`` of those that describe each row; -1 if there are none."""
+        self._resampled_hz = resampled_hz
         for name in _COLUMNS:
             setattr(self, name, columns[name])
         self._num_items = columns["num_items"]
-        self._entries = _entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
 
     def __len__(self) -> int:
         """Return the number of frames (of events: the number of events)."""
@@ -133,8 +150,8 @@ class Series(ItemValues):
 
     def parameters_of(self, row: int) -> Parameters:
         """Return the server's parameters that describe a row; without any section if the take has none."""
-        entry = int(self._entries[row])
-        return self._parameters[entry].parameters if entry >= 0 else Parameters()
+        entry = int(self.entries[row])
+        return self.parameters[entry].parameters if entry >= 0 else Parameters()
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -160,8 +177,11 @@ class Series(ItemValues):
 
     @property
     def rate_hz(self) -> float | None:
-        """The rate of frames that the server announces; None if it announces none, or it changes."""
-        return common(layout.rate_hz for layout in self._layouts.values())
+        """The rate of frames that the server announces; None if it announces none, or it changes.
+
+        Of what ``resample`` returns, it is the new rate.
+        """
+        return self._resampled_hz or common(layout.rate_hz for layout in self._layouts.values())
 
     @cached_property
     def measured_rate_hz(self) -> float | None:
@@ -169,6 +189,8 @@ class Series(ItemValues):
 
         If the time stamps are constant, it is computed from the times of arrival.
         """
+        if self._resampled_hz:
+            return self._resampled_hz
         for times in (self.timestamp_us, self.utime):
             step_us = regular_step(
                 np.diff(times)[(np.diff(self.sequence) == 1) & (np.diff(self.session) == 0)]
@@ -190,11 +212,11 @@ class Series(ItemValues):
         recording; use ``runs`` then.
         """
         if self.component is ComponentType.EVENT:
-            return self._recorded[1][:, 0]
-        if len(self._recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
-            return next(iter(self._recorded.values()))
+            return self.recorded[1][:, 0]
+        if len(self.recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
+            return next(iter(self.recorded.values()))
         dtype = NATIVE_ITEM_DTYPES[self.component]
-        recorded_bytes = sum(items.nbytes for items in self._recorded.values())
+        recorded_bytes = sum(items.nbytes for items in self.recorded.values())
         num_bytes = len(self) * len(self.labels) * dtype.itemsize
         if num_bytes > max(_MAX_PADDING * recorded_bytes, _MIN_LIMIT_BYTES):
             raise TakeError(
@@ -203,12 +225,12 @@ class Series(ItemValues):
             )
         items = np.full((len(self), len(self.labels)), MISSING, np.float32 if not dtype.names else dtype)
         columns = {label: column for column, label in enumerate(self.labels)}
-        rows_of = {number: np.flatnonzero(self._num_items == number) for number in self._recorded}
+        rows_of = {number: np.flatnonzero(self._num_items == number) for number in self.recorded}
         for (entry, num_items), layout in self._layouts.items():
             rows = rows_of[num_items]
-            chosen = self._entries[rows] == entry
+            chosen = self.entries[rows] == entry
             places = np.array([columns[label] for label in layout.labels], np.intp)
-            items[rows[chosen][:, None], places] = self._recorded[num_items][chosen]
+            items[rows[chosen][:, None], places] = self.recorded[num_items][chosen]
         return items
 
     @property
@@ -217,10 +239,10 @@ class Series(ItemValues):
         if self.component is not ComponentType.EVENT:
             return ()
         names = {
-            entry: event_labels(self._parameters[entry].parameters if entry >= 0 else None)
-            for entry in np.unique(self._entries).tolist()
+            entry: event_labels(self.parameters[entry].parameters if entry >= 0 else None)
+            for entry in np.unique(self.entries).tolist()
         }
-        rows = zip(self._entries.tolist(), self.items["id"].tolist(), strict=True)
+        rows = zip(self.entries.tolist(), self.items["id"].tolist(), strict=True)
         return tuple(names[entry].get(number, "") for entry, number in rows)
 
     def runs(self) -> "list[Series]":
@@ -236,34 +258,93 @@ class Series(ItemValues):
         if self.component is not ComponentType.EVENT:
             is_start |= np.diff(self._layout_numbers()) != 0
         starts = [0, *(np.flatnonzero(is_start) + 1).tolist(), len(self)]
-        before = dict.fromkeys(self._recorded, 0)
+        before = dict.fromkeys(self.recorded, 0)
         runs = []
         for start, stop in pairwise(starts):
             num_items = int(self._num_items[start])
             first = before[num_items]
             before[num_items] += stop - start
-            recorded = {num_items: self._recorded[num_items][first : before[num_items]]}
-            columns = {name: values[start:stop] for name, values in self._columns.items()}
-            runs.append(Series(self.component, columns, recorded, self._parameters, self.start_utime))
+            recorded = {num_items: self.recorded[num_items][first : before[num_items]]}
+            columns = {name: values[start:stop] for name, values in self.columns.items()}
+            runs.append(self._part(columns, recorded, self.entries[start:stop]))
         return runs
+
+    def resample(
+        self,
+        rate_hz: float,
+        *,
+        max_gap_s: float = MAX_GAP_S,
+        from_s: float | None = None,
+        to_s: float | None = None,
+    ) -> "Series":
+        """Return the values at a constant rate: at multiples of 1 / ``rate_hz`` since the take's beginning.
+
+        Positions, loads and analog values are interpolated linearly between the frames before and after,
+        orientations by slerp. Between frames that are further apart than ``max_gap_s`` and one and a half
+        periods, they are NaN, so ``max_gap_s=0`` fills no gap; so they are before the first and after the
+        last frame, and between the runs (see ``runs``). A marker, tool, channel or plate that is missing in
+        a frame is interpolated from those that have it.
+
+        ``from_s`` and ``to_s`` are the first and the last second; the default are those of the frames.
+        Nothing is filtered: use a low-pass filter before you reduce the rate of a signal that has higher
+        frequencies. ``capture_utime`` has the new times, and the other columns are those of the nearest
+        frame. Raises TakeError, also for events, which have no rate.
+        """
+        from gateway.takes.files.resampling import resample  # noqa: PLC0415 - it imports this module
+
+        return resample(self, rate_hz, max_gap_s, from_s, to_s)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return a table with a row per frame or event, and the seconds as index ``time_s``.
+
+        The columns are those of an exported table: ``capture_utime`` and other numbers of the frame, then the
+        values, such as "head x". ``attrs["units"]`` has the units by column. Raises TakeError if pandas is
+        not installed.
+        """
+        from gateway.takes.files.tables import to_pandas  # noqa: PLC0415 - it imports this module
+
+        return to_pandas(self)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Return a dataset with the dimension ``time`` in seconds, and one for the items.
+
+        ======  =======================================================================================
+        3d      ``position`` (time, marker, axis), ``reliability`` (time, marker)
+        6d      ``position`` (time, tool, axis), ``quaternion`` (time, tool, part), ``error`` (time, tool)
+        analog  ``value`` (time, channel)
+        force   ``force`` (time, plate, axis), ``moment`` (time, plate, axis)
+        event   ``id``, ``label`` and others (time)
+        ======  =======================================================================================
+
+        The items have their labels as coordinates, and their units as the coordinate ``unit``; ``attrs`` have
+        the unit that all have in common. Raises TakeError if xarray is not installed.
+        """
+        from gateway.takes.files.tables import to_xarray  # noqa: PLC0415 - it imports this module
+
+        return to_xarray(self)
 
     def without_empty_frames(self) -> "Series":
         """Return the frames that have items; all frames if none has."""
         has_items = self._num_items > 0
         if has_items.all() or not has_items.any():
             return self
-        columns = {name: values[has_items] for name, values in self._columns.items()}
-        recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
-        return Series(self.component, columns, recorded, self._parameters, self.start_utime)
+        columns = {name: values[has_items] for name, values in self.columns.items()}
+        recorded = {num_items: items for num_items, items in self.recorded.items() if num_items}
+        return self._part(columns, recorded, self.entries[has_items])
+
+    def _part(self, columns: dict[str, Array], recorded: dict[int, Array], entries: Array) -> "Series":
+        """Return a series of some of the rows."""
+        about = (self.parameters, self.start_utime)
+        return Series(self.component, columns, recorded, *about, entries, self._resampled_hz)
 
     @cached_property
     def _layouts(self) -> dict[tuple[int, int], Description]:
-        """What describes rows, by index in ``_parameters`` and number of items, as they appear."""
-        pairs = np.stack([self._entries, self._num_items], axis=1)
+        """What describes rows, by index in ``parameters`` and number of items, as they appear."""
+        pairs = np.stack([self.entries, self._num_items], axis=1)
         unique, first = np.unique(pairs, axis=0, return_index=True)
         layouts = {}
         for entry, num_items in unique[np.argsort(first)].tolist():
-            parameters = self._parameters[entry].parameters if entry >= 0 else None
+            parameters = self.parameters[entry].parameters if entry >= 0 else None
             layouts[entry, num_items] = describe(self.component, parameters, num_items)
         return layouts
 
@@ -274,7 +355,7 @@ class Series(ItemValues):
         for (entry, num_items), layout in self._layouts.items():
             number = numbers.setdefault(layout, len(numbers))
             if number:
-                result[(self._entries == entry) & (self._num_items == num_items)] = number
+                result[(self.entries == entry) & (self._num_items == num_items)] = number
         return result
 
 

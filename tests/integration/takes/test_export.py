@@ -51,7 +51,7 @@ EXISTS = "exists already, and nothing is overwritten"
 @pytest.mark.parametrize(
     ("name", "options", "problem", "status"),
     [
-        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .csv or .mcap", 2),
+        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .csv, .parquet or .mcap", 2),
         ("walk", (), "walk has no known extension", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
         ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
