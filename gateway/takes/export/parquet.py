@@ -19,7 +19,7 @@ from gateway.takes.export.tables import Table, table_parts
 from gateway.takes.files.series import Series
 from gateway.takes.files.tables import event_columns, time_columns, units_by_column, value_rows
 
-_MAX_WAITING_BYTES: Final = 64 * 1024 * 1024
+_MAX_WAITING_BYTES: Final = 32 * 1024 * 1024
 """How much of all tables waits in memory for larger row groups; then that of the largest is written."""
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
