@@ -84,12 +84,19 @@ def test_every_command_of_record_prints_the_output_on_the_page(
 def test_every_command_of_use_takes_prints_the_output_on_the_page(
     folder: Path, terminals: dict[str, Terminal]
 ) -> None:
-    assert follow("docs/how-to/use-takes.md", folder, terminals) > 6
+    assert follow("docs/how-to/use-takes.md", folder, terminals) > 4
     assert read_ezc3d(folder / "walk.c3d")["data"]["points"].shape[1] == 34
     assert len(read_trc(folder / "walk.trc").labels) == 34
     assert {"/lab/markers", "/lab/tools", "/lab/forces"} < read_mcap(folder / "walk.mcap").topics.keys()
-    components = sorted(path.name for path in folder.glob("walk-*.csv"))
-    assert components == [f"walk-{key}.csv" for key in ("3d", "6d", "analog", "event", "force")]
+
+
+def test_every_command_of_take_to_data_science_prints_the_output_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow("docs/how-to/take-to-data-science.md", folder, terminals) > 4
+    for extension in ("csv", "parquet"):
+        components = sorted(path.name for path in folder.glob(f"walk-*.{extension}"))
+        assert components == [f"walk-{key}.{extension}" for key in ("3d", "6d", "analog", "event", "force")]
 
 
 @pytest.mark.wheelhouse

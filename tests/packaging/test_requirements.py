@@ -1,7 +1,7 @@
 """The requirements files have a tested version of every dependency that pyproject.toml names.
 
-requirements-view.txt has those of all extras; requirements.txt has the same ones without those of ``view`` and
-``parquet``.
+requirements-view.txt has those of all extras; requirements.txt has the same ones without those of ``view``
+and ``parquet``.
 """
 
 import re
