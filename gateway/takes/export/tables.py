@@ -15,7 +15,7 @@ from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series, SeriesBuilder
-from gateway.takes.files.tables import Column, value_columns
+from gateway.takes.files.tables import TIME_COLUMNS, Column, value_columns
 from gateway.takes.files.take import Take, TakeSource
 
 _MAX_TABLES: Final = 200
@@ -54,6 +54,8 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
                 parts = (source.name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
                 table = Table(source, key, columns, job.file_name(*parts))
                 tables[source.name, key, columns] = table
+                for label in sorted({*run.labels} & {*TIME_COLUMNS}):
+                    job.note(f"the channel {label} of {source.name} is the column {label}_2")
             yield table, run
     if not tables:
         raise nothing_to_export(job, "frames")
@@ -84,4 +86,4 @@ def _parts(job: ExportJob, take: Take) -> Iterator[tuple[TakeSource, str, Series
             series = builder.build(source.parameters, take.start_utime)
             if series is not None:
                 yield source, batch.key, series
-        job.progress(f"reading {job.take.name}", reader.read_bytes, reader.num_bytes)
+        job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)

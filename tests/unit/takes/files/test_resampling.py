@@ -85,6 +85,16 @@ def test_gaps_up_to_the_limit_are_filled_and_longer_ones_are_nan(
     assert np.isnan(found.items["reliability"]).tolist() == np.isnan(found.values[..., 0]).tolist()
 
 
+def test_neighbours_are_interpolated_whatever_the_limit_and_the_reliability(series: Open) -> None:
+    """The server may not send a reliability. Frames at 2 Hz are further apart than the default limit."""
+    rows = [(0.5 * n, [(n, 0, 0, NAN)]) for n in range(3)]
+    for found in (
+        series(ComponentType.MARKERS, rows).resample(4, max_gap_s=max_gap_s) for max_gap_s in (0, 0.1)
+    ):
+        assert found.values[:, 0, 0].tolist() == [0, 0.5, 1, 1.5, 2]
+        assert np.isnan(found.items["reliability"]).all()
+
+
 def test_nothing_is_invented_outside_the_frames_or_between_measurements(tmp_path: Path) -> None:
     first = captured(ComponentType.ANALOG, [(0.01 * n, [1]) for n in range(2, 5)])
     second = captured(ComponentType.ANALOG, [(0.01 * n, [2]) for n in range(6, 9)], session=2)
@@ -127,9 +137,9 @@ def test_labels_that_change_stay_with_their_frames(tmp_path: Path) -> None:
 
 
 def test_frames_without_items_have_no_values_and_times_that_go_back_do_no_harm(series: Open) -> None:
-    rows: list[Captured] = [(0.0, [(0, 0, 0, 0)]), (0.01, []), (0.03, [(3, 0, 0, 0)]), (0.02, [(2, 0, 0, 0)])]
+    rows: list[Captured] = [(0.0, [(0, 0, 0, 0)]), (0.01, []), (0.03, [(3, 0, 0, 0)]), (0.02, [(9, 0, 0, 0)])]
     found = series(ComponentType.MARKERS, rows).resample(100)
-    assert found.values[:, 0, 0].tolist() == [0, 1, 2, 3]
+    assert found.values[:, 0, 0].tolist() == [0, 4.5, 9, 3]
     empty = series(ComponentType.MARKERS, [(0.0, []), (0.01, [])]).resample(200)
     assert empty.items.shape == (3, 0)
 
