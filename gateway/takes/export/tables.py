@@ -39,23 +39,24 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
     take = job.open_take(components=())
     tables: dict[tuple[str, str, tuple[Column, ...]], Table] = {}
     numbers: Counter[tuple[str, str]] = Counter()
-    for source, key, series in _parts(job, take):
+    for name, key, series in parts_of(job, take):
+        source = take.sources[name]
         for run in series.runs():
             columns = value_columns(run)
-            table = tables.get((source.name, key, columns))
+            table = tables.get((name, key, columns))
             if table is None:
                 if len(tables) == _MAX_TABLES:
                     raise TakeError(
                         f"the labels in {job.take} change so often that there would be more than "
                         f"{_MAX_TABLES} files; choose a part by --from and --to"
                     )
-                numbers[source.name, key] += 1
-                number = numbers[source.name, key]
-                parts = (source.name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
+                numbers[name, key] += 1
+                number = numbers[name, key]
+                parts = (name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
                 table = Table(source, key, columns, job.file_name(*parts))
-                tables[source.name, key, columns] = table
+                tables[name, key, columns] = table
                 for label in sorted({*run.labels} & {*TIME_COLUMNS}):
-                    job.note(f"the channel {label} of {source.name} is the column {label}_2")
+                    job.note(f"the channel {label} of {name} is the column {label}_2")
             yield table, run
     if not tables:
         raise nothing_to_export(job, "frames")
@@ -65,8 +66,8 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
     job.note_malformed(take)
 
 
-def _parts(job: ExportJob, take: Take) -> Iterator[tuple[TakeSource, str, Series]]:
-    """Yield parts of the components of some MB, with their sources, in the order of the take."""
+def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
+    """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
     reader = TakeReader(job.take)
     first, stop = job.utimes(take)
     for batches in reader.batches():
@@ -85,5 +86,5 @@ def _parts(job: ExportJob, take: Take) -> Iterator[tuple[TakeSource, str, Series
             builder.add(rows)
             series = builder.build(source.parameters, take.start_utime)
             if series is not None:
-                yield source, batch.key, series
+                yield source.name, batch.key, series
         job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)

@@ -17,20 +17,23 @@ def join_series(parts: Sequence[Series]) -> Series:
     if len(parts) == 1:
         return parts[0]
     parts = sorted(parts, key=lambda part: int(part.utime.min()))
-    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+    contents = [part.content for part in parts]
+    columns = {
+        name: np.concatenate([content.columns[name] for content in contents]) for name in contents[0].columns
+    }
     entries: list[Array] = []
     parameters: list[ParametersEntry] = []
-    for part in parts:
-        entries.append(np.where(part.entries >= 0, part.entries + len(parameters), -1))
-        parameters += part.parameters
+    for content in contents:
+        entries.append(np.where(content.entries >= 0, content.entries.astype(np.int64) + len(parameters), -1))
+        parameters += content.parameters
     if all(before.utime.max() < after.utime.min() for before, after in pairwise(parts)):
         order = np.arange(len(columns["utime"]))
     else:
         order = _order_without_duplicates(columns, np.repeat(np.arange(len(parts)), [*map(len, parts)]))
     num_items = columns["num_items"]
     recorded = {}
-    for number in dict.fromkeys(number for part in parts for number in part.recorded):
-        items = np.concatenate([part.recorded[number] for part in parts if number in part.recorded])
+    for number in dict.fromkeys(number for content in contents for number in content.recorded):
+        items = np.concatenate([each.recorded[number] for each in contents if number in each.recorded])
         places = np.cumsum(num_items == number) - 1
         recorded[number] = items[places[order[num_items[order] == number]]]
     return Series(

@@ -7,11 +7,8 @@ import numpy as np
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import MISSING, ComponentType
-from gateway.takes.files.component_rows import Array
-from gateway.takes.files.series import Series, regular_step
-
-_MAX_ROWS: Final = 100_000_000
-"""Nearly 14 hours at 2000 Hz. Times of capture that a damaged message has are years away from the others."""
+from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array
+from gateway.takes.files.series import MAX_PADDING, MIN_LIMIT_BYTES, Series, regular_step
 
 _BLOCK_ROWS: Final = 20_000
 """How many rows are computed at a time, in 64 bits."""
@@ -47,21 +44,21 @@ def resample(
     nearest: list[tuple[Series, Array]] = []
     for run, first, stop in zip(runs, bounds, bounds[1:], strict=False):
         values, frames = _interpolate(run, times[first:stop], max_gap_s * 1e6)
-        [(number, recorded)] = run.recorded.items()
+        [(number, recorded)] = run.content.recorded.items()
         items.setdefault(number, []).append(values.view(recorded.dtype).reshape(len(values), number))
         nearest.append((run, frames))
     columns = {
-        name: np.concatenate([run.columns[name][frames] for run, frames in nearest])
-        for name in series.columns
+        name: np.concatenate([run.content.columns[name][frames] for run, frames in nearest])
+        for name in series.content.columns
     }
     columns["capture_utime"] = times
     return Series(
         series.component,
         columns,
         {number: np.concatenate(found) for number, found in items.items()},
-        series.parameters,
+        series.content.parameters,
         series.start_utime,
-        np.concatenate([run.entries[frames] for run, frames in nearest]),
+        np.concatenate([run.content.entries[frames] for run, frames in nearest]),
         rate_hz,
     )
 
@@ -71,10 +68,14 @@ def _grid(series: Series, rate_hz: float, from_s: float | None, to_s: float | No
     first_s = float(series.seconds.min()) if from_s is None else from_s
     last_s = float(series.seconds.max()) if to_s is None else to_s
     first, last = math.ceil(first_s * rate_hz - 1e-6), math.floor(last_s * rate_hz + 1e-6)
-    if not 0 < last - first + 1 <= _MAX_ROWS:
+    num_rows = last - first + 1
+    # A pause of days, or a damaged time of capture, would become rows of NaN that fill the memory.
+    row_bytes = HEAD.itemsize + len(series.labels) * NATIVE_ITEM_DTYPES[series.component].itemsize
+    frames_at_rate = len(series) * rate_hz / (series.measured_rate_hz or rate_hz)
+    if num_rows < 1 or num_rows * row_bytes > max(MAX_PADDING * frames_at_rate * row_bytes, MIN_LIMIT_BYTES):
         raise TakeError(
-            f"{series.key} from {first_s:.3f} s to {last_s:.3f} s has {last - first + 1} rows at "
-            f"{rate_hz:g} Hz, not 1 to {_MAX_ROWS}; choose another rate, or a part by from_s and to_s"
+            f"{series.key} cannot be resampled to {rate_hz:g} Hz from {first_s:.3f} s to {last_s:.3f} s: its "
+            f"{len(series)} frames would become {num_rows} rows; resample parts by from_s and to_s"
         )
     elapsed_us: Array = np.rint(np.arange(first, last + 1) * (1e6 / rate_hz)).astype(np.int64)
     return elapsed_us + series.start_utime

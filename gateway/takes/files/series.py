@@ -33,9 +33,10 @@ _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprin
 MAX_GAP_S: Final = 0.1
 """Resampling interpolates across gaps up to this, unless told otherwise: 20 frames at 200 Hz."""
 
-_MAX_PADDING: Final = 4
-"""How many times as large as what was recorded ``items`` may become, when the labels change."""
-_MIN_LIMIT_BYTES: Final = 256 * 1024 * 1024
+MAX_PADDING: Final = 4
+"""How many times as large as what was recorded arrays may become, by labels that change or by resampling."""
+MIN_LIMIT_BYTES: Final = 256 * 1024 * 1024
+"""Arrays of this size are always possible."""
 
 
 class ParametersEntry(NamedTuple):
@@ -73,6 +74,20 @@ class ParametersHistory:
         self._xml, self.is_readable = xml, parameters is not None
         self.newest = ParametersEntry(message.utime, version, parameters or Parameters())
         return self.newest
+
+
+class SeriesContent(NamedTuple):
+    """What a ``Series`` is made of.
+
+    ``columns`` has its columns by name, and ``num_items``; ``recorded`` the items by their number, as in
+    ``Rows`` (of events, all below 1); ``entries`` the index in ``parameters`` of those that describe each
+    row, -1 if there are none.
+    """
+
+    columns: dict[str, Array]
+    recorded: dict[int, Array]
+    parameters: Sequence[ParametersEntry]
+    entries: Array
 
 
 class Series(ItemValues):
@@ -115,21 +130,18 @@ class Series(ItemValues):
         self.component = component
         self.key = component.key
         self.start_utime = start_utime
-        self.columns = columns
-        """The columns of the table above by name, and ``num_items``."""
-        self.recorded = recorded
-        """The items by their number, as in ``Rows``; of events, all below 1."""
-        self.parameters = parameters
-        self.entries = (
+        self._parameters = parameters
+        self._recorded = recorded  # items by their number, as in Rows; of events, all below 1
+        self._columns = columns
+        for name in _COLUMNS:
+            setattr(self, name, columns[name])
+        self._num_items = columns["num_items"]
+        self._entries = (
             _entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
             if entries is None
             else entries
         )
-        """The index in ``parameters`` of those that describe each row; -1 if there are none."""
         self._resampled_hz = resampled_hz
-        for name in _COLUMNS:
-            setattr(self, name, columns[name])
-        self._num_items = columns["num_items"]
 
     def __len__(self) -> int:
         """Return the number of frames (of events: the number of events)."""
@@ -138,6 +150,11 @@ class Series(ItemValues):
     def __repr__(self) -> str:
         """Return a summary."""
         return f"<Series {self.key}: {len(self)} rows, {len(self.labels)} labels>"
+
+    @property
+    def content(self) -> "SeriesContent":
+        """What this series was made of, to make another one of it."""
+        return SeriesContent(self._columns, self._recorded, self._parameters, self._entries)
 
     @property
     def seconds(self) -> Array:
@@ -150,8 +167,8 @@ class Series(ItemValues):
 
     def parameters_of(self, row: int) -> Parameters:
         """Return the server's parameters that describe a row; without any section if the take has none."""
-        entry = int(self.entries[row])
-        return self.parameters[entry].parameters if entry >= 0 else Parameters()
+        entry = int(self._entries[row])
+        return self._parameters[entry].parameters if entry >= 0 else Parameters()
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -212,25 +229,25 @@ class Series(ItemValues):
         recording; use ``runs`` then.
         """
         if self.component is ComponentType.EVENT:
-            return self.recorded[1][:, 0]
-        if len(self.recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
-            return next(iter(self.recorded.values()))
+            return self._recorded[1][:, 0]
+        if len(self._recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
+            return next(iter(self._recorded.values()))
         dtype = NATIVE_ITEM_DTYPES[self.component]
-        recorded_bytes = sum(items.nbytes for items in self.recorded.values())
+        recorded_bytes = sum(items.nbytes for items in self._recorded.values())
         num_bytes = len(self) * len(self.labels) * dtype.itemsize
-        if num_bytes > max(_MAX_PADDING * recorded_bytes, _MIN_LIMIT_BYTES):
+        if num_bytes > max(MAX_PADDING * recorded_bytes, MIN_LIMIT_BYTES):
             raise TakeError(
                 f"the labels of {self.key} change so often that an array with all {len(self.labels)} of them "
                 f"would take {num_bytes / 1e9:.1f} GB; read the parts with equal labels one by one: runs()"
             )
         items = np.full((len(self), len(self.labels)), MISSING, np.float32 if not dtype.names else dtype)
         columns = {label: column for column, label in enumerate(self.labels)}
-        rows_of = {number: np.flatnonzero(self._num_items == number) for number in self.recorded}
+        rows_of = {number: np.flatnonzero(self._num_items == number) for number in self._recorded}
         for (entry, num_items), layout in self._layouts.items():
             rows = rows_of[num_items]
-            chosen = self.entries[rows] == entry
+            chosen = self._entries[rows] == entry
             places = np.array([columns[label] for label in layout.labels], np.intp)
-            items[rows[chosen][:, None], places] = self.recorded[num_items][chosen]
+            items[rows[chosen][:, None], places] = self._recorded[num_items][chosen]
         return items
 
     @property
@@ -239,10 +256,10 @@ class Series(ItemValues):
         if self.component is not ComponentType.EVENT:
             return ()
         names = {
-            entry: event_labels(self.parameters[entry].parameters if entry >= 0 else None)
-            for entry in np.unique(self.entries).tolist()
+            entry: event_labels(self._parameters[entry].parameters if entry >= 0 else None)
+            for entry in np.unique(self._entries).tolist()
         }
-        rows = zip(self.entries.tolist(), self.items["id"].tolist(), strict=True)
+        rows = zip(self._entries.tolist(), self.items["id"].tolist(), strict=True)
         return tuple(names[entry].get(number, "") for entry, number in rows)
 
     def runs(self) -> "list[Series]":
@@ -258,15 +275,15 @@ class Series(ItemValues):
         if self.component is not ComponentType.EVENT:
             is_start |= np.diff(self._layout_numbers()) != 0
         starts = [0, *(np.flatnonzero(is_start) + 1).tolist(), len(self)]
-        before = dict.fromkeys(self.recorded, 0)
+        before = dict.fromkeys(self._recorded, 0)
         runs = []
         for start, stop in pairwise(starts):
             num_items = int(self._num_items[start])
             first = before[num_items]
             before[num_items] += stop - start
-            recorded = {num_items: self.recorded[num_items][first : before[num_items]]}
-            columns = {name: values[start:stop] for name, values in self.columns.items()}
-            runs.append(self._part(columns, recorded, self.entries[start:stop]))
+            recorded = {num_items: self._recorded[num_items][first : before[num_items]]}
+            columns = {name: values[start:stop] for name, values in self._columns.items()}
+            runs.append(self._part(columns, recorded, self._entries[start:stop]))
         return runs
 
     def resample(
@@ -328,23 +345,23 @@ class Series(ItemValues):
         has_items = self._num_items > 0
         if has_items.all() or not has_items.any():
             return self
-        columns = {name: values[has_items] for name, values in self.columns.items()}
-        recorded = {num_items: items for num_items, items in self.recorded.items() if num_items}
-        return self._part(columns, recorded, self.entries[has_items])
+        columns = {name: values[has_items] for name, values in self._columns.items()}
+        recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
+        return self._part(columns, recorded, self._entries[has_items])
 
     def _part(self, columns: dict[str, Array], recorded: dict[int, Array], entries: Array) -> "Series":
         """Return a series of some of the rows."""
-        about = (self.parameters, self.start_utime)
+        about = (self._parameters, self.start_utime)
         return Series(self.component, columns, recorded, *about, entries, self._resampled_hz)
 
     @cached_property
     def _layouts(self) -> dict[tuple[int, int], Description]:
-        """What describes rows, by index in ``parameters`` and number of items, as they appear."""
-        pairs = np.stack([self.entries, self._num_items], axis=1)
+        """What describes rows, by index in ``_parameters`` and number of items, as they appear."""
+        pairs = np.stack([self._entries, self._num_items], axis=1)
         unique, first = np.unique(pairs, axis=0, return_index=True)
         layouts = {}
         for entry, num_items in unique[np.argsort(first)].tolist():
-            parameters = self.parameters[entry].parameters if entry >= 0 else None
+            parameters = self._parameters[entry].parameters if entry >= 0 else None
             layouts[entry, num_items] = describe(self.component, parameters, num_items)
         return layouts
 
@@ -355,7 +372,7 @@ class Series(ItemValues):
         for (entry, num_items), layout in self._layouts.items():
             number = numbers.setdefault(layout, len(numbers))
             if number:
-                result[(self.entries == entry) & (self._num_items == num_items)] = number
+                result[(self._entries == entry) & (self._num_items == num_items)] = number
         return result
 
 
@@ -405,7 +422,7 @@ def regular_step(steps: Array) -> float | None:
     steps = steps[steps > 0]
     if not len(steps):
         return None
-    median = np.median(steps)
+    median = np.quantile(steps, 0.5, method="lower")  # one of them, so that at least this one remains
     return float(steps[abs(steps - median) <= median / 2].mean())
 
 

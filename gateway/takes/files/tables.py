@@ -41,7 +41,7 @@ class Column(NamedTuple):
 
 def time_columns(series: Series) -> dict[str, Array]:
     """Return the columns of TIME_COLUMNS, each of shape (rows,)."""
-    return {"time_s": series.seconds, **{name: series.columns[name] for name in TIME_COLUMNS[1:]}}
+    return {"time_s": series.seconds, **{name: series.content.columns[name] for name in TIME_COLUMNS[1:]}}
 
 
 def value_columns(series: Series) -> tuple[Column, ...]:

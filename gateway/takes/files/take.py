@@ -50,7 +50,7 @@ class TakeSource:
     @property
     def series(self) -> dict[str, Series]:
         """The recorded components by their keys: "3d", "6d", "analog", "force", "event"."""
-        by_key = {key: getattr(self, name) for key, name in COMPONENT_FIELDS.items()}
+        by_key = {key: getattr(self, name) for key, name in _FIELDS.items()}
         return {key: series for key, series in by_key.items() if series is not None}
 
     def runs(self, key: str) -> list[Series]:
@@ -62,13 +62,7 @@ class TakeSource:
 _MAX_LATE_US: Final = 10_000_000
 """This long after the end of a range, no more messages belong to it."""
 
-COMPONENT_FIELDS: Final = {
-    "3d": "markers",
-    "6d": "tools",
-    "analog": "analog",
-    "force": "forces",
-    "event": "events",
-}
+_FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "forces", "event": "events"}
 """The fields of TakeSource by the keys of components."""
 
 
@@ -105,7 +99,7 @@ class Take:
             for key, series in source.series.items():
                 if series.component is not ComponentType.EVENT:
                     resampled = series.resample(rate_hz, max_gap_s=max_gap_s, **limits)
-                    setattr(source, COMPONENT_FIELDS[key], resampled)
+                    setattr(source, _FIELDS[key], resampled)
         return replace(self, sources=sources)
 
 
@@ -205,7 +199,7 @@ def _join_sources(parts: Sequence[TakeSource]) -> TakeSource:
     )
     for part in parts:
         joined.malformed.update(part.malformed)
-    for key, name in COMPONENT_FIELDS.items():
+    for key, name in _FIELDS.items():
         found = [part.series[key] for part in parts if key in part.series]
         setattr(joined, name, join_series(found) if found else None)
     return joined
@@ -255,7 +249,7 @@ class TakeLoader:
         """Return the sources with their arrays."""
         for (name, key), builder in self._builders.items():
             source = self._sources[name]
-            setattr(source, COMPONENT_FIELDS[key], builder.build(source.parameters, start_utime))
+            setattr(source, _FIELDS[key], builder.build(source.parameters, start_utime))
         return self._sources
 
     def _describe(self, source: TakeSource, key: str, message: bytes) -> None:

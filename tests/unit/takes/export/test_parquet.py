@@ -48,8 +48,8 @@ def test_pandas_reads_every_number_of_every_component_as_it_was_recorded(name: s
         assert tuple(found.columns[:7]) == TIME_COLUMNS
         assert np.array_equal(found["time_s"], series.seconds)
         for column in TIME_COLUMNS[1:]:
-            assert found[column].dtype == series.columns[column].dtype
-            assert np.array_equal(found[column], series.columns[column])
+            assert found[column].dtype == getattr(series, column).dtype
+            assert np.array_equal(found[column], getattr(series, column))
         if key == "event":
             assert found["id"].tolist() == series.items["id"].tolist()
             assert found["event_timestamp_us"].tolist() == series.items["timestamp"].tolist()
