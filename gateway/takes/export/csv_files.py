@@ -39,7 +39,9 @@ def _lines(part: Series) -> Iterator[bytes]:
         _numbers(np.stack([column.astype(np.int64) for column in numbers], axis=1)),
     ]
     if part.component is ComponentType.EVENT:
-        columns.append(_record(row).rstrip() for row in zip(*event_columns(part).values(), strict=True))
+        columns.append(
+            _record(row).removesuffix(b"\r\n") for row in zip(*event_columns(part).values(), strict=True)
+        )
     elif part.labels:
         columns.append(_numbers(value_rows(part)))
     return map(b",".join, zip(*columns, strict=True))
