@@ -292,7 +292,7 @@ build/release-packages/complete: requirements-view.txt $(RELEASE_TOOLS)
 	@touch $@
 
 # Renew the versions of all dependencies for every supported Python and platform: requirements-view.txt has those of all
-# extras, and requirements.txt the same without the live view, which a service does not need.
+# extras, and requirements.txt the same without the live view and Parquet, which a service does not need.
 UV_COMPILE := build/lock-venv/bin/uv pip compile --quiet --universal --python-version 3.11 --upgrade --generate-hashes \
     --no-annotate --no-header --no-emit-index-url
 

@@ -71,7 +71,7 @@ def describe(component: ComponentType, parameters: Parameters | None, num_items:
     noun = component.item_noun.removesuffix("s")
     given = [label.strip() for label in islice(labels, num_items)]
     given += [""] * (num_items - len(given))
-    found = _different(
+    found = distinct(
         [(label or f"{noun} {index}")[:MAX_LABEL_LENGTH] for index, label in enumerate(given, start=1)],
         lambda text, length: text[: MAX_LABEL_LENGTH - length],
         [JSON_NAME] if component is ComponentType.TOOLS else [],  # no key of a tool is that of JSON
@@ -119,10 +119,10 @@ def fitting_labels(
         cut(fit(label), max_bytes) or fit(f"{noun} {position}")
         for position, label in enumerate(labels, start=1)
     )
-    return tuple(_different(bases, lambda text, num_bytes: cut(text, max_bytes - num_bytes)))
+    return tuple(distinct(bases, lambda text, num_bytes: cut(text, max_bytes - num_bytes)))
 
 
-def _different(
+def distinct(
     bases: Iterable[str], shorten: Callable[[str, int], str], taken: Sequence[str] = ()
 ) -> list[str]:
     """Return labels that differ from each other and from ``taken``.

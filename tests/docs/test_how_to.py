@@ -92,9 +92,16 @@ def test_every_command_of_take_to_biomechanics_prints_the_output_on_the_page(
 def test_every_command_of_use_takes_prints_the_output_on_the_page(
     folder: Path, terminals: dict[str, Terminal]
 ) -> None:
-    assert follow("docs/how-to/use-takes.md", folder, terminals) > 2
-    components = sorted(path.name for path in folder.glob("walk-*.csv"))
-    assert components == [f"walk-{key}.csv" for key in ("3d", "6d", "analog", "event", "force")]
+    assert follow("docs/how-to/use-takes.md", folder, terminals) == 1
+
+
+def test_every_command_of_take_to_data_science_prints_the_output_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow("docs/how-to/take-to-data-science.md", folder, terminals) > 4
+    for extension in ("csv", "parquet"):
+        components = sorted(path.name for path in folder.glob(f"walk-*.{extension}"))
+        assert components == [f"walk-{key}.{extension}" for key in ("3d", "6d", "analog", "event", "force")]
 
 
 def test_every_command_from_a_take_to_robotics_prints_the_output_on_the_page(

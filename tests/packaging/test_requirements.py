@@ -1,7 +1,7 @@
 """The requirements files have a tested version of every dependency that pyproject.toml names.
 
-requirements-view.txt has those of all extras; requirements.txt has the same ones without those of ``view``.
-The files in release/ have the tools of a build and of a release.
+requirements-view.txt has those of all extras; requirements.txt has the same ones without those of ``view``
+and ``parquet``. The files in release/ have the tools of a build and of a release.
 """
 
 import re
@@ -16,7 +16,10 @@ from tests.support.fresh_clones import ROOT
 PYPROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT: Final = PYPROJECT["project"]
 EXTRAS: Final = PROJECT["optional-dependencies"]
-NAMES: Final = {"requirements.txt": EXTRAS.keys() - {"view"}, "requirements-view.txt": EXTRAS.keys()}
+NAMES: Final = {
+    "requirements.txt": EXTRAS.keys() - {"parquet", "view"},
+    "requirements-view.txt": EXTRAS.keys(),
+}
 """The extras whose dependencies each file has."""
 
 _MYPYC: Final = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"]
@@ -79,4 +82,4 @@ def test_the_runtime_in_the_compiled_modules_is_that_of_the_mypy_in_the_bill_of_
 def test_the_service_has_the_same_versions_without_the_view() -> None:
     small, large = ({str(each) for each in locked_in(name)} for name in NAMES)
     assert small < large
-    assert not any(text.startswith("viser") for text in small)
+    assert not any(text.startswith(("viser", "pyarrow")) for text in small)

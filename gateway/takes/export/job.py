@@ -23,6 +23,7 @@ FORMATS: Final = {
     ".mot": ("opensim", "export_mot"),
     ".sto": ("opensim", "export_sto"),
     ".csv": ("csv_files", "export_csv"),
+    ".parquet": ("parquet", "export_parquet"),
     ".mcap": ("mcap", "export_mcap"),
 }
 """The module and the function that write the files of a job, by the extension of its ``out``."""
@@ -34,7 +35,9 @@ CHOSEN_FORMATS: Final = {
 }
 """The same for the formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
 
-_INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
+_EXTRAS: Final = {".mcap": ("foxglove-sdk", "foxglove"), ".parquet": ("pyarrow", "parquet")}
+"""The package that files of an extension need, and the extra that installs it."""
+
 _MAX_NAMED: Final = 10
 
 
@@ -50,10 +53,12 @@ def export_take(job: "ExportJob") -> list[Path]:
         try:
             write = getattr(import_module(f"gateway.takes.export.{module}"), function)
         except ImportError as error:
-            if extension != ".mcap":
+            if extension not in _EXTRAS:
                 raise
+            package, extra = _EXTRAS[extension]
             raise TakeError(
-                f"{job.out} cannot be written without foxglove-sdk; install it: {_INSTALL}"
+                f"{job.out} cannot be written without {package}; "
+                f"install it: pip install 'rtc3d-gateway[{extra}]'"
             ) from error
         write(job)
     return job.files.paths

@@ -44,9 +44,9 @@ from gateway.messages.ros2_names import (
     wrench_topic,
 )
 from gateway.messages.topics import unique_name
-from gateway.takes.export.csv_files import parts_of
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.mcap import McapFile
+from gateway.takes.export.tables import parts_of
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series
 

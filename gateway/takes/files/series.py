@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import rtc3d
@@ -26,14 +26,22 @@ from gateway.takes.files.component_rows import (
 from gateway.takes.files.row import ItemValues
 from gateway.takes.files.spool import pieces
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray
+
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
 
 _NEIGHBOURS: Final = 20
 """How many rows beside two tell whether something starts again between them; some may have no time stamp."""
 
-_MAX_PADDING: Final = 4
-"""How many times as large as what was recorded ``items`` may become, when the labels change."""
-_MIN_LIMIT_BYTES: Final = 256 * 1024 * 1024
+MAX_GAP_S: Final = 0.1
+"""Resampling interpolates across gaps up to this, unless told otherwise: 20 frames at 200 Hz."""
+
+MAX_PADDING: Final = 4
+"""How many times as large as what was recorded arrays may become, by labels that change or by resampling."""
+MIN_LIMIT_BYTES: Final = 256 * 1024 * 1024
+"""Arrays of this size are always possible."""
 
 
 class ParametersEntry(NamedTuple):
@@ -73,6 +81,20 @@ class ParametersHistory:
         return self.newest
 
 
+class SeriesContent(NamedTuple):
+    """What a ``Series`` is made of.
+
+    ``columns`` has its columns by name, and ``num_items``; ``recorded`` the items by their number, as in
+    ``Rows`` (of events, all below 1); ``entries`` the index in ``parameters`` of those that describe each
+    row, -1 if there are none.
+    """
+
+    columns: dict[str, Array]
+    recorded: dict[int, Array]
+    parameters: Sequence[ParametersEntry]
+    entries: Array
+
+
 class Series(ItemValues):
     """A component of one source: arrays with one row per frame; of events, with one row per event.
 
@@ -108,6 +130,7 @@ class Series(ItemValues):
         parameters: Sequence[ParametersEntry],
         start_utime: int,
         entries: Array | None = None,
+        resampled_hz: float | None = None,
     ) -> None:
         self.component = component
         self.key = component.key
@@ -123,6 +146,7 @@ class Series(ItemValues):
             if entries is None
             else entries
         )
+        self._resampled_hz = resampled_hz
 
     def __len__(self) -> int:
         """Return the number of frames (of events: the number of events)."""
@@ -131,6 +155,11 @@ class Series(ItemValues):
     def __repr__(self) -> str:
         """Return a summary."""
         return f"<Series {self.key}: {len(self)} rows, {len(self.labels)} labels>"
+
+    @property
+    def content(self) -> "SeriesContent":
+        """What this series was made of, to make another one of it."""
+        return SeriesContent(self._columns, self._recorded, self._parameters, self._entries)
 
     @property
     def seconds(self) -> Array:
@@ -170,8 +199,11 @@ class Series(ItemValues):
 
     @property
     def rate_hz(self) -> float | None:
-        """The rate of frames that the server announces; None if it announces none, or it changes."""
-        return common(layout.rate_hz for layout in self._layouts.values())
+        """The rate of frames that the server announces; None if it announces none, or it changes.
+
+        Of what ``resample`` returns, it is the new rate.
+        """
+        return self._resampled_hz or common(layout.rate_hz for layout in self._layouts.values())
 
     @cached_property
     def measured_rate_hz(self) -> float | None:
@@ -179,6 +211,8 @@ class Series(ItemValues):
 
         If the time stamps are constant, it is computed from the times of arrival.
         """
+        if self._resampled_hz:
+            return self._resampled_hz
         for times in (self.timestamp_us, self.utime):
             step_us = regular_step(
                 np.diff(times)[(np.diff(self.sequence) == 1) & (np.diff(self.session) == 0)]
@@ -206,7 +240,7 @@ class Series(ItemValues):
         dtype = NATIVE_ITEM_DTYPES[self.component]
         recorded_bytes = sum(items.nbytes for items in self._recorded.values())
         num_bytes = len(self) * len(self.labels) * dtype.itemsize
-        if num_bytes > max(_MAX_PADDING * recorded_bytes, _MIN_LIMIT_BYTES):
+        if num_bytes > max(MAX_PADDING * recorded_bytes, MIN_LIMIT_BYTES):
             raise TakeError(
                 f"the labels of {self.key} change so often that an array with all {len(self.labels)} of them "
                 f"would take {num_bytes / 1e9:.1f} GB; read the parts with equal labels one by one: runs()"
@@ -250,10 +284,7 @@ class Series(ItemValues):
             before[num_items] += stop - start
             recorded = {num_items: self._recorded[num_items][first : before[num_items]]}
             columns = {name: values[start:stop] for name, values in self._columns.items()}
-            entries = self._entries[start:stop]
-            runs.append(
-                Series(self.component, columns, recorded, self._parameters, self.start_utime, entries)
-            )
+            runs.append(self._part(columns, recorded, self._entries[start:stop]))
         return runs
 
     def _starts(self) -> list[int]:
@@ -272,6 +303,60 @@ class Series(ItemValues):
             starts += found[(found > start) & (found <= stop) & (found < len(self))].tolist()
         return starts
 
+    def resample(
+        self,
+        rate_hz: float,
+        *,
+        max_gap_s: float = MAX_GAP_S,
+        from_s: float | None = None,
+        to_s: float | None = None,
+    ) -> "Series":
+        """Return the values at a constant rate: at multiples of 1 / ``rate_hz`` since the take's beginning.
+
+        Positions, loads and analog values are interpolated linearly between the frames before and after,
+        orientations by slerp. Between frames that are further apart than ``max_gap_s`` and one and a half
+        periods, they are NaN, so ``max_gap_s=0`` fills no gap; so they are before the first and after the
+        last frame, and between the runs (see ``runs``). A marker, tool, channel or plate that is missing in
+        a frame is interpolated from those that have it.
+
+        ``from_s`` and ``to_s`` are the first and the last second; the default are those of the frames.
+        Nothing is filtered: use a low-pass filter before you reduce the rate of a signal that has higher
+        frequencies. ``capture_utime`` has the new times, and the other columns are those of the nearest
+        frame. Raises TakeError, also for events, which have no rate.
+        """
+        from gateway.takes.files.resampling import resample  # noqa: PLC0415 - it imports this module
+
+        return resample(self, rate_hz, max_gap_s, from_s, to_s)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return a table with a row per frame or event, and the seconds as index ``time_s``.
+
+        The columns are those of an exported table: ``capture_utime`` and other numbers of the frame, then the
+        values, such as "head x". ``attrs["units"]`` has the units by column. Raises TakeError if pandas is
+        not installed.
+        """
+        from gateway.takes.files.tables import to_pandas  # noqa: PLC0415 - it imports this module
+
+        return to_pandas(self)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Return a dataset with the dimension ``time`` in seconds, and one for the items.
+
+        ======  =======================================================================================
+        3d      ``position`` (time, marker, axis), ``reliability`` (time, marker)
+        6d      ``position`` (time, tool, axis), ``quaternion`` (time, tool, part), ``error`` (time, tool)
+        analog  ``value`` (time, channel)
+        force   ``force`` (time, plate, axis), ``moment`` (time, plate, axis)
+        event   ``id``, ``label`` and others (time)
+        ======  =======================================================================================
+
+        The items have their labels as coordinates, and their units as the coordinate ``unit``; ``attrs`` have
+        the unit that all have in common. Raises TakeError if xarray is not installed.
+        """
+        from gateway.takes.files.tables import to_xarray  # noqa: PLC0415 - it imports this module
+
+        return to_xarray(self)
+
     def without_empty_frames(self) -> "Series":
         """Return the frames that have items; all frames if none has."""
         has_items = self._num_items > 0
@@ -279,7 +364,12 @@ class Series(ItemValues):
             return self
         columns = {name: values[has_items] for name, values in self._columns.items()}
         recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
-        return Series(self.component, columns, recorded, self._parameters, self.start_utime)
+        return self._part(columns, recorded, self._entries[has_items])
+
+    def _part(self, columns: dict[str, Array], recorded: dict[int, Array], entries: Array) -> "Series":
+        """Return a series of some of the rows."""
+        about = (self._parameters, self.start_utime)
+        return Series(self.component, columns, recorded, *about, entries, self._resampled_hz)
 
     @cached_property
     def _layouts(self) -> dict[tuple[int, int], Description]:
@@ -355,7 +445,7 @@ def regular_step(steps: Array) -> float | None:
     steps = steps[steps > 0]
     if not len(steps):
         return None
-    median = np.median(steps)
+    median = np.quantile(steps, 0.5, method="lower")  # one of them, so that at least this one remains
     return float(steps[abs(steps - median) <= median / 2].mean())
 
 

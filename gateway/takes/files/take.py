@@ -3,17 +3,26 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from gateway.errors import ProtocolError, SelectionError
+import numpy as np
+
+from gateway.errors import ProtocolError, SelectionError, TakeError
 from gateway.messages.decode import decode
-from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
+from gateway.takes.files.joined import join_series
 from gateway.takes.files.reader import MessageBatch, TakeReader
-from gateway.takes.files.series import ParametersEntry, ParametersHistory, Series, SeriesBuilder
+from gateway.takes.files.series import (
+    MAX_GAP_S,
+    ParametersEntry,
+    ParametersHistory,
+    Series,
+    SeriesBuilder,
+)
 
 
 @dataclass
@@ -64,7 +73,7 @@ class Take:
     ``start_utime`` is the time of the first event, in µs since 1970; all seconds count from it.
     ``num_damaged`` places of the files, with ``damaged_bytes`` in all, could not be read. ``unknown`` is how
     many messages have a type that is none of a gateway's, by channel. ``path`` is None if it was collected
-    live.
+    live, or joined from several takes.
     """
 
     path: Path | None
@@ -74,9 +83,28 @@ class Take:
     damaged_bytes: int = 0
     unknown: dict[str, int] = field(default_factory=dict)
 
+    def resample(self, rate_hz: float, *, max_gap_s: float = MAX_GAP_S) -> "Take":
+        """Return the take with all components of all sources at the same times, as ``Series.resample`` does.
+
+        The times are those from the first frame of any of them to the last one, so all arrays have the same
+        number of rows, which are NaN where a component has nothing. Events stay as they are.
+        """
+        every = [series for source in self.sources.values() for series in source.series.values()]
+        seconds = [series.seconds for series in every if series.component is not ComponentType.EVENT]
+        if not seconds:
+            return self
+        limits = {"from_s": min(map(np.min, seconds)), "to_s": max(map(np.max, seconds))}
+        sources = {name: replace(source) for name, source in self.sources.items()}
+        for source in sources.values():
+            for key, series in source.series.items():
+                if series.component is not ComponentType.EVENT:
+                    resampled = series.resample(rate_hz, max_gap_s=max_gap_s, **limits)
+                    setattr(source, _FIELDS[key], resampled)
+        return replace(self, sources=sources)
+
 
 def open_take(
-    path: Path | str,
+    path: Path | str | Sequence[Path | str],
     *,
     sources: Collection[str] | None = None,
     components: Collection[str] | None = None,
@@ -85,7 +113,7 @@ def open_take(
     progress: Callable[[int, int], object] | None = None,
     spool_folder: Path | None = None,
 ) -> Take:
-    """Read a take (an event log, or the folder of a saved take) into numpy arrays.
+    """Read a take (an event log, or the folder of a saved take) into numpy arrays; several takes as one.
 
     ::
 
@@ -94,7 +122,7 @@ def open_take(
         take = open_take("lab-20261122-101500.lcmlog")
         markers = take.sources["lab"].markers
         print(markers.labels, markers.unit, markers.rate_hz)
-        head = markers.positions[:, markers.labels.index("head")]  # (frames, 3), NaN where it is missing
+        head = markers["head"]  # x, y, z, shape (frames, 3), NaN where it is missing
         plt.plot(markers.seconds, head)
 
     ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
@@ -103,29 +131,81 @@ def open_take(
     much memory as their part of the file, unless there is a ``spool_folder``: then large ones are in
     temporary files there, and cannot be changed. Damage is skipped and counted. Raises TakeError if there is
     no take, and SelectionError, a TakeError, if a source or component is not in it.
+
+    Of several takes, ``open_take([first, second])``, sources of the same name are joined in the order of
+    their times, and others are side by side; seconds count from the earliest take. A message that several
+    takes have, because they overlap, occurs once. What describes a source, such as its subject, is that of
+    the earliest take that has it. Joining needs twice the memory for a moment.
     """
     unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
     if unknown:
         raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
-    reader = TakeReader(Path(path))
-    first_utime = -math.inf if from_s is None else reader.start_utime + from_s * 1e6
-    end_utime = math.inf if to_s is None else reader.start_utime + to_s * 1e6
-    loader = TakeLoader(sources, COMPONENTS_BY_KEY.keys() if components is None else components, spool_folder)
-    for batches in reader.batches():
-        for batch in batches:
-            loader.add(batch, first_utime, end_utime)
-        if min((min(batch.utimes) for batch in batches), default=-math.inf) > end_utime + _MAX_LATE_US:
-            break
-        if progress is not None:
-            progress(reader.read_bytes, reader.num_bytes)
-    take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
-    take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
-    take.unknown = dict(reader.unknown)
-    missing = set(sources or ()) - take.sources.keys()
+    paths = [path] if isinstance(path, Path | str) else path
+    readers = sorted((TakeReader(Path(each)) for each in paths), key=lambda reader: reader.start_utime)
+    if not readers:
+        raise TakeError("there is no take to open; name at least one")
+    takes: list[Take] = []
+    start_utime = readers[0].start_utime
+    limits_s = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
+    first_utime, end_utime = (start_utime + limit_s * 1e6 for limit_s in limits_s)
+    total = sum(reader.num_bytes for reader in readers)
+    chosen = COMPONENTS_BY_KEY.keys() if components is None else components
+    for reader in readers:
+        loader = TakeLoader(sources, chosen, spool_folder)
+        for batches in reader.batches():
+            for batch in batches:
+                loader.add(batch, first_utime, end_utime)
+            if min((min(batch.utimes) for batch in batches), default=-math.inf) > end_utime + _MAX_LATE_US:
+                break
+            if progress is not None:
+                progress(sum(each.read_bytes for each in readers), total)
+        take = Take(reader.path, start_utime, loader.finish(start_utime))
+        take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
+        take.unknown = dict(reader.unknown)
+        takes.append(take)
+    missing = set(sources or ()).difference(*(take.sources for take in takes))
     if missing:
-        names = ", ".join(reader.source_names) or "none of a gateway"
-        raise SelectionError(f"{path} has no source {min(missing)!r}; its sources are: {names}")
-    return take
+        known = dict.fromkeys(name for reader in readers for name in reader.source_names)
+        names = ", ".join(known) or "none of a gateway"
+        opened = ", ".join(str(reader.path) for reader in readers)
+        raise SelectionError(f"{opened} has no source {min(missing)!r}; its sources are: {names}")
+    return takes[0] if len(takes) == 1 else _join_takes(takes)
+
+
+def _join_takes(takes: Sequence[Take]) -> Take:
+    """Return takes as one: sources of the same name are joined, others are side by side."""
+    unknown: Counter[str] = Counter()
+    sources: dict[str, list[TakeSource]] = {}
+    for take in takes:
+        unknown.update(take.unknown)
+        for name, source in take.sources.items():
+            sources.setdefault(name, []).append(source)
+    return Take(
+        None,
+        takes[0].start_utime,
+        {name: _join_sources(parts) for name, parts in sources.items()},
+        sum(take.num_damaged for take in takes),
+        sum(take.damaged_bytes for take in takes),
+        dict(unknown),
+    )
+
+
+def _join_sources(parts: Sequence[TakeSource]) -> TakeSource:
+    """Return one source; what describes it is that of the first take that has it."""
+    joined = replace(
+        parts[0],
+        server=next((part.server for part in parts if part.server), ""),
+        gateway_version=next((part.gateway_version for part in parts if part.gateway_version), ""),
+        details=next((part.details for part in parts if any(part.details)), parts[0].details),
+        parameters=[entry for part in parts for entry in part.parameters],
+        malformed=Counter[str](),
+    )
+    for part in parts:
+        joined.malformed.update(part.malformed)
+    for key, name in _FIELDS.items():
+        found = [part.series[key] for part in parts if key in part.series]
+        setattr(joined, name, join_series(found) if found else None)
+    return joined
 
 
 class TakeLoader:

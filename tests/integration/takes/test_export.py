@@ -73,7 +73,12 @@ EXISTS = "exists already, and nothing is overwritten"
 @pytest.mark.parametrize(
     ("name", "options", "problem", "status"),
     [
-        ("walk.xyz", (), "walk.xyz has no known extension; choose .c3d, .trc, .mot, .sto, .csv or .mcap", 2),
+        (
+            "walk.xyz",
+            (),
+            "walk.xyz has no known extension; choose .c3d, .trc, .mot, .sto, .csv, .parquet or .mcap",
+            2,
+        ),
         ("walk", (), "walk has no known extension", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
         ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
@@ -115,11 +120,17 @@ def test_bad_input_is_a_sentence_with_the_name_of_the_file(tmp_path: Path) -> No
     assert not list(tmp_path.glob("*walk*"))
 
 
-def test_an_export_that_is_stopped_or_whose_disk_is_full_leaves_no_file(tmp_path: Path) -> None:
-    """Half a file would be taken for the whole one."""
+@pytest.mark.parametrize("extension", ["csv", "parquet"])
+def test_an_export_that_is_stopped_or_whose_disk_is_full_leaves_no_file(
+    tmp_path: Path, extension: str
+) -> None:
+    """Half a file would be taken for the whole one. The take is a folder with the same file many times."""
     scene = SyntheticScene(markers=300, tools=0, analog=200, plates=0, rate_hz=100, analog_rate_hz=1000)
-    record_scene(tmp_path / "long.lcmlog", scene, 1000)
-    command = [*PROGRAM, "export", str(tmp_path / "long.lcmlog"), str(tmp_path / "long.csv")]
+    (tmp_path / "long.lcmlog").mkdir()
+    recording = record_scene(tmp_path / "long.lcmlog/0.lcmlog", scene, 200)
+    for number in range(1, 20):
+        recording.with_name(f"{number}.lcmlog").hardlink_to(recording)
+    command = [*PROGRAM, "export", str(tmp_path / "long.lcmlog"), str(tmp_path / f"long.{extension}")]
     with subprocess.Popen(command) as process:
         wait_until(lambda: len(names(tmp_path)) > 1)
         process.send_signal(signal.SIGINT)

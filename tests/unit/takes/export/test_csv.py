@@ -97,6 +97,13 @@ def test_missing_values_are_empty_and_extreme_ones_exact(tmp_path: Path) -> None
     assert found[1][7:11] == ["inf", "-inf", "1.6777216e+07", "0.1"]
 
 
+def test_frames_without_items_have_their_times(tmp_path: Path) -> None:
+    export_messages(tmp_path, [markers(0, 4), markers(0, 5)], "walk.csv")
+    head, rows = read_csv(tmp_path / "walk-3d.csv")
+    assert head == HEAD
+    assert [row[3] for row in rows] == ["4", "5"]
+
+
 def test_events_have_one_row_each(tmp_path: Path) -> None:
     definition = EventDefinition("0x10", "Button, red", parameters=(EventParameter("1", "string", "Side"),))
     events = [(16, 5_000_000, int.from_bytes(b"LEFT", "big"), -1, -1), (-3, -1, 1, 2, 3)]

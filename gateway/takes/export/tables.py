@@ -1,0 +1,90 @@
+"""The tables of an export: one for each component of each source; if its labels change, one for each set.
+
+They are made while the take is read, so that its size does not matter.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gateway.errors import TakeError
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.takes.export.job import ExportJob, nothing_to_export
+from gateway.takes.files.component_rows import decode_rows
+from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.series import Series, SeriesBuilder
+from gateway.takes.files.tables import TIME_COLUMNS, Column, value_columns
+from gateway.takes.files.take import Take, TakeSource
+
+_MAX_TABLES: Final = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table of an export: the component of a source, its columns of values, and the name of its file."""
+
+    source: TakeSource
+    key: str
+    columns: tuple[Column, ...]
+    path: Path
+
+
+def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
+    """Yield the content of a take in parts of some MB, in its order, each with the table that it belongs to.
+
+    Reports what was left out. Raises TakeError, also if there is nothing to export.
+    """
+    take = job.open_take(components=())
+    tables: dict[tuple[str, str, tuple[Column, ...]], Table] = {}
+    numbers: Counter[tuple[str, str]] = Counter()
+    for name, key, series in parts_of(job, take):
+        source = take.sources[name]
+        for run in series.runs():
+            columns = value_columns(run)
+            table = tables.get((name, key, columns))
+            if table is None:
+                if len(tables) == _MAX_TABLES:
+                    raise TakeError(
+                        f"the labels in {job.take} change so often that there would be more than "
+                        f"{_MAX_TABLES} files; choose a part by --from and --to"
+                    )
+                numbers[name, key] += 1
+                number = numbers[name, key]
+                parts = (name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
+                table = Table(source, key, columns, job.file_name(*parts))
+                tables[name, key, columns] = table
+                for label in sorted({*run.labels} & {*TIME_COLUMNS}):
+                    job.note(f"the channel {label} of {name} is the column {label}_2")
+            yield table, run
+    if not tables:
+        raise nothing_to_export(job, "frames")
+    for (name, key), count in numbers.items():
+        if count > 1:
+            job.note(f"the labels of {key} of {name} change, so there are {count} files of it")
+    job.note_malformed(take)
+
+
+def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
+    """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
+    reader = TakeReader(job.take)
+    first, stop = job.utimes(take)
+    for batches in reader.batches():
+        for batch in batches:
+            source = take.sources.get(batch.source)
+            if source is None or batch.key not in COMPONENTS_BY_KEY:
+                continue
+            component = COMPONENTS_BY_KEY[batch.key]
+            events = zip(batch.utimes, batch.messages, strict=True)
+            messages = [message for utime, message in events if first <= utime < stop]
+            if not messages:
+                continue
+            rows = decode_rows(component, messages)
+            source.malformed[batch.key] += rows.malformed
+            builder = SeriesBuilder(component)
+            builder.add(rows)
+            series = builder.build(source.parameters, take.start_utime)
+            if series is not None:
+                yield source.name, batch.key, series
+        job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)
