@@ -62,7 +62,7 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
         raise nothing_to_export(job, "frames")
     for (name, key), count in numbers.items():
         if count > 1:
-            job.note(f"the labels of {key} of {name} change, so there are {count} files of it")
+            job.note(f"the labels of {key} of {name} change: each set of labels has a file", amount=count)
     job.note_malformed(take)
 
 
