@@ -23,6 +23,9 @@ _ROOT_FILES: Final = _FOLDER / "root"
 _COMPLETE: Final = _FOLDER / "complete"
 _PACKAGES: Final = _FOLDER / "packages.txt"
 
+PYTHON_ROOT: Final = _FOLDER / "python-root"
+"""The root folder of a Debian 12 that also has Python, for the wheels; `make test-install` makes it."""
+
 
 def bare_root() -> Path:
     """Return the root folder of a bare Debian 12 with systemd: no compiler, no Python. It must not change."""
@@ -66,15 +69,22 @@ def main() -> None:
     _PACKAGES.write_text(newest)
     command = (sys.executable, "-B", "-c", "from tests.support.bare_debian import fetch; fetch()")
     subprocess.run(command, cwd=ROOT, env={**os.environ, "DEB_PACKAGES": str(_PACKAGES)}, check=True)
-    if not _ROOT_FILES.exists():
-        shutil.rmtree(unfinished := _FOLDER / "unfinished", ignore_errors=True)
-        debootstrap = ("debootstrap", "--variant=minbase", "--include=systemd-sysv", "bookworm")
-        mounts = ("unshare", "--mount")
-        output = subprocess.DEVNULL
-        subprocess.run([*mounts, *debootstrap, unfinished, _mirror()], stdout=output, check=True)
-        (unfinished / "etc/apt/apt.conf.d/yes").write_text('APT::Get::Assume-Yes "true";\n')
-        unfinished.rename(_ROOT_FILES)
+    _make_root(_ROOT_FILES, "systemd-sysv")
+    if "--python" in sys.argv[1:]:
+        _make_root(PYTHON_ROOT, "systemd-sysv,python3-venv,libglib2.0-0")
     _COMPLETE.touch()
+
+
+def _make_root(root: Path, packages: str) -> None:
+    """Make the root folder of a Debian 12 with these packages, unless it exists."""
+    if root.exists():
+        return
+    shutil.rmtree(unfinished := _FOLDER / "unfinished", ignore_errors=True)
+    debootstrap = ("debootstrap", "--variant=minbase", f"--include={packages}", "bookworm")
+    command = ("unshare", "--mount", *debootstrap, unfinished, _mirror())
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
+    (unfinished / "etc/apt/apt.conf.d/yes").write_text('APT::Get::Assume-Yes "true";\n')
+    unfinished.rename(root)
 
 
 def fetch() -> None:

@@ -5,11 +5,15 @@ import os
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from tests.support.fresh_clones import ROOT
 from tests.support.needs import need_programs
 from tests.systemd.test_debian_package import package
 
 __all__ = ["package"]  # a fixture
+
+pytestmark = [pytest.mark.netns, pytest.mark.timeout(1800), pytest.mark.xdist_group("debian_package")]
 
 
 def test_lintian_finds_no_error(package: Path) -> None:
