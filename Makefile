@@ -152,7 +152,7 @@ COMPILED := PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/compiled
 
 compiled: build/compiled/complete
 
-build/compiled/complete: .venv/installed $(shell find $(SOURCES) ! -path '*__pycache__*')
+build/compiled/complete: .venv/installed $(shell find $(SOURCES) -type f ! -path '*__pycache__*')
 	rm -rf build/compiled
 	$(BIN)/python -B -m release.build --dist build/compiled/wheel wheel
 	$(BIN)/pip install --quiet --no-deps --target build/compiled build/compiled/wheel/*.whl
