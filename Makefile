@@ -47,11 +47,12 @@ test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE)
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
-# second build; the wheels and the sdist on a Debian without a compiler. It takes ten minutes, and is not part of the check.
+# second build; the wheels and the sdist on a Debian without a compiler; the container image. It takes a quarter of an
+# hour, and is not part of the check.
 test-install: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 	$(BIN)/python -B -m tests.support.bare_debian --python
 	MAKEFLAGS= FULL_INSTALLATION=1 exec $(BIN)/python tests/run.py --dist loadgroup tests/systemd/test_debian_package.py \
-	    tests/systemd/full_package.py tests/systemd/full_wheels.py
+	    tests/systemd/full_package.py tests/systemd/full_wheels.py tests/release/full_image.py
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.

@@ -1,4 +1,4 @@
-"""What the tests of a release share, each built once."""
+"""What the tests of a release share, each built once, because all that use it are in one worker."""
 
 import os
 import subprocess

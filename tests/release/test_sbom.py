@@ -17,7 +17,7 @@ from tests.packaging.test_requirements import locked_in
 from tests.support.builds import Built, release
 from tests.support.fresh_clones import skip_if_plain
 
-pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600), pytest.mark.xdist_group("release")]
 
 Bill = dict[str, Any]
 

@@ -24,7 +24,7 @@ from tests.support.fresh_clones import (
 )
 
 # The compiled modules take a minute on a busy machine.
-pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600), pytest.mark.xdist_group("release")]
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ pytestmark = [
     pytest.mark.systemd,
     pytest.mark.wheelhouse,
     pytest.mark.netns,
+    pytest.mark.xdist_group("machine"),  # installed once
     pytest.mark.timeout(600),
 ]
 
