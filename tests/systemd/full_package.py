@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.fresh_clones import ROOT
+from tests.support.fresh_clones import ROOT, pip_environment
 from tests.support.needs import need_programs
 from tests.systemd.test_debian_package import package
 
@@ -24,5 +24,6 @@ def test_lintian_finds_no_error(package: Path) -> None:
 def test_a_second_build_gives_the_same_bytes(package: Path) -> None:
     first = hashlib.sha256(package.read_bytes()).hexdigest()
     command = ["sh", "-c", "umask 077; exec make --silent deb"]
-    subprocess.run(command, cwd=ROOT, check=True, env={**os.environ, "MAKEFLAGS": "", "TZ": "Asia/Tokyo"})
+    environment = {**os.environ, **pip_environment(), "MAKEFLAGS": "", "TZ": "Asia/Tokyo"}
+    subprocess.run(command, cwd=ROOT, check=True, env=environment)
     assert hashlib.sha256(package.read_bytes()).hexdigest() == first

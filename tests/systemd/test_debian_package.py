@@ -15,7 +15,7 @@ import pytest
 
 from gateway import __version__
 from tests.support.bare_debian import bare_root, build_package, quick_package
-from tests.support.fresh_clones import ROOT
+from tests.support.fresh_clones import ROOT, pip_environment
 from tests.systemd.machine import CLONE, CONFIG, UNIT, Machine, booted, commands
 
 pytestmark = [
@@ -41,7 +41,8 @@ def package() -> Path:
     """Return the package of this repository."""
     if not FULL:
         return quick_package()
-    subprocess.run(["make", "--silent", "deb"], cwd=ROOT, check=True, env={**os.environ, "MAKEFLAGS": ""})
+    environment = {**os.environ, **pip_environment(), "MAKEFLAGS": ""}  # tests have no network
+    subprocess.run(["make", "--silent", "deb"], cwd=ROOT, check=True, env=environment)
     return ROOT / f"dist/rtc3d-gateway_{__version__}_amd64.deb"
 
 
