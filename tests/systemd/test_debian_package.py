@@ -195,6 +195,8 @@ def previous_package(folder: Path) -> Path | None:
     try:
         if not (previous / "release/deb/build.py").exists():
             return None
+        (previous / "build").mkdir()
+        (previous / "build/deb").symlink_to(ROOT / "build/deb")  # what apt has downloaded
         return build_package(output, "compiled", f"{__version__}~previous", previous)
     finally:
         subprocess.run([*git, "worktree", "remove", "--force", previous], check=True)
