@@ -235,7 +235,7 @@ class Measurement(NamedTuple):
             first_row = self._row_of(run, grid, rows_per_row)
             if first_row is not None:
                 rows = grid.rows
-                rows += first_row
+                rows += first_row  # in place: `place` made them for this call, and a copy could take 30 MB
                 first, last = np.searchsorted(rows, [0, stop])
                 if first < last:
                     parts.append(Part(run, rows[first:last], _some(grid.frames, first, last)))
