@@ -4,7 +4,7 @@ docs/reference/takes.md has the table of topics.
 """
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final
@@ -42,7 +42,9 @@ from gateway.foxglove_schemas.topics import (
     FloatRecord,
     FloatTopics,
     FoxgloveMessage,
+    ProtobufRecord,
     Topic,
+    TopicMessages,
     field_names,
     json_topic,
     timestamp,
@@ -196,8 +198,8 @@ class FoxgloveSource:
     ) -> list[FoxgloveMessage]:
         """Return the messages of one component, on the ``wanted`` topics; None means all.
 
-        ``items`` has the shape (items,) and the dtype of ITEM_DTYPES, big-endian. ``capture_utime`` is in µs
-        since 1970, from 0 to MAX_UTIME, and ``timestamp_us`` the server's time stamp.
+        ``items`` has the shape (items,) and the dtype of ITEM_DTYPES in any byte order. ``capture_utime`` is
+        in µs since 1970, from 0 to MAX_UTIME, and ``timestamp_us`` the server's time stamp.
         """
         found: list[FoxgloveMessage] = []
         for topic in self.topics(component, len(items)):
@@ -215,12 +217,43 @@ class FoxgloveSource:
                 found.append(self._force_arrows(items, capture_utime))
             else:
                 record = self._number_records(component, len(items))[topic]
-                found.append(FoxgloveMessage(topic, capture_utime, record.encode(items.view(">f4"))))
+                found.append(FoxgloveMessage(topic, capture_utime, record.encode(_floats(items))))
         return found
+
+    def convert_frames(
+        self,
+        component: ComponentType,
+        items: Items,
+        capture_utimes: list[int],
+        timestamps_us: list[int],
+        arrow_interval: int,
+    ) -> Iterator[TopicMessages]:
+        """Yield the messages of many frames for a file: what ``convert`` returns for each of them.
+
+        ``items`` has the shape (frames, items). Forces are drawn in one of ``arrow_interval`` frames only.
+        """
+        num_items = items.shape[1]
+        records = self._number_records(component, num_items) if component in NUMBERS_PER_ITEM else {}
+        for topic in self.topics(component, num_items):
+            record = records.get(topic)
+            if isinstance(record, ProtobufRecord):  # as all in files
+                messages = record.encode_rows(_floats(items))
+                yield TopicMessages(topic, capture_utimes, messages)
+                continue
+            converted = [
+                message
+                for row in range(0, len(items), arrow_interval if topic is self._arrows else 1)
+                for message in self.convert(
+                    component, items[row], capture_utimes[row], timestamps_us[row], (topic,)
+                )
+            ]
+            yield TopicMessages(
+                topic, [message.utime for message in converted], [message.data for message in converted]
+            )
 
     def _cloud(self, items: Items, utime: int) -> bytes:
         """Return the visible markers; each has its position in the parameters, from 0."""
-        values = items.view(">f4").reshape(-1, 4).astype(np.float32)
+        values = _floats(items).reshape(-1, 4).astype(np.float32)
         visible = np.flatnonzero(np.isfinite(values[:, :3]).all(axis=1))
         points = np.empty((len(visible), 5), "<f4")
         points[:, :4] = values[visible]
@@ -359,6 +392,11 @@ class FoxgloveSource:
     def _placed(self, points: Sequence[Sequence[float]]) -> list[list[float]]:
         moved: list[list[float]] = self._plate_frame.points(np.array(points)).tolist()
         return moved
+
+
+def _floats(items: Items) -> Items:
+    """Return the values of items, shape (…, values), as they are in memory."""
+    return items.view(items.dtype[0]) if items.dtype.names else items
 
 
 def _from_x_axis(x: float, y: float, z: float) -> Quaternion:

@@ -4,6 +4,7 @@ They are protobuf. With 69 channels, they need a fifth of the space of JSON, and
 Live, they are CDR with the message definition of ROS 2 as well: PlotJuggler 3.17 takes nothing else.
 """
 
+import itertools
 import json
 import re
 import unicodedata
@@ -23,6 +24,7 @@ from google.protobuf.descriptor_pb2 import (
 )
 
 from gateway.descriptions.labels import fitting_labels
+from gateway.messages.encode import encode_rows
 from gateway.rtc3d.components import Items
 
 MAX_UTIME: Final = ((1 << 32) - 1) * 1_000_000
@@ -45,6 +47,14 @@ class FoxgloveMessage(NamedTuple):
     topic: Topic
     utime: int
     data: bytes
+
+
+class TopicMessages(NamedTuple):
+    """Messages of one topic, and the time of each in µs since 1970."""
+
+    topic: Topic
+    utimes: list[int]
+    messages: list[bytes]
 
 
 class MessageClass(Protocol):
@@ -143,24 +153,31 @@ class ProtobufRecord:
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         self.topic = Topic(topic_name, "protobuf", schema_name, "protobuf", _schema(schema_name, names))
-        data = bytearray()
-        places = []
-        for number in range(1, len(names) + 1):
-            tag = number << 3 | _FIXED_32_BITS  # as a varint: 7 bits in a byte, the lowest first
-            while tag > 0x7F:
-                data.append(tag & 0x7F | 0x80)
-                tag >>= 7
-            data.append(tag)
-            places.append(len(data))
-            data += bytes(4)
-        self._template = np.frombuffer(bytes(data), np.uint8)
-        self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
+        self._tags = [_tag(number) for number in range(1, len(names) + 1)]
+        places = np.cumsum([len(tag) + 4 for tag in self._tags]) - 4
+        self._places = places[:, np.newaxis] + np.arange(4)
+        self._template = np.frombuffer(b"".join(tag + bytes(4) for tag in self._tags), np.uint8)
 
     def encode(self, values: Items) -> bytes:
         """See CdrRecord."""
         data = self._template.copy()
         data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)
         return data.tobytes()
+
+    def encode_rows(self, values: Items) -> list[bytes]:
+        """Return a message for each row of ``values``, shape (rows, fields)."""
+        columns = values.astype("<f4").T
+        return encode_rows(*itertools.chain(*zip(self._tags, columns, strict=True)))
+
+
+def _tag(number: int) -> bytes:
+    """Return what comes before the value of a field, as a varint: 7 bits in a byte, the lowest first."""
+    tag = number << 3 | _FIXED_32_BITS
+    data = bytearray()
+    while tag > 0x7F:
+        data.append(tag & 0x7F | 0x80)
+        tag >>= 7
+    return bytes([*data, tag])
 
 
 FloatRecord = CdrRecord | ProtobufRecord

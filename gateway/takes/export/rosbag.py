@@ -1,17 +1,12 @@
-"""Export to a bag of ROS 2: an MCAP file with the messages that the output ``ros2`` publishes live.
+"""Export to a bag of ROS 2: an MCAP file with the messages that the output ``ros2`` publishes live."""
 
-The file is written while the take is read, so its size does not matter. Whole blocks of frames are encoded
-at once, because a Python call for each message would take several times as long.
-"""
-
-from collections import Counter
 from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
 
 from gateway.descriptions.force_plates import units_of
-from gateway.foxglove_schemas.topics import MAX_UTIME, FoxgloveMessage, Topic
+from gateway.foxglove_schemas.topics import Topic, TopicMessages
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import metres_per_unit
 from gateway.messages.ros2 import (
@@ -44,57 +39,39 @@ from gateway.messages.ros2_names import (
     wrench_topic,
 )
 from gateway.messages.topics import unique_name
-from gateway.takes.export.job import ExportJob, nothing_to_export
-from gateway.takes.export.mcap import McapFile
-from gateway.takes.export.tables import parts_of
+from gateway.takes.export.job import ExportJob
+from gateway.takes.export.mcap_file import SourceExport, export_to_mcap
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series
+from gateway.takes.files.take import TakeSource
 
 _PROFILE: Final = "ros2"
 
 
 def export_rosbag(job: ExportJob) -> None:
     """Write the sources of a take to one bag, with the topics of the output ``ros2``."""
-    take = job.open_take(components=())
-    sources: dict[str, _SourceTopics] = {}
-    with McapFile(job.files.create(job.out), profile=_PROFILE) as file:
-        for name, key, series in parts_of(job, take):
-            if name not in sources:
-                taken = {source.name for source in sources.values()}
-                sources[name] = _SourceTopics(
-                    name, unique_name(ros_name(name, "source"), taken, MAX_PART_CHARS)
-                )
-            for run in series.runs():
-                for message in sources[name].messages(key, run):
-                    file.write(message)
-        for each in take.sources.values():
-            file.write_metadata(each)
-    if not file.num_messages:
-        raise nothing_to_export(job, "markers, tools, analog channels or forces")
-    job.note_malformed(take)
-    for name, source in sources.items():
-        for what, count in source.left_out.items():
-            job.note(f"{what} of {name} left out", job.out.name, count)
+    taken: set[str] = set()
+
+    def new_export(source: TakeSource) -> SourceExport:
+        name = unique_name(ros_name(source.name, "source"), taken, MAX_PART_CHARS)
+        taken.add(name)
+        return _RosExport(source.name, name)
+
+    export_to_mcap(job, new_export, "markers, tools, analog channels or forces", _PROFILE)
 
 
-class _SourceTopics:
-    """The topics of one source: what the frames of a run become."""
+class _RosExport(SourceExport):
+    """One source: what its frames become. ``name`` is the part of its topics that stands for it."""
 
     def __init__(self, source: str, name: str) -> None:
-        self.name = name
-        """The part of its topics that stands for the source."""
-        self.left_out: Counter[str] = Counter()
-        """How many messages or items were left out, by what they are."""
+        super().__init__()
         self._source = source
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
         self._stamped = StampedEncoder(source)
         self._topics: dict[tuple[str, RosType], Topic] = {}
 
-    def messages(self, key: str, run: Series) -> Iterable[FoxgloveMessage]:
-        """Return the messages of frames with constant labels and units."""
-        is_valid = (run.capture_utime >= 0) & (run.capture_utime <= MAX_UTIME)
-        self._count(f"messages from before 1970 or after 2106 in {key}", ~is_valid)
-        (rows,) = np.nonzero(is_valid)
+    def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
+        """Return the messages of a component; events are left out."""
         match key:
             case "3d":
                 return self._markers(run, rows)
@@ -102,44 +79,49 @@ class _SourceTopics:
                 return self._tools(run, rows)
             case "analog":
                 encoded = AnalogEncoder(run.labels).encode_rows(run.items[rows])
-                return self._logged(ANALOG, FLOAT_ARRAY, run.capture_utime[rows], encoded)
+                return [self._messages(ANALOG, FLOAT_ARRAY, run.capture_utime[rows], encoded)]
             case "force":
                 return self._forces(run, rows)
-        self._count("events", is_valid)
+        self.count("events", rows >= 0)
         return ()
 
-    def _markers(self, run: Series, rows: Array) -> Iterable[FoxgloveMessage]:
+    def _markers(self, run: Series, rows: Array) -> list[TopicMessages]:
         metres = metres_per_unit(run.unit)
         if metres is None:
-            self._count(f"markers with the unknown unit {run.unit!r}", rows >= 0)
-            return ()
+            self.count(f"markers with the unknown unit {run.unit!r}", rows >= 0)
+            return []
         utimes, markers = run.capture_utime[rows], run.values[rows]
         encoder = CloudEncoder(self._source, markers.shape[1])
         positions = markers[..., :3].astype(np.float64) * metres
         encoded = encoder.encode_rows(ros_stamps(utimes), positions, markers[..., 3])
-        return self._logged(MARKERS, POINT_CLOUD, utimes, encoded)
+        return [self._messages(MARKERS, POINT_CLOUD, utimes, encoded)]
 
-    def _tools(self, run: Series, rows: Array) -> Iterable[FoxgloveMessage]:
-        """Yield /tf with all tools that are in view in a frame, and the pose of each of them."""
+    def _tools(self, run: Series, rows: Array) -> list[TopicMessages]:
+        """Return the pose of each tool, and /tf with all tools that are in view in a frame."""
         frame = CoordinateFrame(self._source, metres_per_unit(run.unit))
         if frame.metres_per_unit is None:
-            self._count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
-            return
+            self.count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
+            return []
         tools = unique_ros_names(run.labels, "tool")
         names = [TransformNames(self._source, f"{self._source}/{tool}") for tool in tools]
         topics = [self._topic(f"{self._base}/{pose_topic(tool)}", POSE_STAMPED) for tool in tools]
-        tf = self._topic(TF, TF_MESSAGE)
+        found = [TopicMessages(topic, [], []) for topic in topics]
+        tf = TopicMessages(self._topic(TF, TF_MESSAGE), [], [])
         for row, utime in zip(rows.tolist(), run.capture_utime[rows].tolist(), strict=True):
             stamp = ros_stamp(utime)
-            poses = enumerate(frame.poses(run.items[row]))
-            packed = [(index, pack_pose(*pose[:7])) for index, pose in poses if pose is not None]
-            for index, pose in packed:
-                yield FoxgloveMessage(topics[index], utime, self._stamped.encode(stamp, pose))
-            if packed:
-                transforms = [(names[index], pose) for index, pose in packed]
-                yield FoxgloveMessage(tf, utime, tf_message(stamp, transforms))
+            transforms = []
+            for index, pose in enumerate(frame.poses(run.items[row])):
+                if pose is not None:
+                    packed = pack_pose(*pose[:7])
+                    transforms.append((names[index], packed))
+                    found[index].utimes.append(utime)
+                    found[index].messages.append(self._stamped.encode(stamp, packed))
+            if transforms:
+                tf.utimes.append(utime)
+                tf.messages.append(tf_message(stamp, transforms))
+        return [*found, tf]
 
-    def _forces(self, run: Series, rows: Array) -> Iterable[FoxgloveMessage]:
+    def _forces(self, run: Series, rows: Array) -> Iterable[TopicMessages]:
         force = run.parameters_of(0).force
         plates = force.plates if force else ()
         for index in range(run.values.shape[1]):
@@ -148,21 +130,13 @@ class _SourceTopics:
             is_known = ~np.isnan(loads).any(axis=1)
             utimes = run.capture_utime[rows][is_known]
             encoded = self._stamped.encode_rows(ros_stamps(utimes), loads[is_known])
-            yield from self._logged(wrench_topic(plate_name(index + 1)), WRENCH_STAMPED, utimes, encoded)
+            yield self._messages(wrench_topic(plate_name(index + 1)), WRENCH_STAMPED, utimes, encoded)
 
-    def _logged(
-        self, name: str, ros_type: RosType, utimes: Array, encoded: list[bytes]
-    ) -> Iterable[FoxgloveMessage]:
-        topic = self._topic(f"{self._base}/{name}", ros_type)
-        return map(FoxgloveMessage, [topic] * len(encoded), utimes.tolist(), encoded)
+    def _messages(self, name: str, ros_type: RosType, utimes: Array, encoded: list[bytes]) -> TopicMessages:
+        return TopicMessages(self._topic(f"{self._base}/{name}", ros_type), utimes.tolist(), encoded)
 
     def _topic(self, path: str, ros_type: RosType) -> Topic:
         if (path, ros_type) not in self._topics:
             schema = definition(ros_type).encode()
             self._topics[path, ros_type] = Topic(path, "cdr", ros_type.name, "ros2msg", schema)
         return self._topics[path, ros_type]
-
-    def _count(self, what: str, rows: Array) -> None:
-        count = int(rows.sum())
-        if count:
-            self.left_out[what] += count

@@ -45,11 +45,12 @@ MIN_LIMIT_BYTES: Final = 256 * 1024 * 1024
 
 
 class ParametersEntry(NamedTuple):
-    """Parameters of a server: when the gateway sent them (``parameters_t.utime``), and their version."""
+    """Parameters of a server: when the gateway sent them (``parameters_t.utime``), their version and XML."""
 
     utime: int
     version: int
     parameters: Parameters
+    xml: bytes
 
 
 def recorded_parameters(xml: bytes) -> Parameters | None:
@@ -77,7 +78,7 @@ class ParametersHistory:
             return None
         parameters = recorded_parameters(xml)
         self._xml, self.is_readable = xml, parameters is not None
-        self.newest = ParametersEntry(message.utime, version, parameters or Parameters())
+        self.newest = ParametersEntry(message.utime, version, parameters or Parameters(), xml)
         return self.newest
 
 

@@ -184,7 +184,7 @@ class SourceStatistics:
         before, entry = self._history.newest, self._history.add(message)
         if entry is None:
             return
-        utime, version, parameters = entry
+        utime, version, parameters, _ = entry
         self.others["parameters"].malformed += not self._history.is_readable
         self._label(version)  # what came before, if versions start again
         self.num_parameters_changes += 1

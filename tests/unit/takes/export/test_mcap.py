@@ -35,7 +35,7 @@ from gateway.rtc3d.parameters import (
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.mcap import McapFile
+from gateway.takes.export.mcap_file import McapFile
 from gateway.takes.files.take import TakeSource
 from tests.support.takes import (
     START_UTIME,
