@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import rtc3d
 
 from gateway.messages.coordinate_frame import CoordinateFrame
@@ -197,24 +196,3 @@ def tool_poses(
         + (_CONTENT.pack(*head, False, *_NO_POSE) if pose is None else _CONTENT.pack(*head, True, *pose))
         for pose, sequence in zip(frame.poses(component.items(), accept_zeros=True), sequences, strict=True)
     ]
-
-
-def encode_rows(*parts: bytes | npt.NDArray[Any]) -> list[bytes]:
-    """Return messages of equal size from their parts: bytes that all have, and arrays with a row for each."""
-    blocks = [
-        np.frombuffer(part, np.uint8) if isinstance(part, bytes) else bytes_of_rows(part) for part in parts
-    ]
-    num_rows = next(len(block) for block in blocks if block.ndim > 1)
-    ends = np.cumsum([block.shape[-1] for block in blocks]).tolist()
-    table = np.empty((num_rows, ends[-1]), np.uint8)
-    for start, stop, block in zip([0, *ends], ends, blocks, strict=False):
-        table[:, start:stop] = block
-    content, size = table.tobytes(), ends[-1]
-    return [content[start : start + size] for start in range(0, len(content), size)]
-
-
-def bytes_of_rows(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the bytes of each row, shape (rows, bytes)."""
-    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
-    table: npt.NDArray[Any] = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).reshape(len(rows), row_bytes)
-    return table

@@ -10,14 +10,13 @@ in all distributions since Iron.
 The stamps are the results of ``ros_stamp``. All positions are in metres.
 """
 
+import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-
-from gateway.messages.encode import bytes_of_rows, encode_rows
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 """The first bytes of every message: CDR version 1, little-endian, no options."""
@@ -156,13 +155,33 @@ MAX_LABEL_BYTES: Final = 16 * 1024
 """Longer labels of channels are left out, because they are in every message."""
 
 
+def _rows(*parts: bytes | Array) -> list[bytes]:
+    """Return messages of equal size from their parts: bytes that all have, and arrays with a row for each."""
+    blocks = [
+        np.frombuffer(part, np.uint8) if isinstance(part, bytes) else _bytes_of_rows(part) for part in parts
+    ]
+    num_rows = next(len(block) for block in blocks if block.ndim > 1)
+    ends = np.cumsum([block.shape[-1] for block in blocks]).tolist()
+    table = np.empty((num_rows, ends[-1]), np.uint8)
+    for start, stop, block in zip([0, *ends], ends, blocks, strict=False):
+        table[:, start:stop] = block
+    content, size = table.tobytes(), ends[-1]
+    return [content[start : start + size] for start in range(0, len(content), size)]
+
+
+def _bytes_of_rows(rows: Array) -> Array:
+    """Return the bytes of each row, shape (rows, bytes)."""
+    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+    return np.ascontiguousarray(rows).reshape(-1).view(np.uint8).reshape(len(rows), row_bytes)
+
+
 def ros_stamps(utimes: Array) -> Array:
     """Return the stamps of times in µs since the Unix epoch, shape (times, 8), uint8; see ``ros_stamp``."""
     seconds, microseconds = np.divmod(utimes, 1_000_000)
     stamps = np.empty(len(utimes), [("sec", "<i4"), ("nanosec", "<u4")])
     stamps["sec"] = np.clip(seconds, -MAX_STAMP_S - 1, MAX_STAMP_S)
     stamps["nanosec"] = 1000 * microseconds
-    return bytes_of_rows(stamps)
+    return _bytes_of_rows(stamps)
 
 
 class StampedEncoder:
@@ -177,7 +196,7 @@ class StampedEncoder:
 
     def encode_rows(self, stamps: Array, values: Array) -> list[bytes]:
         """Return a message for each row of ``values``: a wrench or a pose, shape (rows, 6) or (rows, 7)."""
-        return encode_rows(ENCAPSULATION, stamps, self._frame_id, values.astype("<f8"))
+        return _rows(ENCAPSULATION, stamps, self._frame_id, values.astype("<f8"))
 
 
 class TransformNames:
@@ -243,7 +262,7 @@ class CloudEncoder:
         floats[..., :3][np.isnan(positions).any(axis=2)] = np.nan
         floats[..., 3] = reliabilities
         is_dense = np.isfinite(floats[..., :3]).all(axis=(1, 2))
-        return encode_rows(ENCAPSULATION, stamps, self._layout, points, is_dense[:, None])
+        return _rows(ENCAPSULATION, stamps, self._layout, points, is_dense[:, None])
 
 
 class AnalogEncoder:
@@ -267,7 +286,7 @@ class AnalogEncoder:
 
     def encode_rows(self, values: Array) -> list[bytes]:
         """Return a message for each row of ``values``, shape (rows, num_channels)."""
-        return encode_rows(ENCAPSULATION, self._layout, values.astype("<f4"))
+        return _rows(ENCAPSULATION, self._layout, values.astype("<f4"))
 
 
 class DiagnosticStatus(NamedTuple):

@@ -1,6 +1,5 @@
 """Export to MCAP with Foxglove's types, for Foxglove, Lichtblick and rerun."""
 
-import math
 from collections.abc import Iterator
 from typing import Final
 
@@ -19,7 +18,7 @@ from gateway.takes.files.take import TakeSource
 _MAX_CONVERTERS: Final = 100
 
 _ARROWS_HZ: Final = 100
-"""How often the arrows of forces are drawn at most: screens show no more, and programs read them slowly."""
+"""About how often arrows of forces are drawn at most: screens show no more, and programs read them slowly."""
 
 
 def export_mcap(job: ExportJob) -> None:
@@ -45,7 +44,7 @@ class _FoxgloveExport(SourceExport):
             return
         interval = 1
         if component is ComponentType.FORCE:
-            interval = math.ceil((run.measured_rate_hz or _ARROWS_HZ) / _ARROWS_HZ)
+            interval = max(1, round((run.measured_rate_hz or _ARROWS_HZ) / _ARROWS_HZ))
             if interval > 1:
                 self.notes[f"arrows of forces are drawn for one of {interval} frames"] = None
         entries = run.content.entries[rows]

@@ -6,7 +6,7 @@ reads the same format, but ends at the first damaged byte.
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
@@ -18,6 +18,9 @@ SYNC: Final = bytes.fromhex("eda1da01")
 _HEADER: Final = struct.Struct(">4sqqii")
 """Sync word, event number, time in µs since the Unix epoch, size of the channel, size of the message."""
 _HEADER_BYTES: Final = _HEADER.size
+
+_FINGERPRINT_BYTES: Final = 8
+"""What a message begins with: the type of LCM that it has."""
 
 MAX_CHANNEL_BYTES: Final = 255
 MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
@@ -50,6 +53,13 @@ class Event(NamedTuple):
     offset: int
 
 
+class EventColumns(NamedTuple):
+    """The times and the messages of events of one channel."""
+
+    utimes: list[int]
+    messages: list[bytes]
+
+
 class Damage(NamedTuple):
     """Bytes of a file that belong to no readable event."""
 
@@ -72,29 +82,43 @@ class EventLogReader:
         """How many places of damage there are."""
         self.damaged_bytes = 0
         """How many bytes belong to no readable event."""
+        self.offset = 0
+        """About how far the newest pass has come."""
 
     def events(self, start_offset: int = 0, stop_offset: int | None = None) -> Iterator[Event]:
         """Yield the events from a place in the file on, to the end of the file or to another place.
 
         Raises TakeError if it is no event log. Nothing behind ``stop_offset`` is read.
         """
-        self.damage, self.num_damaged, self.damaged_bytes = [], 0, 0
+        return filter(None, self.collect({}, start_offset, stop_offset))
+
+    def collect(
+        self, columns: Mapping[bytes, EventColumns], start_offset: int = 0, stop_offset: int | None = None
+    ) -> Iterator[Event | None]:
+        """Do as ``events``, but append most events of known channels to ``columns``; do not yield these.
+
+        ``columns`` has as keys the bytes of a channel with the first 8 bytes of its messages. The caller may
+        change it whenever this yields. About once in 1 MiB of the file, this yields None.
+        """
+        self.damage, self.num_damaged, self.damaged_bytes, self.offset = [], 0, 0, start_offset
         try:
             with open_file(self.path) as file:
                 file.seek(start_offset)
-                yield from self._events(_Window(file, start_offset, stop_offset))
+                yield from self._collect(_Window(file, start_offset, stop_offset), columns)
         except (OSError, ValueError) as error:  # ValueError: of a path with NUL
             reason = getattr(error, "strerror", None) or error
             raise TakeError(f"{safe_text(str(self.path))} cannot be read: {reason}") from error
 
-    def _events(self, window: "_Window") -> Iterator[Event]:
+    def _collect(self, window: "_Window", columns: Mapping[bytes, EventColumns]) -> Iterator[Event | None]:
         has_events = False
         damage_start: int | None = None
         while window.has(1):
+            self.offset = window.offset
+            yield None
             if damage_start is None:
-                for intact in window.intact_events():
-                    has_events = True
-                    yield intact
+                start = window.offset
+                yield from window.intact_events(columns)
+                has_events |= window.offset > start
             event = window.event()
             if event is None:
                 if damage_start is None:
@@ -108,6 +132,7 @@ class EventLogReader:
                 damage_start = None
             has_events = True
             yield event
+        self.offset = window.offset
         if damage_start is not None:
             self._add_damage(damage_start, window.offset)
         if not has_events:
@@ -195,8 +220,8 @@ class _Window:
             self._start = 0
         return len(self._data) - self._start >= num_bytes
 
-    def intact_events(self) -> Iterator[Event]:
-        """Yield the next events, as far as each is in memory and another one follows directly.
+    def intact_events(self, columns: Mapping[bytes, EventColumns]) -> Iterator[Event]:
+        """Yield or collect the next events, as far as each is in memory and another one follows directly.
 
         This is the fast way through a log without damage; ``event`` has all the rules.
         """
@@ -216,12 +241,20 @@ class _Window:
             stop = message_start + message_bytes
             if stop > last_header:
                 break
-            channel = data[start + _HEADER_BYTES : message_start]
             sync, next_number, next_utime, next_channel_bytes, next_message_bytes = unpack(data, stop)
-            name = names.get(channel)
-            if sync != SYNC or (name is None and (name := self._name(channel)) is None):
+            if sync != SYNC:
                 break
-            yield new_event(Event, (number, utime, name, data[message_start:stop], to_offset + start))
+            if columns and (
+                found := columns.get(data[start + _HEADER_BYTES : message_start + _FINGERPRINT_BYTES])
+            ):
+                found[0].append(utime)
+                found[1].append(data[message_start:stop])
+            else:
+                channel = data[start + _HEADER_BYTES : message_start]
+                name = names.get(channel) or self._name(channel)
+                if name is None:
+                    break
+                yield new_event(Event, (number, utime, name, data[message_start:stop], to_offset + start))
             start = stop
             number, utime = next_number, next_utime
             channel_bytes, message_bytes = next_channel_bytes, next_message_bytes

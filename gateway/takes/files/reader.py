@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,7 +16,7 @@ from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
 from gateway.messages.topics import unique_name
-from gateway.takes.files.event_log import Event, EventLogReader
+from gateway.takes.files.event_log import Event, EventColumns, EventLogReader
 from gateway.takes.files.new_file import by_number
 
 NAMED_WITHIN_EVENTS: Final = 50_000
@@ -77,11 +77,7 @@ SUFFIX: Final = ".lcmlog"
 """The extension of an event log."""
 
 _BATCH_BYTES: Final = 4 * 1024 * 1024
-_BATCH_MESSAGES: Final = 20_000
-"""A batch ends at this many bytes or messages, whichever comes first."""
-
-_EVENT_BYTES: Final = 40
-"""About how many bytes of a file an event has besides its message."""
+"""A batch ends after about this many bytes of the files."""
 
 _MAX_ROUTES: Final = 10_000
 
@@ -151,8 +147,6 @@ class TakeReader:
         """How many messages have a type that this version does not know, by channel, in the newest pass."""
         self.empty_files: dict[Path, str] = {}
         """Files of a folder without any event, and why, in the newest pass."""
-        self.read_bytes = 0
-        """How far the newest pass of ``batches`` has come."""
         self._log = 0
         self._offset = 0
         self._names = SourceNames(itertools.islice(self.events(), NAMED_WITHIN_EVENTS))
@@ -168,6 +162,11 @@ class TakeReader:
             with contextlib.suppress(OSError):
                 num_bytes += log.path.stat().st_size
         return num_bytes
+
+    @property
+    def read_bytes(self) -> int:
+        """How far the newest pass has come."""
+        return sum(log.offset for log in self.logs)
 
     @property
     def num_damaged(self) -> int:
@@ -191,11 +190,19 @@ class TakeReader:
 
     def events(self, start: Place = FIRST_PLACE) -> Iterator[Event]:
         """Yield the events of all files, from a place on. Raises TakeError."""
+        return filter(None, self._collect({}, start))
+
+    def _collect(
+        self, columns: Mapping[bytes, EventColumns], start: Place = FIRST_PLACE
+    ) -> Iterator[Event | None]:
+        """Yield what ``EventLogReader.collect`` does for each file."""
         self.empty_files = {}
+        for log in self.logs:
+            log.offset = 0
         for number, log in enumerate(self.logs[start.log :], start=start.log):
             self._log = number
             try:
-                yield from log.events(start.offset if number == start.log else 0)
+                yield from log.collect(columns, start.offset if number == start.log else 0)
             except TakeError as error:
                 # After a loss of power, one file of a folder may be empty.
                 self.empty_files[log.path] = str(error)
@@ -227,33 +234,39 @@ class TakeReader:
         before. Raises TakeError, also if there are no such messages.
         """
         self.unknown.clear()
-        self.read_bytes = 0
-        batches: dict[tuple[str, bytes], MessageBatch | None] = {}
-        newest: dict[str, bytes] = {}
-        num_bytes = num_messages = 0
-        for _, utime, channel, message, _ in self.events():
-            identity = (channel, message[:8])
-            if identity not in batches:
-                route = self._route(identity)
-                batches[identity] = None if route is None else MessageBatch(*route)
-            batch = batches[identity]
-            num_messages += 1
-            num_bytes += len(message)
-            if batch is None:
-                self.unknown[channel] += 1
+        batches: dict[tuple[str, bytes], MessageBatch] = {}  # by channel and fingerprint
+        columns: dict[bytes, EventColumns] = {}  # of the same, except parameters
+        newest: dict[str, bytes] = {}  # parameters, by source
+        first_byte = 0
+        for event in self._collect(columns):
+            if event is None:
+                if self.read_bytes - first_byte >= _BATCH_BYTES:
+                    yield [*batches.values()]
+                    batches.clear()
+                    columns.clear()
+                    first_byte = self.read_bytes
                 continue
-            is_news = batch.key == "parameters" and newest.get(batch.source) != message[VERSION_OFFSET:]
-            if is_news or num_bytes >= _BATCH_BYTES or num_messages >= _BATCH_MESSAGES:
-                if is_news:
-                    newest[batch.source] = message[VERSION_OFFSET:]
-                self.read_bytes += num_bytes + num_messages * _EVENT_BYTES
-                yield [filled for filled in batches.values() if filled is not None and filled.messages]
-                num_bytes = num_messages = 0
+            _, utime, channel, message, _ = event
+            identity = (channel, message[:8])
+            batch = batches.get(identity)
+            if batch is None:
+                route = self._route(identity)
+                if route is None:
+                    self.unknown[channel] += 1
+                    continue
+                batch = MessageBatch(*route)
+            if batch.key != "parameters":
+                columns[channel.encode() + message[:8]] = EventColumns(batch.utimes, batch.messages)
+            elif newest.get(batch.source) != message[VERSION_OFFSET:]:
+                newest[batch.source] = message[VERSION_OFFSET:]
+                yield [*batches.values()]
+                batches.clear()
+                columns.clear()
                 batch = MessageBatch(batch.source, batch.key)
-                batches = {identity: batch}
+            batches[identity] = batch
             batch.utimes.append(utime)
             batch.messages.append(message)
-        yield [filled for filled in batches.values() if filled is not None and filled.messages]
+        yield [*batches.values()]
         self._check_is_take()
 
     def _check_is_take(self) -> None:

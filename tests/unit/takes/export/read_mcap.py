@@ -74,13 +74,17 @@ def floats_of(record: Any) -> dict[str, float]:
     return {field.name: getattr(record, field.name) for field in record.DESCRIPTOR.fields}
 
 
-def assert_equals_take(content: McapContent, path: Path) -> None:
-    """The file has every value and every time of capture of a take whose labels do not change."""
+def assert_equals_take(content: McapContent, path: Path, arrow_interval: int = 1) -> None:
+    """The file has every value and every time of capture of a take whose labels do not change.
+
+    Of the frames of forces, one of ``arrow_interval`` has its arrows.
+    """
     recorded = open_take(path).sources["lab"]
     topics = content.topics
     for key, topic in (("3d", "markers"), ("analog", "analog"), ("force", "loads"), ("force", "forces")):
         times = [log.time_ns // 1000 for log in topics.get(f"/lab/{topic}", [])]
-        assert times == (recorded.series[key].capture_utime.tolist() if key in recorded.series else [])
+        expected = recorded.series[key].capture_utime.tolist() if key in recorded.series else []
+        assert times == (expected[::arrow_interval] if topic == "forces" else expected)
     assert recorded.markers is not None
     metres = {"mm": 1e-3, "m": 1.0}[recorded.markers.unit]
     for row, log in zip(recorded.markers.items, topics["/lab/markers"], strict=True):

@@ -20,7 +20,7 @@ from gateway.rtc3d.parameters import (
     Plate,
 )
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.files import reader
+from gateway.takes.files import event_log, reader
 from tests.support.takes import START_UTIME, frame, markers, parameters
 from tests.unit.takes.export.exported import NAN, export_messages, labelled, notes_of, scene
 
@@ -148,6 +148,7 @@ def test_parts_of_a_long_take_follow_each_other(tmp_path: Path, monkeypatch: pyt
     messages = scene(30, SCENE)
     export_messages(tmp_path, messages, "whole.csv")
     monkeypatch.setattr(reader, "_BATCH_BYTES", 1000)
+    monkeypatch.setattr(event_log, "_READ_BYTES", 1000)
     export_messages(tmp_path, messages, "parts.csv")
     for key in ("3d", "6d", "analog", "force"):
         assert (tmp_path / f"parts-{key}.csv").read_bytes() == (tmp_path / f"whole-{key}.csv").read_bytes()

@@ -4,7 +4,7 @@ import math
 import os
 import struct
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
-from gateway.foxglove_schemas.topics import FoxgloveMessage, Topic
+from gateway.foxglove_schemas.topics import Topic, TopicMessages
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import (
@@ -36,6 +36,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.mcap_file import McapFile
+from gateway.takes.files.series import ParametersEntry
 from gateway.takes.files.take import TakeSource
 from tests.support.takes import (
     START_UTIME,
@@ -62,9 +63,15 @@ NO_MARKER = (MISSING, MISSING, MISSING, 999.0)
 NO_TOOL = (MISSING,) * 8
 
 
-def export(folder: Path, messages: Iterable[Message], **options: Any) -> McapContent:
+def one_of(interval: int) -> str:
+    return f"lab: arrows of forces are drawn for one of {interval} frames"
+
+
+def export(
+    folder: Path, messages: Iterable[Message], *, notes: Sequence[str] = (), **options: Any
+) -> McapContent:
     job = export_messages(folder, messages, "walk.mcap", **options)
-    assert job.notes == []
+    assert notes_of(job) == [*notes]
     return read_mcap(folder / "walk.mcap")
 
 
@@ -94,8 +101,8 @@ def plates(*described: Plate, version: int = 1) -> Message:
 def test_every_value_of_a_real_recording_is_exported(tmp_path: Path) -> None:
     scene = C3dScene(Path(os.environ["RTC3D_TAKES"]) / "qualisys.c3d")
     messages = [description(), parameters(scene.parameters), *scene_messages(scene, scene.num_frames or 0)]
-    content = export(tmp_path, messages)
-    assert_equals_take(content, tmp_path / "take.lcmlog")
+    content = export(tmp_path, messages, notes=[one_of(20)])
+    assert_equals_take(content, tmp_path / "take.lcmlog", arrow_interval=20)
     assert len(content.topics["/lab/markers"]) == scene.num_frames
 
 
@@ -106,8 +113,8 @@ def test_every_value_of_a_computed_scene_is_exported(tmp_path: Path) -> None:
         parameters(SCENE.parameters),
         *scene_messages(SCENE, 50),
     ]
-    content = export(tmp_path, messages)
-    assert_equals_take(content, tmp_path / "take.lcmlog")
+    content = export(tmp_path, messages, notes=[one_of(10)])
+    assert_equals_take(content, tmp_path / "take.lcmlog", arrow_interval=10)
     assert content.schemas == {
         "/lab/markers": "foxglove.PointCloud",
         "/lab/tools": "foxglove.FrameTransforms",
@@ -372,12 +379,13 @@ def test_without_foxglove_sdk_the_error_has_a_remedy(tmp_path: Path, monkeypatch
 
 def test_a_full_disk_is_its_own_error_whatever_is_written() -> None:
     topic = Topic("/lab/test", "json", "test", "jsonschema", b"{}")
-    message = FoxgloveMessage(topic, START_UTIME, os.urandom(2_000_000))
+    messages = TopicMessages(topic, [START_UTIME], [os.urandom(2_000_000)])
+    entry = ParametersEntry(START_UTIME, 1, Parameters(), bytes(2_000_000))
 
     uses: list[Callable[[McapFile], object]] = [
-        lambda file: file.attach(START_UTIME, "large", "application/xml", bytes(2_000_000)),
-        lambda file: file.write(message),
-        lambda file: file.write_metadata(TakeSource("lab", "192.0.2.20:3020")),
+        lambda file: file.write(messages),
+        lambda file: file.describe(TakeSource("lab", parameters=[entry])),
+        lambda file: file.describe(TakeSource("lab", "192.0.2.20:3020")),
         lambda _file: None,
     ]
     for use in uses:

@@ -16,7 +16,7 @@ from gateway.simulator.c3d_scene import C3dScene
 from gateway.takes import open_take
 from gateway.takes.export import parquet
 from gateway.takes.export.job import ExportJob, export_take
-from gateway.takes.files import reader
+from gateway.takes.files import event_log, reader
 from gateway.takes.files.tables import TIME_COLUMNS
 from tests.support.documents import ROOT
 from tests.support.takes import START_UTIME, description, details, frame, parameters, record_scene
@@ -115,6 +115,7 @@ def test_rows_are_written_in_groups_before_much_of_them_waits(
     messages = scene(100)
     export_messages(tmp_path, messages, "whole.parquet")
     monkeypatch.setattr(reader, "_BATCH_BYTES", 2000)
+    monkeypatch.setattr(event_log, "_READ_BYTES", 1000)
     monkeypatch.setattr(parquet, "_MAX_WAITING_BYTES", 10_000)
     export_messages(tmp_path, messages, "parts.parquet")
     for key in ("3d", "analog", "force"):

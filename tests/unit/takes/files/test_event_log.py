@@ -8,11 +8,13 @@ import lcm
 import pytest
 
 from gateway.errors import TakeError
-from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, SYNC, EventBoundary, EventLogReader
+from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, SYNC, EventBoundary, EventColumns, EventLogReader
 from tests.support.takes import encode_event
 
 HEADER_BYTES = 28
-MESSAGES = [(number, 1_000_000 + 5000 * number, b"MOCAP_LAB_3D", os.urandom(100)) for number in range(500)]
+MESSAGES = [
+    (number, 1_000_000 + 5000 * number, b"MOCAP_LAB_3D", bytes(8) + os.urandom(92)) for number in range(500)
+]
 EVENTS = [encode_event(*message) for message in MESSAGES]
 
 
@@ -25,8 +27,20 @@ def path(tmp_path: Path) -> Path:
 
 
 def read(path: Path) -> tuple[list[tuple[int, int, str, bytes]], EventLogReader]:
+    """Return the events; those that are collected by channel are the same."""
     reader = EventLogReader(path)
-    return [event[:4] for event in reader.events()], reader
+    events = [event[:4] for event in reader.events()]
+    damage = reader.damage
+    columns: dict[bytes, EventColumns] = {}
+    collected = []
+    for event in filter(None, reader.collect(columns)):
+        collected.append((event.utime, event.channel, event.message))
+        columns.setdefault(event.channel.encode() + event.message[:8], EventColumns([], []))
+    for key, (utimes, messages) in columns.items():
+        collected += [(utime, key[:-8].decode(), data) for utime, data in zip(utimes, messages, strict=True)]
+    assert sorted(collected) == sorted(event[1:] for event in events)
+    assert (reader.damage, reader.offset) == (damage, path.stat().st_size)
+    return events, reader
 
 
 def numbers(path: Path) -> list[int]:

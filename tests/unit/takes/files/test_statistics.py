@@ -10,7 +10,7 @@ import rtc3d
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
-from gateway.takes.files import reader
+from gateway.takes.files import event_log, reader
 from gateway.takes.files.component_statistics import MAX_LISTED_STEPS, ClockSteps, ComponentStatistics
 from gateway.takes.files.statistics import SourceStatistics, take_statistics
 from tests.support.takes import (
@@ -96,6 +96,7 @@ def test_restarts_of_server_and_gateway(
 ) -> None:
     """They count between two parts that are read at once, too."""
     monkeypatch.setattr(reader, "_BATCH_BYTES", batch_bytes)
+    monkeypatch.setattr(event_log, "_READ_BYTES", batch_bytes)
     messages = [
         markers(1, 0),
         markers(1, 1),
