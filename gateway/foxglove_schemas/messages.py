@@ -206,7 +206,8 @@ class FoxgloveSource:
             if wanted is not None and topic not in wanted:
                 continue
             if topic is self._markers:
-                found.append(FoxgloveMessage(topic, capture_utime, self._cloud(items, capture_utime)))
+                [data] = self._clouds(items[np.newaxis], [capture_utime])
+                found.append(FoxgloveMessage(topic, capture_utime, data))
             elif topic is self._tools:
                 data = self._transforms(items, capture_utime)
                 if data:
@@ -237,37 +238,41 @@ class FoxgloveSource:
         for topic in self.topics(component, num_items):
             record = records.get(topic)
             if isinstance(record, ProtobufRecord):  # as all in files
-                messages = record.encode_rows(_floats(items))
-                yield TopicMessages(topic, capture_utimes, messages)
-                continue
-            converted = [
-                message
-                for row in range(0, len(items), arrow_interval if topic is self._arrows else 1)
-                for message in self.convert(
-                    component, items[row], capture_utimes[row], timestamps_us[row], (topic,)
+                yield TopicMessages(topic, capture_utimes, record.encode_rows(_floats(items)))
+            elif topic is self._markers:
+                yield TopicMessages(topic, capture_utimes, self._clouds(items, capture_utimes))
+            else:
+                chosen = slice(None, None, arrow_interval if topic is self._arrows else 1)
+                frames = zip(items[chosen], capture_utimes[chosen], timestamps_us[chosen], strict=True)
+                converted = [
+                    message
+                    for frame, utime, timestamp_us in frames
+                    for message in self.convert(component, frame, utime, timestamp_us, (topic,))
+                ]
+                yield TopicMessages(
+                    topic, [message.utime for message in converted], [message.data for message in converted]
                 )
-            ]
-            yield TopicMessages(
-                topic, [message.utime for message in converted], [message.data for message in converted]
-            )
 
-    def _cloud(self, items: Items, utime: int) -> bytes:
-        """Return the visible markers; each has its position in the parameters, from 0."""
-        values = _floats(items).reshape(-1, 4).astype(np.float32)
-        visible = np.flatnonzero(np.isfinite(values[:, :3]).all(axis=1))
-        points = np.empty((len(visible), 5), "<f4")
-        points[:, :4] = values[visible]
+    def _clouds(self, items: Items, utimes: list[int]) -> list[bytes]:
+        """Return the visible markers of frames; each has its position in the parameters, from 0."""
+        values = _floats(items).reshape(*items.shape, 4).astype(np.float32)
+        points = np.empty((*items.shape, 5), "<f4")
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
-            points[:, :3] = self._frame.points(points[:, :3])
-        points.view("<u4")[:, 4] = visible
-        return PointCloud(
-            timestamp=timestamp(utime),
-            frame_id=self._frame.frame_id,
-            pose=_NO_POSE,
-            point_stride=_POINT.itemsize,
-            fields=_POINT_FIELDS,
-            data=points.tobytes(),
-        ).encode()
+            points[..., :3] = self._frame.points(values[..., :3])
+        points[..., 3] = values[..., 3]
+        points.view("<u4")[..., 4] = np.arange(items.shape[1])
+        is_visible: Any = np.isfinite(values[..., :3]).all(axis=2)
+        return [
+            PointCloud(
+                timestamp=timestamp(utime),
+                frame_id=self._frame.frame_id,
+                pose=_NO_POSE,
+                point_stride=_POINT.itemsize,
+                fields=_POINT_FIELDS,
+                data=frame[visible].tobytes(),
+            ).encode()
+            for frame, visible, utime in zip(points, is_visible, utimes, strict=True)
+        ]
 
     def _transforms(self, items: Items, utime: int) -> bytes:
         """Return the poses of the visible tools; b"" if there are none.

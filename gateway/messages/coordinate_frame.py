@@ -75,14 +75,14 @@ class CoordinateFrame:
     def points(self, positions: npt.NDArray[Any]) -> Coordinates:
         """Return positions of the server in metres, in this frame; NaN stays NaN.
 
-        ``positions`` has the shape (n, 3). The unit must be known.
+        ``positions`` has the shape (…, 3). The unit must be known.
         """
         with np.errstate(invalid="ignore"):  # servers may send infinity, and any bits that are a NaN
             points: Coordinates = positions.astype(np.float64) * self._metres
             return points if self.only_scales else points @ self.matrix.T + self.translation_m
 
     def vectors(self, vectors: npt.NDArray[Any]) -> Coordinates:
-        """Return vectors such as forces, shape (n, 3), with the axes of this frame and in their own unit."""
+        """Return vectors such as forces, shape (…, 3), with the axes of this frame and in their own unit."""
         with np.errstate(invalid="ignore"):  # as in ``points``
             rotated: Coordinates = vectors.astype(np.float64)
             return rotated if self.rotation_xyzw == NO_ROTATION else rotated @ self.matrix.T

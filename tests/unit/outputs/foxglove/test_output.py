@@ -196,7 +196,7 @@ async def test_the_components_of_the_topics_that_viewers_subscribe_to_are_wanted
 async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch: pytest.MonkeyPatch) -> None:
     converted: list[str] = []
     for owner, name in (
-        (messages.FoxgloveSource, "_cloud"),
+        (messages.FoxgloveSource, "_clouds"),
         (messages.FoxgloveSource, "_transforms"),
         (topics.ProtobufRecord, "encode"),
         (topics.CdrRecord, "encode"),
@@ -375,7 +375,7 @@ async def test_numbers_are_also_in_cdr_as_messages_of_ros_2() -> None:
 async def test_a_defect_in_one_message_is_logged_once_and_others_are_sent(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(messages.FoxgloveSource, "_cloud", lambda *_: 1 / 0)
+    monkeypatch.setattr(messages.FoxgloveSource, "_clouds", lambda *_: 1 / 0)
     async with watching("/lab/markers", "/lab/events") as (lab, viewer):
         for _ in range(5):
             lab.publish_items(MARKERS)
