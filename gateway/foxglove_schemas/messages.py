@@ -3,39 +3,26 @@
 docs/reference/takes.md has the table of topics.
 """
 
-import math
-from collections.abc import Container, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Container, Iterator
 from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from foxglove.messages import (
-    ArrowPrimitive,
-    Color,
-    Duration,
     FrameTransform,
     FrameTransforms,
-    LinePrimitive,
-    LinePrimitiveLineType,
     Log,
     LogLevel,
     PackedElementField,
     PackedElementFieldNumericType,
-    Point3,
     PointCloud,
-    Pose,
     Quaternion,
-    SceneEntity,
-    SceneEntityDeletion,
-    SceneEntityDeletionType,
     SceneUpdate,
-    TextPrimitive,
     Vector3,
 )
 
-from gateway.descriptions.force_plates import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
 from gateway.descriptions.labels import MAX_EVENT_AGE_US, describe, event_labels, event_text
+from gateway.foxglove_schemas.plates import NO_POSE, PlateScene
 from gateway.foxglove_schemas.topics import (
     MAX_FIELDS,
     MAX_UTIME,
@@ -71,19 +58,6 @@ _POINT_FIELDS: Final = [
     )
     for index, name in enumerate(_POINT.names or ())
 ]
-_NO_POSE: Final = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
-"""Points without a pose are not valid in rerun."""
-
-_ARROW_COLOR: Final = Color(r=1.0, g=0.75, b=0.1, a=1.0)
-_PLATE_COLOR: Final = Color(r=0.6, g=0.6, b=0.65, a=1.0)
-_LINE_M: Final = 0.005
-_TEXT_M: Final = 0.05
-_SHAFT_M: Final = 0.015
-_HEAD_M: Final = 0.04
-
-_LIFETIME: Final = Duration(1)
-"""An arrow disappears if no other message comes for this many seconds."""
-
 _LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 _NOUNS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
 """What channels and plates without a name are called."""
@@ -125,8 +99,7 @@ class FoxgloveSource:
                 self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"
             frame = CoordinateFrame(source, metres or _MILLIMETRE)
         self._frame = frame
-        self._plates = placed_plates(parameters)  # those without a known place are not drawn
-        self._plate_frame = replace(frame, metres_per_unit=frame.scale)  # plates are in metres already
+        self._plates = PlateScene(parameters, frame)
         self._labels_of = lru_cache(_MAX_LAYOUTS)(self._find_labels)
         self._number_records = lru_cache(_MAX_LAYOUTS)(self._new_records)
         self._markers = topic_of(f"/{source}/markers", PointCloud)
@@ -186,7 +159,10 @@ class FoxgloveSource:
         labels = {str(number): label for number, label in event_labels(self._parameters).items()}
         content["event"] = {"labels": labels}
         data = json_text(content).encode()
-        return [FoxgloveMessage(self._description, utime, data), self._placed_outlines(utime)]
+        return [
+            FoxgloveMessage(self._description, utime, data),
+            FoxgloveMessage(self._outlines, utime, self._plates.outlines(utime)),
+        ]
 
     def convert(
         self,
@@ -215,7 +191,8 @@ class FoxgloveSource:
             elif topic is self._events:
                 found += [self._log(item, capture_utime, timestamp_us) for item in items]
             elif topic is self._arrows:
-                found.append(self._force_arrows(items, capture_utime))
+                data = self._plates.arrows(items, capture_utime)
+                found.append(FoxgloveMessage(topic, capture_utime, data))
             else:
                 record = self._number_records(component, len(items))[topic]
                 found.append(FoxgloveMessage(topic, capture_utime, record.encode(_floats(items))))
@@ -266,7 +243,7 @@ class FoxgloveSource:
             PointCloud(
                 timestamp=timestamp(utime),
                 frame_id=self._frame.frame_id,
-                pose=_NO_POSE,
+                pose=NO_POSE,
                 point_stride=_POINT.itemsize,
                 fields=_POINT_FIELDS,
                 data=frame[visible].tobytes(),
@@ -320,94 +297,7 @@ class FoxgloveSource:
     def _find_labels(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
         return describe(component, self._parameters, num_items).labels
 
-    # Force plates ---------------------------------------------------------------------------
-
-    def _placed_outlines(self, utime: int) -> FoxgloveMessage:
-        """Return the outlines and labels of the plates, in place of all earlier ones."""
-        time = timestamp(utime)
-        entities = []
-        for plate in filter(None, self._plates):
-            outline = LinePrimitive(
-                type=LinePrimitiveLineType.LineLoop,
-                pose=_NO_POSE,
-                thickness=_LINE_M,
-                points=[Point3(x=x, y=y, z=z) for x, y, z in self._placed(plate.corners)],
-                color=_PLATE_COLOR,
-            )
-            [[x, y, z]] = self._placed([plate.centre])
-            label = TextPrimitive(
-                pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
-                billboard=True,
-                font_size=_TEXT_M,
-                color=_PLATE_COLOR,
-                text=plate.label,
-            )
-            entities.append(
-                SceneEntity(
-                    timestamp=time,
-                    frame_id=self._frame.frame_id,
-                    id=plate.label,
-                    lines=[outline],
-                    texts=[label],
-                )
-            )
-        deletion = SceneEntityDeletion(timestamp=time, type=SceneEntityDeletionType.All)
-        update = SceneUpdate(deletions=[deletion], entities=entities)
-        return FoxgloveMessage(self._outlines, utime, update.encode())
-
-    def _force_arrows(self, items: Items, utime: int) -> FoxgloveMessage:
-        """Return an arrow from each centre of pressure; ``items`` are those of the Force component."""
-        time = timestamp(utime)
-        entities = [
-            # An entity without an arrow removes the one before.
-            SceneEntity(
-                timestamp=time,
-                frame_id=self._frame.frame_id,
-                id=plate.label,
-                lifetime=_LIFETIME,
-                arrows=self._arrow(plate, load),
-            )
-            for plate, load in zip(self._plates, items.tolist(), strict=False)
-            if plate is not None
-        ]
-        return FoxgloveMessage(self._arrows, utime, SceneUpdate(entities=entities).encode())
-
-    def _arrow(self, plate: PlacedPlate, load: tuple[float, ...]) -> list[ArrowPrimitive]:
-        """Return the arrow of a load; [] if it is too small or not known."""
-        found = force_on(plate, load)
-        if found is None:
-            return []
-        [[x, y, z]] = self._placed([found.position])
-        [[fx, fy, fz]] = self._plate_frame.vectors(np.array([found.force])).tolist()
-        force = math.hypot(fx, fy, fz)
-        length = force * METRES_PER_NEWTON
-        head = min(_HEAD_M, length / 2)
-        direction = _from_x_axis(fx / force, fy / force, fz / force)
-        return [
-            ArrowPrimitive(
-                pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=direction),
-                shaft_length=length - head,
-                shaft_diameter=_SHAFT_M,
-                head_length=head,
-                head_diameter=_HEAD_M,
-                color=_ARROW_COLOR,
-            )
-        ]
-
-    def _placed(self, points: Sequence[Sequence[float]]) -> list[list[float]]:
-        moved: list[list[float]] = self._plate_frame.points(np.array(points)).tolist()
-        return moved
-
 
 def _floats(items: Items) -> Items:
     """Return the values of items, shape (…, values), as they are in memory."""
     return items.view(items.dtype[0]) if items.dtype.names else items
-
-
-def _from_x_axis(x: float, y: float, z: float) -> Quaternion:
-    """Return the shortest rotation from the x-axis to a direction of length 1."""
-    w = 1.0 + x
-    if w < 1e-9:
-        return Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
-    length = math.sqrt(w * w + y * y + z * z)
-    return Quaternion(x=0.0, y=-z / length, z=y / length, w=w / length)

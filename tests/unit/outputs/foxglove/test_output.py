@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.foxglove_schemas import messages, topics
+from gateway.foxglove_schemas import messages, plates, topics
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.server import FoxgloveServer
@@ -201,7 +201,7 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
         (topics.ProtobufRecord, "encode"),
         (topics.CdrRecord, "encode"),
         (messages.FoxgloveSource, "_log"),
-        (messages.FoxgloveSource, "_force_arrows"),
+        (plates.PlateScene, "arrows"),
     ):
         original = getattr(owner, name)
 
@@ -222,7 +222,7 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
         await lab.wait_until_wanted()
         lab.publish(everything)
         await viewer.wait_for("/lab/events")
-        assert sorted(converted) == ["_force_arrows", "_log", "encode"]
+        assert sorted(converted) == ["_log", "arrows", "encode"]
 
 
 async def test_viewers_have_their_own_subscriptions_and_speak_one_of_two_protocols() -> None:
