@@ -35,7 +35,7 @@ from gateway.takes.export.measurements import (
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import Take, TakeSource
 
@@ -157,7 +157,8 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
     for start in range(0, grid.num_rows, size):
         stop = min(start + size, grid.num_rows)
         values = (placed.block(start, stop).reshape(-1, *factors.shape) * factors).reshape(stop - start, -1)
-        file.write(encode_rows(values, NOT_AVAILABLE.encode(), b"\n"))
+        rows = number_rows(rounded(values), NOT_AVAILABLE.encode(), b"\t")
+        file.write(b"\n".join([*rows, b""]))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
     note_missing(job, path, measurement, 0, grid.num_rows)
     channels = _channels(job, measurement, conversions)

@@ -35,7 +35,7 @@ from gateway.takes.export.measurements import (
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.export.opensim_labels import opensim_labels
 from gateway.takes.export.plates import PlatePlan, plan_plates
 from gateway.takes.export.trc import write_trc
@@ -225,7 +225,7 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
                 for reactions, sign in zip(found, signs, strict=True)
                 for vector in (sign * reactions.forces, reactions.positions, sign * reactions.free_moments)
             ]
-            yield times[is_known], np.concatenate(vectors, axis=1)[is_known]
+            yield times[is_known], rounded(np.concatenate(vectors, axis=1)[is_known])
 
     names = [f"{name}{axis}" for plan in loads.plans for name in _identifiers(plan) for axis in "xyz"]
     _write_table(job, path, loads.samples, names, "", blocks())
@@ -308,8 +308,8 @@ def _write_table(
     num_rows, num_expected = 0, samples.placed.last_row - samples.placed.first_row + 1
     num_done = 0
     for times, values in blocks:
-        heads = [b"%.6f" % time_s for time_s in times.tolist()]
-        file.write(encode_rows(values, b"nan", b"\n", heads))
+        rows = zip(times.tolist(), number_rows(values, b"nan", b"\t"), strict=True)
+        file.write(b"".join(b"%.6f\t%b\n" % row for row in rows))
         num_rows += len(times)
         num_done = min(num_done + _BLOCK_ROWS, num_expected)
         job.progress(f"writing {path.name}", num_done, num_expected)
