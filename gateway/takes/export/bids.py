@@ -21,6 +21,7 @@ from gateway.takes.export.bids_data_set import (
     DataSet,
     add_rows,
     bids_label,
+    note_label,
     open_data_set,
     write_json,
     write_table,
@@ -31,6 +32,7 @@ from gateway.takes.export.measurements import (
     Measurement,
     event_seconds,
     measurements_by_component,
+    note_grid,
     note_missing,
     seconds_of_row,
     utc_text,
@@ -118,6 +120,8 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
     analog channels go on, a new run begins that has no analog channels.
     """
     names = fitting_labels([*take.sources], bids_label, _MAX_NAME_BYTES, "source")
+    for source, name in zip(take.sources, names, strict=True):
+        note_label(job, "source", source, bids_label(name))
     found = [
         _Recording(
             bids_label(name) + _LABELS[measurement.base.key], measurement, seconds_of_row(measurement, 0)
@@ -160,6 +164,7 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
         rows = number_rows(rounded(values), NOT_AVAILABLE.encode(), b"\t")
         file.write(b"\n".join([*rows, b""]))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
+    note_grid(job, measurement)
     note_missing(job, path, measurement, 0, grid.num_rows)
     channels = _channels(job, measurement, conversions)
     write_table(job, data_set.path(recording.label, run, "channels.tsv"), _Channel._fields, channels)

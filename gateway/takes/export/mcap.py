@@ -19,13 +19,13 @@ from gateway.errors import ProtocolError, TakeError
 from gateway.foxglove_schemas.messages import FoxgloveSource
 from gateway.foxglove_schemas.topics import MAX_FIELDS, MAX_UTIME, FloatTopics, FoxgloveMessage, Topic
 from gateway.messages.decode import decode
-from gateway.messages.encode import ITEMS_OFFSET
+from gateway.messages.encode import ITEMS_OFFSET, metres_per_unit
 from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters, differ_in_statistics_only
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.files.take import TakeSource
+from gateway.takes.files.take import Take, TakeSource
 
 _MAX_CHANNELS: Final = 1000
 """More can only come from labels that change all the time."""
@@ -49,6 +49,7 @@ def export_mcap(job: ExportJob) -> None:
     """Write the sources of a take to one file, each with topics of its own, and all their parameters."""
     take = job.open_take(components=())
     job.note_malformed(take)
+    note_metres(job, take)
     sources = {name: _SourceExport(source) for name, source in take.sources.items()}
     reader = TakeReader(job.take)
     total = sum(log.path.stat().st_size for log in reader.logs)
@@ -64,6 +65,7 @@ def export_mcap(job: ExportJob) -> None:
                 sources[name].attach_parameters(message, file)
             elif name in sources and key in COMPONENTS_BY_KEY and first <= utime < stop:
                 sources[name].write(key, message, file)
+        job.progress(f"writing {job.out.name}", total, total)
         for source in take.sources.values():
             file.write_metadata(source)
     if not file.num_messages:
@@ -73,6 +75,14 @@ def export_mcap(job: ExportJob) -> None:
             job.note(f"{what} of {name} left out", amount=count)
         for problem in exported.lacking:
             job.note(f"{name}: {problem}")
+
+
+def note_metres(job: ExportJob, take: Take) -> None:
+    """Report that positions are converted to m."""
+    for source in take.sources.values():
+        for unit in {entry.parameters.length_unit for entry in source.parameters}:
+            if metres_per_unit(unit) not in {None, 1.0}:
+                job.note(f"positions converted from {unit} to m")
 
 
 class _SourceExport:

@@ -45,7 +45,7 @@ from gateway.messages.ros2_names import (
 )
 from gateway.messages.topics import unique_name
 from gateway.takes.export.job import ExportJob, nothing_to_export
-from gateway.takes.export.mcap import McapFile
+from gateway.takes.export.mcap import McapFile, note_metres
 from gateway.takes.export.tables import parts_of
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series
@@ -56,6 +56,7 @@ _PROFILE: Final = "ros2"
 def export_rosbag(job: ExportJob) -> None:
     """Write the sources of a take to one bag, with the topics of the output ``ros2``."""
     take = job.open_take(components=())
+    note_metres(job, take)
     sources: dict[str, _SourceTopics] = {}
     with McapFile(job.files.create(job.out), profile=_PROFILE) as file:
         for name, key, series in parts_of(job, take):
@@ -75,6 +76,8 @@ def export_rosbag(job: ExportJob) -> None:
     for name, source in sources.items():
         for what, count in source.left_out.items():
             job.note(f"{what} of {name} left out", job.out.name, count)
+        if source.converts_loads:
+            job.note("forces and moments converted to N and N.m")
 
 
 class _SourceTopics:
@@ -85,6 +88,8 @@ class _SourceTopics:
         """The part of its topics that stands for the source."""
         self.left_out: Counter[str] = Counter()
         """How many messages or items were left out, by what they are."""
+        self.converts_loads = False
+        """Whether forces or moments did not have the units N and Nm."""
         self._source = source
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
         self._stamped = StampedEncoder(source)
@@ -146,6 +151,8 @@ class _SourceTopics:
             newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
             loads = run.values[rows, index] * np.array([newtons] * 3 + [newton_metres] * 3)
             is_known = ~np.isnan(loads).any(axis=1)
+            self._count("forces with NaN", ~is_known)
+            self.converts_loads |= (newtons, newton_metres) != (1.0, 1.0)
             utimes = run.capture_utime[rows][is_known]
             encoded = self._stamped.encode_rows(ros_stamps(utimes), loads[is_known])
             yield from self._logged(wrench_topic(plate_name(index + 1)), WRENCH_STAMPED, utimes, encoded)

@@ -246,13 +246,15 @@ class TakeReader:
             if is_news or num_bytes >= _BATCH_BYTES or num_messages >= _BATCH_MESSAGES:
                 if is_news:
                     newest[batch.source] = message[VERSION_OFFSET:]
-                self.read_bytes += num_bytes + num_messages * _EVENT_BYTES
+                read_bytes = self.read_bytes + num_bytes + num_messages * _EVENT_BYTES
+                self.read_bytes = min(read_bytes, self.num_bytes)  # a channel's name can be shorter
                 yield [filled for filled in batches.values() if filled is not None and filled.messages]
                 num_bytes = num_messages = 0
                 batch = MessageBatch(batch.source, batch.key)
                 batches = {identity: batch}
             batch.utimes.append(utime)
             batch.messages.append(message)
+        self.read_bytes = self.num_bytes
         yield [filled for filled in batches.values() if filled is not None and filled.messages]
         self._check_is_take()
 

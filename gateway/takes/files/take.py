@@ -163,6 +163,8 @@ def open_take(
         take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
         take.unknown = dict(reader.unknown)
         takes.append(take)
+    if progress is not None:  # what comes after ``to_s`` is not read
+        progress(total, total)
     missing = set(sources or ()).difference(*(take.sources for take in takes))
     if missing:
         known = dict.fromkeys(name for reader in readers for name in reader.source_names)

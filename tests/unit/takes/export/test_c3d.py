@@ -44,6 +44,7 @@ from tests.unit.takes.export.exported import (
     C3d,
     export_c3d,
     labelled,
+    notes_of,
     read_independently,
     samples,
     scene,
@@ -62,7 +63,7 @@ def test_a_recorded_c3d_file_is_exported_as_it_was(tmp_path: Path, name: str, nu
     take = record_scene(tmp_path / "take.lcmlog", C3dScene(original_path), num_frames)
     job = ExportJob(take, copy_path)
     assert export_take(job) == [copy_path]
-    assert job.notes == []
+    assert notes_of(job) == []
     original, copy = C3d(original_path), C3d(copy_path)
     for group, names in {
         "POINT": ("LABELS", "DESCRIPTIONS", "RATE", "FRAMES", "USED"),
@@ -245,7 +246,7 @@ CALIBRATION = np.diag([100.0, 100, 200, 5000, 5000, 4000]) + 0.3
 
 def test_plates_without_channels_of_their_own_get_six_each(tmp_path: Path) -> None:
     found, notes = export_c3d(tmp_path, scene(150))
-    assert notes == []
+    assert notes == ["out.c3d | forces became analog channels, six of each plate | 2"]
     names = [f"{name}{plate}" for plate in (1, 2) for name in ("Fx", "Fy", "Fz", "Mx", "My", "Mz")]
     assert found("ANALOG", "LABELS")[3:] == names
     assert found("ANALOG", "UNITS")[3:9] == ["N"] * 3 + ["Nmm"] * 3

@@ -64,7 +64,7 @@ NO_TOOL = (MISSING,) * 8
 
 def export(folder: Path, messages: Iterable[Message], **options: Any) -> McapContent:
     job = export_messages(folder, messages, "walk.mcap", **options)
-    assert job.notes == []
+    assert notes_of(job) == []
     return read_mcap(folder / "walk.mcap")
 
 
