@@ -34,7 +34,7 @@ class Format(NamedTuple):
 
 
 _RELIABILITIES: Final = "reliabilities of markers"
-_PARAMETERS: Final = "parameters but labels and units"
+_PARAMETERS: Final = "parameters except labels and units"
 _FOR_VIEWERS: Final = ("errors of tools", "frame numbers", "server's time stamps")
 
 FORMATS: Final = {
@@ -229,8 +229,7 @@ class ExportJob:
                 left_out += [name for name, text in source.details._asdict().items() if text]
             left_out += chosen.lacks
             if left_out:
-                what = f"left out of {source.name}, because {_format_name(self)} has no place for this"
-                self.note(f"{what}: {', '.join(left_out)}")
+                self.note(f"left out of {source.name}: {', '.join(left_out)}")
 
     def utimes(self, take: "Take") -> tuple[float, float]:
         """Return from when on, and before when, the events are to be exported, in µs since 1970."""

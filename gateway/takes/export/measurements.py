@@ -316,7 +316,7 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
 def note_grid(job: ExportJob, measurement: Measurement) -> None:
     """Report that frames have the times of a grid."""
     job.note(
-        "times are those of a regular grid; times of capture and frame numbers left out",
+        "times of capture and frame numbers replaced by a regular grid",
         amount=f"{measurement.grid.rate_hz:.6g} Hz",
     )
 

@@ -65,8 +65,7 @@ def test_who_and_what_the_take_is_about_can_be_replaced(tmp_path: Path) -> None:
     done = run_in_process(
         "export", WALK, tmp_path / "a.csv", "--subject", "S1", "--session", "", "--note", " x "
     )
-    what = "subject, note, parameters but labels and units"
-    assert done.stderr == f"\tleft out of lab, because .csv has no place for this: {what}\t\n"
+    assert done.stderr == "\tleft out of lab: subject, note, parameters except labels and units\t\n"
     done = run_in_process("export", WALK, tmp_path / "a.c3d", "--subject", "S" * 65)
     assert done.returncode == 2
     assert "up to 64 characters" in done.stderr

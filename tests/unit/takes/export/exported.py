@@ -83,7 +83,7 @@ def export_c3d(folder: Path, messages: Iterable[Message], **options: Any) -> tup
 
 USUAL_NOTES = (
     "left out of ",
-    "times are those of a regular grid; ",
+    "times of capture and frame numbers replaced by a regular grid",
     "positions converted from ",
     "residuals rounded to 127 steps",
 )

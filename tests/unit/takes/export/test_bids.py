@@ -314,6 +314,12 @@ def test_sources_with_different_subjects_need_a_choice(tmp_path: Path) -> None:
     assert (tmp_path / "study/sub-b").is_dir()
 
 
+def test_a_source_whose_name_bids_cannot_have_is_reported(tmp_path: Path) -> None:
+    job = export(tmp_path, [description("lab-2"), markers(1, source="lab-2")])
+    assert runs_of(tmp_path) == {("lab2Markers", "1")}
+    assert "the source 'lab-2' is called 'lab2': BIDS has letters and digits only" in notes_of(job)
+
+
 def test_a_data_set_grows_and_keeps_what_others_wrote(tmp_path: Path) -> None:
     study = tmp_path / "study"
     export(tmp_path, [markers(1)])
