@@ -15,14 +15,9 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.files.joined import join_series
+from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory
 from gateway.takes.files.reader import MessageBatch, TakeReader
-from gateway.takes.files.series import (
-    MAX_GAP_S,
-    ParametersEntry,
-    ParametersHistory,
-    Series,
-    SeriesBuilder,
-)
+from gateway.takes.files.series import MAX_GAP_S, Series, SeriesBuilder
 
 
 @dataclass
