@@ -216,6 +216,7 @@ class ExportJob:
                     f"no parameters of {source.name} in the take: labels, units and rates are not known"
                 )
         if components is None:
+            self.progress(f"arranging the frames of {self.take.name}", 0, 0)
             self.note_malformed(take)
         self._note_left_out(take)
         return take

@@ -73,15 +73,16 @@ def export_mcap(job: ExportJob) -> None:
     for name, exported in sources.items():
         for what, count in exported.left_out.items():
             job.note(f"{what} of {name} left out", amount=count)
-        for problem in exported.lacking:
-            job.note(f"{name}: {problem}")
+        for what in exported.remarks:
+            job.note(what)
 
 
 def note_metres(job: ExportJob, take: Take) -> None:
     """Report that positions are converted to m."""
     for source in take.sources.values():
-        for unit in {entry.parameters.length_unit for entry in source.parameters}:
-            if metres_per_unit(unit) not in {None, 1.0}:
+        for _, _, parameters in source.parameters:
+            unit = parameters.length_unit
+            if (parameters.markers or parameters.tools) and metres_per_unit(unit) not in {None, 1.0}:
                 job.note(f"positions converted from {unit} to m")
 
 
@@ -91,8 +92,8 @@ class _SourceExport:
     def __init__(self, source: TakeSource) -> None:
         self.left_out: Counter[str] = Counter()
         """How many messages were left out, by what they are."""
-        self.lacking: dict[str, None] = {}
-        """Sentences about what the parameters lack."""
+        self.remarks: dict[str, None] = {}
+        """What was changed, and what the parameters lack."""
         self._name = source.name
         self._entries = source.parameters
         self._by_version: dict[int, list[int]] = {}  # indices of parameters, in the order of their times
@@ -153,7 +154,9 @@ class _SourceExport:
                 self._converters.clear()
             found = self._converters[index] = FoxgloveSource(self._topics, parameters, version)
             if found.problem:
-                self.lacking[found.problem] = None
+                self.remarks[f"{self._name}: {found.problem}"] = None
+            for key in found.changed_names:
+                self.remarks[f"labels of {key} changed to names of fields"] = None
             for message in found.describe(capture_utime):
                 file.write(message)
         return found

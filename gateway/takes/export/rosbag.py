@@ -76,8 +76,8 @@ def export_rosbag(job: ExportJob) -> None:
     for name, source in sources.items():
         for what, count in source.left_out.items():
             job.note(f"{what} of {name} left out", job.out.name, count)
-        if source.converts_loads:
-            job.note("forces and moments converted to N and N.m")
+        for what in source.changed:
+            job.note(what)
 
 
 class _SourceTopics:
@@ -88,8 +88,8 @@ class _SourceTopics:
         """The part of its topics that stands for the source."""
         self.left_out: Counter[str] = Counter()
         """How many messages or items were left out, by what they are."""
-        self.converts_loads = False
-        """Whether forces or moments did not have the units N and Nm."""
+        self.changed: dict[str, None] = {}
+        """What was changed."""
         self._source = source
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
         self._stamped = StampedEncoder(source)
@@ -131,6 +131,8 @@ class _SourceTopics:
             self._count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
             return
         tools = unique_ros_names(run.labels, "tool")
+        if [*tools] != [*run.labels]:
+            self.changed["labels of tools changed to names of topics"] = None
         names = [TransformNames(self._source, f"{self._source}/{tool}") for tool in tools]
         topics = [self._topic(f"{self._base}/{pose_topic(tool)}", POSE_STAMPED) for tool in tools]
         tf = self._topic(TF, TF_MESSAGE)
@@ -152,7 +154,8 @@ class _SourceTopics:
             loads = run.values[rows, index] * np.array([newtons] * 3 + [newton_metres] * 3)
             is_known = ~np.isnan(loads).any(axis=1)
             self._count("forces with NaN", ~is_known)
-            self.converts_loads |= (newtons, newton_metres) != (1.0, 1.0)
+            if (newtons, newton_metres) != (1.0, 1.0):
+                self.changed["forces and moments converted to N and N.m"] = None
             utimes = run.capture_utime[rows][is_known]
             encoded = self._stamped.encode_rows(ros_stamps(utimes), loads[is_known])
             yield from self._logged(wrench_topic(plate_name(index + 1)), WRENCH_STAMPED, utimes, encoded)

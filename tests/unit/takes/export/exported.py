@@ -85,6 +85,9 @@ USUAL_NOTES = (
     "left out of ",
     "times of capture and frame numbers replaced by a regular grid",
     "positions converted from ",
+    "labels of tools changed to names of topics",
+    "labels of analog changed to names of fields",
+    "labels of force changed to names of fields",
     "residuals rounded to 127 steps",
 )
 """How those notes begin that most exports of a format have."""
