@@ -18,6 +18,7 @@ from tests.support.takes import (
     Message,
     description,
     details,
+    markers,
     parameters,
     scene_messages,
     write_take,
@@ -162,6 +163,8 @@ def stages(calls: Iterable[Call]) -> list[tuple[str, list[Call]]]:
 def test_progress_grows_up_to_the_end_of_each_step(tmp_path: Path, name: str) -> None:
     scene = scene_of(100)
     messages = [parameters(scene.parameters), details("Grace"), *scene_messages(scene, 600)]
+    # These are after ``to_s``, and are not read.
+    messages += [parameters(scene.parameters, 2, utime=START_UTIME + 20_000_000), markers(2, 2000, version=2)]
     calls: list[Call] = []
     take = write_take(tmp_path / "take.lcmlog", messages)
     job = job_for(name, take, tmp_path / "out", progress=lambda *call: calls.append(call), to_s=5.0)
