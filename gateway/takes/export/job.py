@@ -184,7 +184,7 @@ class ExportJob:
             self.notes.append(note)
 
     def open_take(self, components: Collection[str] | None = None) -> "Take":
-        """Return the chosen part of the take, and report what could not be read. Raises TakeError.
+        """Return the chosen part of the take, and report what could not be read or has no place.
 
         ``components`` are the keys of those to load; None means all.
         """
