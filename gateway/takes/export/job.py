@@ -186,7 +186,7 @@ class ExportJob:
     def open_take(self, components: Collection[str] | None = None) -> "Take":
         """Return the chosen part of the take, and report what could not be read or has no place.
 
-        ``components`` are the keys of those to load; None means all.
+        ``components`` are the keys of those to load; None means all. Raises TakeError.
         """
         from gateway.takes.files.take import open_take  # noqa: PLC0415 - see above
 

@@ -159,15 +159,18 @@ def stages(calls: Iterable[Call]) -> list[tuple[str, list[Call]]]:
     return [(what, list(found)) for what, found in groupby(calls, lambda call: call[0])]
 
 
+@pytest.fixture(scope="module")
+def long_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a take that is written in several blocks, with messages after 20 s that are not read."""
+    messages = [parameters(LEFT.parameters), details("Grace"), *scene_messages(LEFT, 600)]
+    messages += [parameters(LEFT.parameters, 2, utime=START_UTIME + 20_000_000), markers(2, 2000, version=2)]
+    return write_take(tmp_path_factory.mktemp("long") / "take.lcmlog", messages)
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_progress_grows_up_to_the_end_of_each_step(tmp_path: Path, name: str) -> None:
-    scene = scene_of(100)
-    messages = [parameters(scene.parameters), details("Grace"), *scene_messages(scene, 600)]
-    # These are after ``to_s``, and are not read.
-    messages += [parameters(scene.parameters, 2, utime=START_UTIME + 20_000_000), markers(2, 2000, version=2)]
+def test_progress_grows_up_to_the_end_of_each_step(long_take: Path, tmp_path: Path, name: str) -> None:
     calls: list[Call] = []
-    take = write_take(tmp_path / "take.lcmlog", messages)
-    job = job_for(name, take, tmp_path / "out", progress=lambda *call: calls.append(call), to_s=5.0)
+    job = job_for(name, long_take, tmp_path, progress=lambda *call: calls.append(call), to_s=5.5)
     export_take(job)
     steps = stages(calls)
     names = [what for what, _ in steps]
