@@ -330,6 +330,12 @@ class DetailsOptions:
     session: Annotated[str | None, typer.Option(help="The session of the subject, such as baseline.")] = None
     note: Annotated[str | None, typer.Option(help="Anything else that belongs to the recording.")] = None
 
+    def given(self) -> dict[str, str]:
+        """Return the details whose options are given, by name; "" takes one away. Raises BadParameter."""
+        return {
+            name: text for name, text in self.checked()._asdict().items() if getattr(self, name) is not None
+        }
+
     def checked(self) -> "TakeDetails":
         """Return the details. Raises BadParameter."""
         from gateway.takes.files.description import TakeDetails

@@ -217,6 +217,7 @@ def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], 
         raise typer.Exit(1)
 
 
+@options.with_options
 def export(
     file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
     out: Annotated[
@@ -230,6 +231,7 @@ def export(
     source: options.SourceOption = None,
     from_s: options.FromOption = None,
     to_s: options.ToOption = None,
+    details: options.DetailsOptions,
     ros2: Annotated[bool, typer.Option("--ros2", help="Write a bag of ROS 2 (.mcap).")] = False,
     opensim: Annotated[
         bool,
@@ -261,19 +263,16 @@ def export(
     bids: Annotated[
         bool, typer.Option("--bids", help="Write to a Motion-BIDS data set; OUT is its folder, new or not.")
     ] = False,
-    subject: Annotated[
-        str | None, typer.Option(help="The subject in BIDS; the default is that of the take.")
-    ] = None,
-    session: Annotated[
-        str | None, typer.Option(help="The session in BIDS; the default is that of the take.")
-    ] = None,
     task: Annotated[str | None, typer.Option(help="The task in BIDS, such as walking.")] = None,
     run: Annotated[
         int | None, typer.Option(min=1, help="The number of the run in BIDS; the default is the next one.")
     ] = None,
     quiet: options.NoProgressOption = False,
 ) -> None:
-    """Convert a take to the files of other programs, such as C3D; never overwrite a file."""
+    """Convert a take to the files of other programs, such as C3D; never overwrite a file.
+
+    Subject, session and note are those of the take, unless options give others.
+    """
     from rich.console import Console
 
     from gateway.display.terminal import print_list
@@ -286,7 +285,7 @@ def export(
         raise typer.BadParameter(f"--{formats[0]} and --{formats[1]} are different formats; choose one")
     chosen_format = formats[0] if formats else ""
     kind = f"--{chosen_format}" if chosen_format else out.suffix.lower()
-    names = BidsNames(subject, session, task, run)
+    names = BidsNames(task, run)
     for option, value, kinds in (
         ("--up", up, (".trc", ".mot", "--opensim")),
         ("--forward", forward, (".trc", ".mot", "--opensim")),
@@ -304,6 +303,7 @@ def export(
         source=source,
         from_s=from_s,
         to_s=to_s,
+        details=details.given(),
         opensim=OpenSimOptions(up, forward, min_force, bodies_of_plates),
         bids=names,
     )

@@ -12,8 +12,9 @@ from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import HEAD, Array, Rows, decode_rows
+from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.row import Row
-from gateway.takes.files.series import ParametersEntry, Series, SeriesBuilder
+from gateway.takes.files.series import Series, SeriesBuilder
 
 
 class ClockDifference:

@@ -12,7 +12,7 @@ from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.takes.files.series import ParametersEntry, ParametersHistory
+from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory
 
 MAX_WAITING: Final = 40_000
 """How many messages of all sources may wait: 18 s of 200 frames of markers and 2000 of channels a second."""

@@ -10,8 +10,8 @@ In ``files``:
 - Reading: ``event_log`` reads events one after the other and goes on behind damage. ``reader`` adds what each
   of them is: the source, the component or kind of message.
 - Arrays: ``take`` and ``series`` decode a take into numpy arrays; ``component_rows`` does so for many
-  messages at once. ``joined`` makes one series of several, ``resampling`` changes the rate, and ``tables``
-  makes tables for pandas and xarray.
+  messages at once, and ``parameters_history`` says which parameters describe them. ``joined`` makes one
+  series of several, ``resampling`` changes the rate, and ``tables`` makes tables for pandas and xarray.
 - Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
   with what interrupts it.
 
@@ -22,7 +22,8 @@ In ``files``:
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gateway.takes.files.series import ParametersEntry, Series
+    from gateway.takes.files.parameters_history import ParametersEntry
+    from gateway.takes.files.series import Series
     from gateway.takes.files.take import Take, TakeSource, open_take
 
 __all__ = ["ParametersEntry", "Series", "Take", "TakeSource", "open_take"]

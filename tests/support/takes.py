@@ -22,6 +22,9 @@ from gateway.takes.files.event_log import SYNC
 
 START_UTIME = 1_700_000_000_000_000
 
+SERVER_START_US = 5_000_000
+"""The server's time of the first sample of a scene."""
+
 Message = tuple[str, bytes]
 """A channel and a message."""
 
@@ -110,10 +113,6 @@ def write_take(path: Path, messages: Iterable[Message]) -> Path:
     return path
 
 
-SERVER_START_US = 5_000_000
-"""The server's time of the first sample."""
-
-
 def scene_messages(
     scene: C3dScene | SyntheticScene,
     num_frames: int,
@@ -121,6 +120,7 @@ def scene_messages(
     source: str = "lab",
     session: int = 1,
     start_us: int = 0,
+    server_start_us: int = SERVER_START_US,
     sequence: int = 0,
     keep: Callable[[ComponentType, int], bool] = lambda _component, _sample: True,
 ) -> Iterator[Message]:
@@ -147,7 +147,7 @@ def scene_messages(
                 sequence + number,
                 utime=START_UTIME + time_us + 3000 + int(jitter.integers(400)),
                 session=session,
-                timestamp_us=SERVER_START_US + time_us,
+                timestamp_us=server_start_us + time_us,
                 frame_number=number + 1,
                 source=source,
             )

@@ -21,6 +21,7 @@ from gateway.takes.export.bids_data_set import (
     DataSet,
     add_rows,
     bids_label,
+    note_label,
     open_data_set,
     write_json,
     write_table,
@@ -31,11 +32,12 @@ from gateway.takes.export.measurements import (
     Measurement,
     event_seconds,
     measurements_by_component,
+    note_grid,
     note_missing,
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import Take, TakeSource
 
@@ -118,6 +120,8 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
     analog channels go on, a new run begins that has no analog channels.
     """
     names = fitting_labels([*take.sources], bids_label, _MAX_NAME_BYTES, "source")
+    for source, name in zip(take.sources, names, strict=True):
+        note_label(job, "source", source, bids_label(name))
     found = [
         _Recording(
             bids_label(name) + _LABELS[measurement.base.key], measurement, seconds_of_row(measurement, 0)
@@ -157,8 +161,10 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
     for start in range(0, grid.num_rows, size):
         stop = min(start + size, grid.num_rows)
         values = (placed.block(start, stop).reshape(-1, *factors.shape) * factors).reshape(stop - start, -1)
-        file.write(encode_rows(values, NOT_AVAILABLE.encode(), b"\n"))
+        rows = number_rows(rounded(values), NOT_AVAILABLE.encode(), b"\t")
+        file.write(b"\n".join([*rows, b""]))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
+    note_grid(job, measurement)
     note_missing(job, path, measurement, 0, grid.num_rows)
     channels = _channels(job, measurement, conversions)
     write_table(job, data_set.path(recording.label, run, "channels.tsv"), _Channel._fields, channels)

@@ -77,12 +77,11 @@ def open_data_set(job: ExportJob, take: Take) -> DataSet:
     No other export can write to it until the job ends. Raises TakeError.
     """
     details = [source.details for source in take.sources.values()]
-    names = job.bids
     data_set = DataSet(
         job.out,
-        subject=_label(job, "subject", names.subject, {each.subject for each in details}, is_required=True),
-        session=_label(job, "session", names.session, {each.session for each in details}),
-        task=_label(job, "task", names.task, set(), is_required=True),
+        subject=_label(job, "subject", {each.subject for each in details}, is_required=True),
+        session=_label(job, "session", {each.session for each in details}),
+        task=_label(job, "task", {job.bids.task or ""}, is_required=True),
     )
     if job.out.is_dir() and any(job.out.iterdir()) and not (job.out / _DESCRIPTION).exists():
         raise SelectionError(
@@ -100,15 +99,9 @@ def open_data_set(job: ExportJob, take: Take) -> DataSet:
     return data_set
 
 
-def _label(
-    job: ExportJob, name: str, chosen: str | None, recorded: set[str], *, is_required: bool = False
-) -> str:
-    """Return the label that was chosen, or else the one that the take has; "" if there is none."""
-    if chosen is not None:
-        if not chosen or bids_label(chosen) != chosen:
-            raise SelectionError(f"--{name} {chosen!r} is not possible: BIDS has letters and digits only")
-        return chosen
-    texts = recorded - {""}
+def _label(job: ExportJob, name: str, texts: set[str], *, is_required: bool = False) -> str:
+    """Return the only one of the texts as a label; "" if there is none. Raises SelectionError."""
+    texts = texts - {""}
     if len(texts) > 1:
         both = " and ".join(sorted(texts)[:2])
         raise SelectionError(f"the sources of {job.take} have different {name}s, {both}; choose by --{name}")
@@ -116,9 +109,14 @@ def _label(
     label = bids_label(text)
     if is_required and not label:
         raise SelectionError(f"{job.take} does not say the {name}, and BIDS needs it; add --{name}")
-    if label != text:
-        job.note(f"the {name} {text!r} is called {label!r}: BIDS has letters and digits only")
+    note_label(job, name, text, label)
     return label
+
+
+def note_label(job: ExportJob, what: str, text: str, label: str) -> None:
+    """Report that something is called by a label that is not its name, if so."""
+    if label != text:
+        job.note(f"the {what} {text!r} is called {label!r}: BIDS has letters and digits only")
 
 
 def _describe(job: ExportJob) -> None:

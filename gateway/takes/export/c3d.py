@@ -10,7 +10,7 @@ second of 55 markers and 69 analog channels), does not report a full disk, and c
 
 import struct
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -30,7 +30,6 @@ from gateway.takes.export.c3d_content import (
 )
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import (
-    Measurement,
     event_seconds,
     named_measurements,
     note_missing,
@@ -70,10 +69,15 @@ _BLOCK_VALUES: Final = 500_000  # values in memory at once: 2 MB
 
 def export_c3d(job: ExportJob) -> None:
     """Write each measurement of each source to a file of its own."""
+    belongs: dict[str, Array] = {}
     for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
-        _write(job, content_of(job, measurement), path)
-        if measurement.source.tools is not None:
-            job.note("tools (6D) left out", path.name)
+        content = content_of(job, measurement)
+        _write(job, content, path)
+        source = measurement.source.name
+        belongs[source] = belongs.get(source, False) | _is_near(content, _event_seconds(content))
+    for source, is_in_file in belongs.items():
+        if not is_in_file.all():
+            job.note(f"events of {source} far from all frames left out", amount=int((~is_in_file).sum()))
 
 
 def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
@@ -89,25 +93,28 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
             f"{path.name} would have {content.num_points} markers and {content.num_channels} analog "
             f"channels with {samples} samples in each frame, more than a C3D file can have; export to .csv"
         )
-    size = max(1, _BLOCK_VALUES // max(4 * content.num_points + content.num_channels * samples, 1))
-    blocks = [(start, min(start + size, content.num_frames)) for start in range(0, content.num_frames, size)]
     scale = 1.0
     if content.markers is not None:
-        job.progress(f"reading the residuals of {path.name}", 0, 0)
-        scale = residual_step(content.points(start, stop) for start, stop in blocks)
+        blocks = _blocks(job, content, f"reading the residuals of {path.name}")
+        scale, is_exact = residual_step(content.points(start, stop) for start, stop in blocks)
+        if not is_exact:
+            job.note("residuals rounded to 127 steps", path.name, f"{scale:.3g} {content.unit} each")
     file = job.files.create(path)
     file.write(_head(job, content, scale))
     incomplete_samples = 0
-    for start, stop in blocks:
+    for start, stop in _blocks(job, content, f"writing {path.name}"):
         points = encode_points(content.points(start, stop), scale).reshape(stop - start, -1)
         channels = content.channels(start, stop)
         incomplete_samples += int(np.isnan(channels).any(axis=1).sum())
         frames = np.concatenate([points, channels.reshape(stop - start, -1)], axis=1)
         file.write(frames.astype("<f4").tobytes())
-        job.progress(f"writing {path.name}", stop, content.num_frames)
     if content.num_frames <= _MAX_WORD:  # ezc3d reads longer files to their end
         file.write(bytes(-file.tell() % _BLOCK_BYTES))
     note_missing(job, path, content.measurement, content.first_row, content.num_frames)
+    if incomplete_samples:
+        job.note("analog samples missing in the take are NaN", path.name, incomplete_samples)
+    if content.added_plates:
+        job.note("forces became analog channels, six of each plate", path.name, len(content.added_plates))
     if content.start_s * content.rate_hz >= 1:
         utc = utc_text(content.measurement, content.start_s)
         job.note(
@@ -115,8 +122,16 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
             path.name,
             f"{content.start_s:.3f} s after the beginning",
         )
-    if incomplete_samples:
-        job.note("analog samples missing in the take are NaN", path.name, incomplete_samples)
+
+
+def _blocks(job: ExportJob, content: C3dContent, what: str) -> Iterator[tuple[int, int]]:
+    """Yield the beginnings and ends of parts of the frames; ``what`` is done with them."""
+    values_per_frame = 4 * content.num_points + content.num_channels * content.samples_per_frame
+    size = max(1, _BLOCK_VALUES // max(values_per_frame, 1))
+    for start in range(0, content.num_frames, size):
+        stop = min(start + size, content.num_frames)
+        yield start, stop
+        job.progress(what, stop, content.num_frames)
 
 
 _TEXT_SIZES: Final = (_MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
@@ -126,8 +141,17 @@ _TEXT_SIZES: Final = (_MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
 def _head(job: ExportJob, content: C3dContent, scale: float) -> bytes:
     """Return everything before the frames, with texts as long as there is room for. Raises TakeError."""
     for max_bytes in _TEXT_SIZES:
-        head = _encode_head(content, scale, _groups(job, content, scale, max_bytes))
+        groups = _groups(job, content, scale, max_bytes)
+        head = _encode_head(content, scale, groups)
         if head is not None:
+            lists = (values for group in groups.values() for values in group.values())
+            texts = (text for values in lists if isinstance(values, Sequence) for text in values)
+            num_cut = sum(_encode_text(text) != text.encode(errors="replace") for text in texts)
+            if num_cut:
+                job.note(
+                    "texts cut: a C3D file has short ones only",
+                    amount=f"{num_cut} to {_MAX_TEXT_BYTES} bytes",
+                )
             if max_bytes < _MAX_TEXT_BYTES:
                 job.note(
                     "descriptions left out and labels cut: a C3D file has no room for so many texts",
@@ -155,9 +179,6 @@ def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -
         "DATE_TIME": [utc_text(content.measurement, content.start_s)],
         "TIME_OFFSET": content.start_s,
     }
-    for text in (details.subject, details.session):
-        if _encode_text(text) != text.encode():
-            job.note(f"{text!r} cut: a C3D file has short texts only", amount=f"{_MAX_TEXT_BYTES} bytes")
     if details.session:
         groups["TRIAL"]["SESSION"] = [details.session]
     if details.note.strip():  # in lines as long as a parameter can have in any script
@@ -165,7 +186,7 @@ def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -
     if details.subject:
         groups["SUBJECTS"] = {"USED": 1, "USES_PREFIXES": 0, "NAMES": [printable(details.subject)]}
     groups["FORCE_PLATFORM"] = _plate_group(content.plates)
-    events = _event_group(job, content.measurement, content.first_row, content.num_frames)
+    events = _event_group(job, content)
     if events:
         groups["EVENT"] = events
     groups["MANUFACTURER"] = {"SOFTWARE": ["rtc3d-gateway"], "VERSION_LABEL": [version_text()]}
@@ -235,23 +256,36 @@ _SIDES: Final = {"Left", "Right"}
 _MARGIN_S: Final = 1.0
 """An event within this time before the first frame or after the last one belongs to the measurement."""
 
+_RESOLUTION_S: Final = 1e-6  # of time stamps
 
-def _event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> _Group:
-    """Return the group EVENT with the events of these rows; {} if there are none."""
-    events = measurement.source.events
-    if events is None:
-        return {}
-    rate_hz = measurement.grid.rate_hz
-    seconds = event_seconds(measurement) - first_row / rate_hz
-    (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
+
+def _event_seconds(content: C3dContent) -> Array:
+    """Return when the events of the source were, in s from the first frame."""
+    return event_seconds(content.measurement) - content.first_row / content.measurement.grid.rate_hz
+
+
+def _is_near(content: C3dContent, seconds: Array) -> Array:
+    """Return for each time whether it belongs to the frames."""
+    duration_s = content.num_frames / content.measurement.grid.rate_hz
+    return (seconds > -_MARGIN_S) & (seconds < duration_s + _MARGIN_S)
+
+
+def _event_group(job: ExportJob, content: C3dContent) -> _Group:
+    """Return the group EVENT with the events of the frames; {} if there are none."""
+    events = content.measurement.source.events
+    seconds = _event_seconds(content)
+    (chosen,) = np.nonzero(_is_near(content, seconds))
     chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
     if len(chosen) > MAX_LIST:
         left_out = len(chosen) - MAX_LIST
         job.note("events left out: a C3D file has at most 255", amount=f"{left_out} of {len(chosen)}")
         chosen = chosen[:MAX_LIST]
-    if not len(chosen):
+    if events is None or not len(chosen):
         return {}
-    subject = measurement.source.details.subject
+    num_early = int((seconds[chosen] < -_RESOLUTION_S).sum())
+    if num_early:
+        job.note("events before the first frame have its time", amount=num_early)
+    subject = content.measurement.source.details.subject
     texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
     return {
         "USED": len(chosen),

@@ -35,10 +35,11 @@ def encode_points(markers: Array, step: float) -> Array:
     return words
 
 
-def residual_step(blocks: Iterable[Array]) -> float:
-    """Return the step of residuals, in the unit of the points, for markers of shape (frames, markers, 4).
+def residual_step(blocks: Iterable[Array]) -> tuple[float, bool]:
+    """Return the step of residuals, in the unit of the points, and whether all are multiples of it.
 
-    A residual has 7 bits. The step is the smallest residual if all are multiples of it, and thus exact.
+    The blocks are markers of shape (frames, markers, 4). A residual has 7 bits. The step is the smallest
+    residual if all are multiples of it, and thus exact.
     """
     different: Array = np.empty(0, np.float32)
     is_exact = True
@@ -49,11 +50,11 @@ def residual_step(blocks: Iterable[Array]) -> float:
         if len(different) > _MAX_STEPS:
             different, is_exact = different[[0, -1]], False
     if not len(different):
-        return 1.0
+        return 1.0, True
     multiples = different.astype(np.float64) / different[0]  # a damaged one may be 1e-40
     is_exact = is_exact and multiples[-1] <= _MAX_STEPS + 0.5
     is_exact = is_exact and bool(np.allclose(multiples, np.round(multiples), rtol=1e-5))
-    return float(different[0] if is_exact else different[-1] / np.float32(_MAX_STEPS))
+    return float(different[0] if is_exact else different[-1] / np.float32(_MAX_STEPS)), is_exact
 
 
 _MAX_TRIMMED_S: Final = 1.0

@@ -4,7 +4,7 @@ The formats are imported when they are used: the command line lists them, and nu
 """
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -12,31 +12,66 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from gateway.config.words import join_or
 from gateway.errors import SelectionError, TakeError
+from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.takes.files.new_file import NewFiles
 
 if TYPE_CHECKING:
     from gateway.takes.files.take import Take
 
+
+class Format(NamedTuple):
+    """A format: the module and the function that write the files of a job, and what they keep of a take.
+
+    ``components`` are the keys of those that it has; ``keeps_details`` says whether it has the subject, the
+    session and the note. ``lacks`` is what else it never has, in words.
+    """
+
+    module: str
+    function: str
+    components: Collection[str] = COMPONENTS_BY_KEY.keys()
+    keeps_details: bool = True
+    lacks: tuple[str, ...] = ()
+
+
+_RELIABILITIES: Final = "reliabilities of markers"
+_PARAMETERS: Final = "parameters except labels and units"
+_FOR_VIEWERS: Final = ("errors of tools", "frame numbers", "server's time stamps")
+
 FORMATS: Final = {
-    ".c3d": ("c3d", "export_c3d"),
-    ".trc": ("trc", "export_trc"),
-    ".mot": ("opensim", "export_mot"),
-    ".sto": ("opensim", "export_sto"),
-    ".csv": ("csv_files", "export_csv"),
-    ".parquet": ("parquet", "export_parquet"),
-    ".mcap": ("mcap", "export_mcap"),
+    ".c3d": Format("c3d", "export_c3d", ("3d", "analog", "force", "event")),
+    ".trc": Format("trc", "export_trc", ("3d",), keeps_details=False, lacks=(_RELIABILITIES,)),
+    ".mot": Format("opensim", "export_mot", ("force",), keeps_details=False),
+    ".sto": Format("opensim", "export_sto", ("analog",), keeps_details=False),
+    ".csv": Format("csv_files", "export_csv", keeps_details=False, lacks=(_PARAMETERS,)),
+    ".parquet": Format("parquet", "export_parquet", lacks=(_PARAMETERS,)),
+    ".mcap": Format("mcap", "export_mcap", lacks=_FOR_VIEWERS),
 }
-"""The module and the function that write the files of a job, by the extension of its ``out``."""
+"""The formats by the extension of the new file."""
 
 CHOSEN_FORMATS: Final = {
-    "opensim": ("opensim", "export_opensim"),
-    "bids": ("bids", "export_bids"),
-    "ros2": ("rosbag", "export_rosbag"),
+    "opensim": Format(
+        "opensim",
+        "export_opensim",
+        ("3d", "analog", "force"),
+        keeps_details=False,
+        lacks=(_RELIABILITIES,),
+    ),
+    "bids": Format("bids", "export_bids"),
+    "ros2": Format("rosbag", "export_rosbag", ("3d", "6d", "analog", "force"), lacks=_FOR_VIEWERS),
 }
-"""The same for the formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
+"""The formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
 
 _EXTRAS: Final = {".mcap": ("foxglove-sdk", "foxglove"), ".parquet": ("pyarrow", "parquet")}
 """The package that files of an extension need, and the extra that installs it."""
+
+_NOUNS: Final = {
+    "3d": "markers",
+    "6d": "tools (6D)",
+    "analog": "analog channels",
+    "force": "forces",
+    "event": "events",
+}
+"""What the components are called in notes."""
 
 _MAX_NAMED: Final = 10
 
@@ -48,10 +83,10 @@ def export_take(job: "ExportJob") -> list[Path]:
         raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does")
     if not job.format and extension not in FORMATS:
         raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
-    module, function = CHOSEN_FORMATS[job.format] if job.format else FORMATS[extension]
+    chosen = job.chosen_format
     with job.files:
         try:
-            write = getattr(import_module(f"gateway.takes.export.{module}"), function)
+            write = getattr(import_module(f"gateway.takes.export.{chosen.module}"), chosen.function)
         except ImportError as error:
             if extension not in _EXTRAS:
                 raise
@@ -61,6 +96,7 @@ def export_take(job: "ExportJob") -> list[Path]:
                 f"install it: pip install 'rtc3d-gateway[{extra}]'"
             ) from error
         write(job)
+        job.progress(f"saving {job.out.name}", 0, 0)
     return job.files.paths
 
 
@@ -98,10 +134,11 @@ class OpenSimOptions:
 
 @dataclass(frozen=True)
 class BidsNames:
-    """What the files of a BIDS data set are called after; None is what the take says, or the next number."""
+    """What the files of a BIDS data set are called after, beside the subject and the session of the take.
 
-    subject: str | None = None
-    session: str | None = None
+    A data set needs a task; ``run`` is that of the first measurement, None the next number.
+    """
+
     task: str | None = None
     run: int | None = None
 
@@ -112,8 +149,9 @@ class ExportJob:
 
     ``format`` is a key of CHOSEN_FORMATS; "" means that the extension of ``out`` says the format.
     ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
-    the take. ``progress`` is called with what is being done, how much of it is done, and how much there is
-    (0: that is not known). ``notes`` say what was changed, rounded or left out.
+    the take. ``details`` replace those of the take, by name: subject, session, note. ``progress`` is called
+    with what is being done, how much of it is done, and how much there is (0: that is not known). ``notes``
+    say what was changed, rounded or left out.
     """
 
     take: Path
@@ -122,11 +160,17 @@ class ExportJob:
     source: str | None = None
     from_s: float | None = None
     to_s: float | None = None
+    details: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[str, int, int], None] = lambda *_: None
     notes: list[Note] = field(default_factory=list)
     opensim: OpenSimOptions = OpenSimOptions()
     bids: BidsNames = BidsNames()
     files: NewFiles = field(default_factory=NewFiles)
+
+    @property
+    def chosen_format(self) -> Format:
+        """The format of the files. Raises KeyError if the extension of ``out`` is none of FORMATS."""
+        return CHOSEN_FORMATS[self.format] if self.format else FORMATS[self.out.suffix.lower()]
 
     def note(self, what: str, file: str = "", amount: object = "") -> None:
         """Report what was changed, rounded or left out, and how much of it; the same is reported once.
@@ -138,9 +182,9 @@ class ExportJob:
             self.notes.append(note)
 
     def open_take(self, components: Collection[str] | None = None) -> "Take":
-        """Return the chosen part of the take, and report what could not be read. Raises TakeError.
+        """Return the chosen part of the take, and report what could not be read or has no place.
 
-        ``components`` are the keys of those to load; None means all.
+        ``components`` are the keys of those to load; None means all. Raises TakeError.
         """
         from gateway.takes.files.take import open_take  # noqa: PLC0415 - see above
 
@@ -164,13 +208,27 @@ class ExportJob:
                 amount=sum(take.unknown.values()),
             )
         for source in take.sources.values():
+            source.details = source.details._replace(**self.details)
             if not source.parameters:
                 self.note(
                     f"no parameters of {source.name} in the take: labels, units and rates are not known"
                 )
         if components is None:
+            self.progress(f"arranging the frames of {self.take.name}", 0, 0)
             self.note_malformed(take)
+        self._note_left_out(take)
         return take
+
+    def _note_left_out(self, take: "Take") -> None:
+        """Report what a take has and the format has no place for."""
+        chosen = self.chosen_format
+        for source in take.sources.values():
+            left_out = [_NOUNS[key] for key in source.series if key not in chosen.components]
+            if not chosen.keeps_details:
+                left_out += [name for name, text in source.details._asdict().items() if text]
+            left_out += chosen.lacks
+            if left_out:
+                self.note(f"left out of {source.name}: {', '.join(left_out)}")
 
     def utimes(self, take: "Take") -> tuple[float, float]:
         """Return from when on, and before when, the events are to be exported, in µs since 1970."""

@@ -46,7 +46,7 @@ class _FoxgloveExport(SourceExport):
         if component is ComponentType.FORCE:
             interval = max(1, round((run.measured_rate_hz or _ARROWS_HZ) / _ARROWS_HZ))
             if interval > 1:
-                self.notes[f"arrows of forces are drawn for one of {interval} frames"] = None
+                self.notes[f"arrows of forces drawn for one of {interval} frames only"] = None
         entries = run.content.entries[rows]
         for part in np.split(rows, np.flatnonzero(np.diff(entries)) + 1):
             utimes = run.capture_utime[part].tolist()
@@ -65,5 +65,7 @@ class _FoxgloveExport(SourceExport):
             self._converters.clear()
         converter = self._converters[index] = FoxgloveSource(self._topics, parameters, version)
         if converter.problem:
-            self.notes[converter.problem] = None
+            self.notes[f"{self._topics.source}: {converter.problem}"] = None
+        for key in converter.changed_names:
+            self.notes[f"labels of {key} changed to names of fields"] = None
         return converter

@@ -17,6 +17,7 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
 from gateway.errors import TakeError
 from gateway.foxglove_schemas.topics import MAX_UTIME, Topic, TopicMessages
+from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import differ_in_statistics_only
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.tables import parts_of
@@ -66,6 +67,7 @@ def export_to_mcap(
     ``content`` says what the format can hold, for a take that has nothing of it.
     """
     take = job.open_take(components=())
+    _note_metres(job, take)
     exports: dict[str, SourceExport] = {}
     with McapFile(job.files.create(job.out), profile) as file:
         for name, key, series in parts_of(job, take):
@@ -81,13 +83,22 @@ def export_to_mcap(
     _report(job, take, exports)
 
 
+def _note_metres(job: ExportJob, take: Take) -> None:
+    """Report that positions are converted to m."""
+    for source in take.sources.values():
+        for entry in source.parameters:
+            unit, parameters = entry.parameters.length_unit, entry.parameters
+            if (parameters.markers or parameters.tools) and metres_per_unit(unit) not in {None, 1.0}:
+                job.note(f"positions converted from {unit} to m")
+
+
 def _report(job: ExportJob, take: Take, exports: dict[str, SourceExport]) -> None:
     job.note_malformed(take)
     for name, export in exports.items():
         for what, count in export.left_out.items():
             job.note(f"{what} of {name} left out", amount=count)
         for note in export.notes:
-            job.note(f"{name}: {note}")
+            job.note(note)
 
 
 class McapFile:

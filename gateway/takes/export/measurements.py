@@ -307,9 +307,18 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     named = []
     for name, found in by_source.items():
         for number, measurement in enumerate(found, start=1):
+            note_grid(job, measurement)
             parts = (name if len(by_source) > 1 else "", str(number) if len(found) > 1 else "")
             named.append((measurement, job.file_name(*parts)))
     return named
+
+
+def note_grid(job: ExportJob, measurement: Measurement) -> None:
+    """Report that frames have the times of a grid."""
+    job.note(
+        "times of capture and frame numbers replaced by a regular grid",
+        amount=f"{measurement.grid.rate_hz:.6g} Hz",
+    )
 
 
 def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iterator[list[Measurement]]:

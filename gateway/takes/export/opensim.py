@@ -5,8 +5,9 @@ person. They come from what readers of C3D would compute for the same take: see 
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -35,7 +36,7 @@ from gateway.takes.export.measurements import (
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.export.opensim_labels import opensim_labels
 from gateway.takes.export.plates import PlatePlan, plan_plates
 from gateway.takes.export.trc import write_trc
@@ -73,7 +74,7 @@ def export_opensim(job: ExportJob) -> None:
         for key, samples in (("analog", analog), ("force", forces)):
             written[measurement.source.name, key] += 0 if samples is None else samples.num_placed
     for source in {measurement.source.name: measurement.source for measurement, _ in found}.values():
-        _note_left_out(job, source, written)
+        _note_samples_left_out(job, source, written)
 
 
 def export_mot(job: ExportJob) -> None:
@@ -97,11 +98,7 @@ def export_sto(job: ExportJob) -> None:
             _write_sto(job, path, analog)
 
 
-def _note_left_out(job: ExportJob, source: TakeSource, written: Counter[tuple[str, str]]) -> None:
-    if source.tools is not None:
-        job.note(f"tools (6D) of {source.name} left out", amount=len(source.tools))
-    if source.events is not None:
-        job.note(f"events of {source.name} left out; .c3d has them", amount=len(source.events))
+def _note_samples_left_out(job: ExportJob, source: TakeSource, written: Counter[tuple[str, str]]) -> None:
     for key in ("analog", "force"):
         count = written[source.name, key]
         total = len(source.series[key].without_empty_frames()) if key in source.series else 0
@@ -138,14 +135,18 @@ class _Samples(NamedTuple):
         """The number of samples that were recorded."""
         return sum(len(part.rows) for part in self.placed.parts)
 
-    def blocks(self) -> Iterator[tuple[int, int, Array]]:
-        """Yield the first row and the end of parts of the samples, and their times in s."""
+    def blocks(self, progress: Callable[[int, int], None]) -> Iterator[tuple[int, int, Array]]:
+        """Yield the first row and the end of parts of the samples, and their times in s.
+
+        ``progress`` is called with the number of rows that are done, and that of all.
+        """
         start_s = seconds_of_row(self.measurement, 0)
         rate_hz = self.measurement.grid.rate_hz * self.per_frame
         first, end = self.placed.first_row, self.placed.last_row + 1
         for start in range(first, end, _BLOCK_ROWS):
             stop = min(start + _BLOCK_ROWS, end)
             yield start, stop, start_s + np.arange(start, stop) / rate_hz
+            progress(stop - first, end - first)
 
 
 class _PlateLoads(NamedTuple):
@@ -181,12 +182,14 @@ class _PlateLoads(NamedTuple):
         """The plates."""
         return [plan for plan, _ in self.plates]
 
-    def blocks(self, min_force_n: float) -> Iterator[tuple[Array, Array, list[GroundReactions]]]:
+    def blocks(
+        self, min_force_n: float, progress: Callable[[int, int], None]
+    ) -> Iterator[tuple[Array, Array, list[GroundReactions]]]:
         """Yield parts of the samples: their times, whether all loads are known, and each plate's reactions.
 
         The reactions have the server's axes.
         """
-        for start, stop, times in self.samples.blocks():
+        for start, stop, times in self.samples.blocks(progress):
             is_known = np.full(len(times), True)
             found = []
             for plan, placed in self.plates:
@@ -219,13 +222,15 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
     signs = _signs(job, path, loads, rotation, min_force_n)
 
     def blocks() -> Iterator[tuple[Array, Array]]:
-        for times, is_known, found in loads.blocks(min_force_n):
+        for times, is_known, found in loads.blocks(
+            min_force_n, partial(job.progress, f"writing {path.name}")
+        ):
             vectors = [
                 vector @ rotation.T
                 for reactions, sign in zip(found, signs, strict=True)
                 for vector in (sign * reactions.forces, reactions.positions, sign * reactions.free_moments)
             ]
-            yield times[is_known], np.concatenate(vectors, axis=1)[is_known]
+            yield times[is_known], rounded(np.concatenate(vectors, axis=1)[is_known])
 
     names = [f"{name}{axis}" for plan in loads.plans for name in _identifiers(plan) for axis in "xyz"]
     _write_table(job, path, loads.samples, names, "", blocks())
@@ -247,7 +252,8 @@ def _signs(
     """
     sums, num_contacts = np.zeros(len(loads.plans)), np.zeros(len(loads.plans), int)
     num_known = 0
-    for _, is_known, found in loads.blocks(min_force_n):
+    progress = partial(job.progress, f"reading the forces of {path.name}")
+    for _, is_known, found in loads.blocks(min_force_n, progress):
         num_known += int(np.count_nonzero(is_known))
         for index, reactions in enumerate(found):
             forces = reactions.forces[is_known]
@@ -273,7 +279,7 @@ def _write_sto(job: ExportJob, path: Path, analog: _Samples) -> None:
     series = analog.placed.series
 
     def blocks() -> Iterator[tuple[Array, Array]]:
-        for start, stop, times in analog.blocks():
+        for start, stop, times in analog.blocks(partial(job.progress, f"writing {path.name}")):
             values = analog.placed.block(start, stop)
             is_known = ~np.isnan(values).all(axis=1)
             yield times[is_known], values[is_known]
@@ -306,13 +312,10 @@ def _write_table(
     file.write(f"\nnColumns={len(labels) + 1}\ninDegrees=no\ntime_0={time_0}\n{more}endheader\n".encode())
     file.write(("\t".join(["time", *labels]) + "\n").encode())
     num_rows, num_expected = 0, samples.placed.last_row - samples.placed.first_row + 1
-    num_done = 0
     for times, values in blocks:
-        heads = [b"%.6f" % time_s for time_s in times.tolist()]
-        file.write(encode_rows(values, b"nan", b"\n", heads))
+        rows = zip(times.tolist(), number_rows(values, b"nan", b"\t"), strict=True)
+        file.write(b"".join(b"%.6f\t%b\n" % row for row in rows))
         num_rows += len(times)
-        num_done = min(num_done + _BLOCK_ROWS, num_expected)
-        job.progress(f"writing {path.name}", num_done, num_expected)
     file.seek(place_of_count)
     file.write(b"%-*d" % (_COUNT_WIDTH, num_rows))
     if num_rows < num_expected:

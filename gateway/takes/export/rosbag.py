@@ -103,6 +103,8 @@ class _RosExport(SourceExport):
             self.count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
             return []
         tools = unique_ros_names(run.labels, "tool")
+        if [*tools] != [*run.labels]:
+            self.notes["labels of tools changed to names of topics"] = None
         names = [TransformNames(self._source, f"{self._source}/{tool}") for tool in tools]
         topics = [self._topic(f"{self._base}/{pose_topic(tool)}", POSE_STAMPED) for tool in tools]
         found = [TopicMessages(topic, [], []) for topic in topics]
@@ -128,6 +130,9 @@ class _RosExport(SourceExport):
             newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
             loads = run.values[rows, index] * np.array([newtons] * 3 + [newton_metres] * 3)
             is_known = ~np.isnan(loads).any(axis=1)
+            self.count("forces with NaN", ~is_known)
+            if (newtons, newton_metres) != (1.0, 1.0):
+                self.notes["forces and moments converted to N and N.m"] = None
             utimes = run.capture_utime[rows][is_known]
             encoded = self._stamped.encode_rows(ros_stamps(utimes), loads[is_known])
             yield self._messages(wrench_topic(plate_name(index + 1)), WRENCH_STAMPED, utimes, encoded)

@@ -14,7 +14,7 @@ from gateway.takes.export.measurements import (
     seconds_of_row,
     utc_text,
 )
-from gateway.takes.export.number_text import encode_rows
+from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.export.opensim_labels import NOT_IN_LABELS, opensim_labels
 from gateway.takes.files.component_rows import Array
 
@@ -57,17 +57,13 @@ def write_trc(
         stop = min(start + _BLOCK_ROWS, grid.num_rows)
         positions = frames.block(start, stop)[..., :3]
         positions[np.isnan(positions).any(axis=2)] = np.nan
-        heads = [f"{row + 1}\t{start_s + row / grid.rate_hz:.6f}" for row in range(start, stop)]
-        if rotation is None:
-            for head, markers in zip(heads, positions, strict=True):
-                # The shortest texts that mean the same 32-bit numbers.
-                cells = "\t".join(map(str, markers.ravel())).replace("nan", "")
-                file.write(f"{head}\t{cells}\t\n".encode())
-        else:
+        if rotation is not None:
             with np.errstate(invalid="ignore"):  # infinity, which becomes an empty cell
-                rotated = positions.astype(np.float64) * factor @ rotation.T
-            rows = rotated.reshape(stop - start, -1)
-            file.write(encode_rows(rows, b"", b"\t\n", [head.encode() for head in heads]))
+                positions = rounded(positions.astype(np.float64) * factor @ rotation.T)
+        cells = number_rows(positions.reshape(stop - start, -1), separator=b"\t")
+        times = (start_s + np.arange(start, stop) / grid.rate_hz).tolist()
+        lines = zip(range(start + 1, stop + 1), times, cells, strict=True)
+        file.write(b"".join(b"%d\t%.6f\t%b\t\n" % line for line in lines))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
     note_missing(job, path, measurement, 0, grid.num_rows)
 

@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 
 from gateway.takes.files.component_rows import Array
-from gateway.takes.files.series import ParametersEntry, Series
+from gateway.takes.files.parameters_history import ParametersEntry
+from gateway.takes.files.series import Series
 
 
 def join_series(parts: Sequence[Series]) -> Series:

@@ -17,8 +17,8 @@ from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.component_statistics import ClockSteps, ComponentStatistics, MessageStatistics
 from gateway.takes.files.description import NO_DETAILS, decoded_details, has_end
 from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, Damage
+from gateway.takes.files.parameters_history import ParametersHistory
 from gateway.takes.files.reader import DESCRIPTIONS, TakeReader
-from gateway.takes.files.series import ParametersHistory
 
 MAX_LISTED_CHANGES: Final = 100
 """How many changes of the parameters are listed; all are counted."""

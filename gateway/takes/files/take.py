@@ -15,14 +15,9 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.files.joined import join_series
+from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory
 from gateway.takes.files.reader import MessageBatch, TakeReader
-from gateway.takes.files.series import (
-    MAX_GAP_S,
-    ParametersEntry,
-    ParametersHistory,
-    Series,
-    SeriesBuilder,
-)
+from gateway.takes.files.series import MAX_GAP_S, Series, SeriesBuilder
 
 
 @dataclass
@@ -163,6 +158,8 @@ def open_take(
         take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
         take.unknown = dict(reader.unknown)
         takes.append(take)
+    if progress is not None:  # what comes after ``to_s`` is not read
+        progress(total, total)
     missing = set(sources or ()).difference(*(take.sources for take in takes))
     if missing:
         known = dict.fromkeys(name for reader in readers for name in reader.source_names)

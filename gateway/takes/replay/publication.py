@@ -28,7 +28,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.replies import XmlThread
-from gateway.takes.files.series import recorded_parameters
+from gateway.takes.files.parameters_history import recorded_parameters
 
 _PARAMETERS_S: Final = 1.0
 """How long messages wait at most until the outputs have sent the parameters that describe them."""

@@ -36,7 +36,8 @@ def names(folder: Path) -> list[str]:
 def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -> None:
     done = run_in_process("export", take, tmp_path / "walk.c3d")
     size = (tmp_path / "walk.c3d").stat().st_size
-    assert done == (0, f"{tmp_path}/walk.c3d ({size / 1e6:.1f} MB)\n", "")
+    assert done[:2] == (0, f"{tmp_path}/walk.c3d ({size / 1e6:.1f} MB)\n")
+    assert "walk.c3d\tforces became analog channels, six of each plate\t1\n" in done.stderr
     content = bytearray(take.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 3000] = bytes(3000)
     (tmp_path / "damaged.lcmlog").write_bytes(content[:-100])
@@ -60,11 +61,14 @@ def test_a_bids_data_set_is_a_folder_that_grows(tmp_path: Path) -> None:
     assert len(list(study.rglob("*_run-3_motion.tsv"))) == 4
 
 
-@pytest.mark.parametrize("option", ["--subject", "--session", "--task"])
-def test_options_of_bids_need_it(tmp_path: Path, option: str) -> None:
-    done = run_in_process("export", WALK, tmp_path / "walk.c3d", option, "x")
+def test_who_and_what_the_take_is_about_can_be_replaced(tmp_path: Path) -> None:
+    done = run_in_process(
+        "export", WALK, tmp_path / "a.csv", "--subject", "S1", "--session", "", "--note", " x "
+    )
+    assert done.stderr == "\tleft out of lab: subject, note, parameters except labels and units\t\n"
+    done = run_in_process("export", WALK, tmp_path / "a.c3d", "--subject", "S" * 65)
     assert done.returncode == 2
-    assert f"{option} is for --bids only" in done.stderr
+    assert "up to 64 characters" in done.stderr
 
 
 EXISTS = "exists already, and nothing is overwritten"
@@ -86,6 +90,7 @@ EXISTS = "exists already, and nothing is overwritten"
         ("a.trc", ("--from", "3000"), "has no markers", 2),
         ("a.csv", ("--forward", "-x"), "--forward is for .trc, .mot or --opensim only", 2),
         ("a.mot", ("--bodies", "calcn_r"), "--bodies is for --opensim only", 2),
+        ("a.c3d", ("--task", "x"), "--task is for --bids only", 2),
         (
             "a",
             ("--opensim", "--bodies", "toes,heel"),
@@ -192,8 +197,7 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
             wait_until(lambda: take.exists() and take.read_bytes().count(channel) == count, 60)  # noqa: B023
         record.send_signal(signal.SIGINT)
         assert record.wait(30) == 0
-    [note] = run_in_process("export", take, copy).stderr.splitlines()
-    assert "time 0 is the first frame" in note
+    assert "time 0 is the first frame" in run_in_process("export", take, copy).stderr
     expected, found = (read_ezc3d(path) for path in (original, copy))
     events = [content["parameters"]["EVENT"] for content in (expected, found)]
     assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]

@@ -81,9 +81,22 @@ def export_c3d(folder: Path, messages: Iterable[Message], **options: Any) -> tup
     return C3d(folder / "out.c3d"), notes_of(job)
 
 
-def notes_of(job: ExportJob) -> list[str]:
-    """Return what the table of an export says, the cells of each row between bars."""
-    return [" | ".join(filter(None, note)) for note in job.notes]
+USUAL_NOTES = (
+    "left out of ",
+    "times of capture and frame numbers replaced by a regular grid",
+    "positions converted from ",
+    "labels of tools changed to names of topics",
+    "labels of analog changed to names of fields",
+    "labels of force changed to names of fields",
+    "residuals rounded to 127 steps",
+)
+"""How those notes begin that most exports of a format have."""
+
+
+def notes_of(job: ExportJob, *, usual: bool = False) -> list[str]:
+    """Return what the table of an export says, the cells of each row between bars; not the usual notes."""
+    notes = [note for note in job.notes if usual or not note.what.startswith(USUAL_NOTES)]
+    return [" | ".join(filter(None, note)) for note in notes]
 
 
 class IndependentC3d(NamedTuple):

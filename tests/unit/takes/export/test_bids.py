@@ -36,11 +36,20 @@ from tests.unit.takes.export.exported import NAN, export_messages, float32, labe
 
 SCENE = SyntheticScene(markers=3, tools=2, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000, seed=5)
 Scene = C3dScene | SyntheticScene
-NAMES = BidsNames(subject="01", task="walking")
+NAMES = BidsNames(task="walking")
 
 
-def export(folder: Path, messages: Sequence[Message], names: BidsNames = NAMES, **options: Any) -> ExportJob:
-    return export_messages(folder, messages, "study", format="bids", bids=names, **options)
+def export(
+    folder: Path,
+    messages: Sequence[Message],
+    names: BidsNames = NAMES,
+    *,
+    subject: str = "01",
+    **options: Any,
+) -> ExportJob:
+    """Export to a data set; ``subject`` is not that of the take, unless it is ""."""
+    about = {"subject": subject} if subject else {}
+    return export_messages(folder, messages, "study", format="bids", bids=names, details=about, **options)
 
 
 def only(folder: Path, pattern: str) -> Path:
@@ -102,7 +111,7 @@ def test_all_values_survive_and_lost_frames_are_not_available(tmp_path: Path) ->
     assert_values(tmp_path, SCENE, "Forces", 400, IN_MM["Forces"])
     file = "sub-01_task-walking_tracksys-labMarkers_run-1_motion.tsv"
     assert Note(file, "frames missing in the take are empty", "3 of 40") in job.notes
-    assert "positions converted from mm to m" in notes_of(job)
+    assert "positions converted from mm to m" in notes_of(job, usual=True)
 
 
 @pytest.mark.takes
@@ -277,28 +286,22 @@ def test_an_event_is_in_the_nearest_run_only_beside_the_markers(tmp_path: Path) 
 
 def test_subject_and_session_come_from_the_take_in_letters_and_digits(tmp_path: Path) -> None:
     about = [details("S-01", "base line"), markers(1)]
-    job = export(tmp_path, about, BidsNames(task="rest"))
+    job = export(tmp_path, about, BidsNames(task="heel-toe"), subject="")
     assert only(tmp_path, "*_motion.tsv").relative_to(tmp_path).as_posix() == (
-        "study/sub-S01/ses-baseline/motion/sub-S01_ses-baseline_task-rest_tracksys-labMarkers_run-1_motion.tsv"
+        "study/sub-S01/ses-baseline/motion/sub-S01_ses-baseline_task-heeltoe_tracksys-labMarkers_run-1_motion.tsv"
     )
     assert only(tmp_path, "*_scans.tsv").parent.name == "ses-baseline"
-    assert "the subject 'S-01' is called 'S01': BIDS has letters and digits only" in notes_of(job)
+    for note in ("the subject 'S-01' is called 'S01'", "the task 'heel-toe' is called 'heeltoe'"):
+        assert f"{note}: BIDS has letters and digits only" in notes_of(job)
 
 
 @pytest.mark.parametrize(
-    ("names", "problem"),
-    [
-        (BidsNames(task="rest"), "does not say the subject, and BIDS needs it; add --subject"),
-        (BidsNames(subject="01"), "does not say the task, and BIDS needs it; add --task"),
-        (replace(NAMES, subject="S-1"), "--subject 'S-1' is not possible: BIDS has letters and digits only"),
-        (replace(NAMES, session=""), "--session '' is not possible"),
-    ],
+    ("subject", "task", "missing"), [("", "rest", "subject"), ("-", "rest", "subject"), ("01", "", "task")]
 )
-def test_a_name_that_bids_needs_or_cannot_have_is_an_error(
-    tmp_path: Path, names: BidsNames, problem: str
-) -> None:
+def test_a_data_set_needs_a_subject_and_a_task(tmp_path: Path, subject: str, task: str, missing: str) -> None:
+    problem = f"does not say the {missing}, and BIDS needs it; add --{missing}"
     with pytest.raises(SelectionError, match=problem):
-        export(tmp_path, [markers(1)], names)
+        export(tmp_path, [markers(1)], BidsNames(task), subject=subject)
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
 
 
@@ -306,9 +309,15 @@ def test_sources_with_different_subjects_need_a_choice(tmp_path: Path) -> None:
     messages = [details(name, source=name) for name in ("a", "b")]
     messages += [markers(1, source=name) for name in ("a", "b")]
     with pytest.raises(SelectionError, match="have different subjects, a and b; choose by --subject"):
-        export(tmp_path, messages, BidsNames(task="rest"))
-    export(tmp_path, messages, BidsNames(task="rest"), source="b")
+        export(tmp_path, messages, subject="")
+    export(tmp_path, messages, subject="", source="b")
     assert (tmp_path / "study/sub-b").is_dir()
+
+
+def test_a_source_whose_name_bids_cannot_have_is_reported(tmp_path: Path) -> None:
+    job = export(tmp_path, [description("lab-2"), markers(1, source="lab-2")])
+    assert runs_of(tmp_path) == {("lab2Markers", "1")}
+    assert "the source 'lab-2' is called 'lab2': BIDS has letters and digits only" in notes_of(job)
 
 
 def test_a_data_set_grows_and_keeps_what_others_wrote(tmp_path: Path) -> None:
@@ -321,7 +330,7 @@ def test_a_data_set_grows_and_keeps_what_others_wrote(tmp_path: Path) -> None:
     scans = study / "sub-01/sub-01_scans.tsv"
     first = scans.read_text()
     export(tmp_path, [markers(1)])
-    export(tmp_path, [markers(1)], BidsNames("02", None, "walking", 7))
+    export(tmp_path, [markers(1)], BidsNames("walking", 7), subject="02")
     assert runs_of(study / "sub-01") == {("labMarkers", "1"), ("labMarkers", "2")}
     assert runs_of(study / "sub-02") == {("labMarkers", "7")}
     assert (study / "participants.tsv").read_text() == "participant_id\tage\nsub-01\t34\nsub-02\tn/a\n"
@@ -348,7 +357,7 @@ def test_an_export_that_fails_changes_nothing(tmp_path: Path) -> None:
     assert content(study) == before
     (study / "participants.tsv").write_bytes(b"\xff")
     with pytest.raises(TakeError, match=r"participants\.tsv is not in UTF-8"):
-        export(tmp_path, [markers(1)], replace(NAMES, subject="02"))
+        export(tmp_path, [markers(1)], subject="02")
     assert not (study / "sub-02").exists()
 
 

@@ -43,7 +43,9 @@ from tests.unit.takes.export.exported import (
     SCENE,
     C3d,
     export_c3d,
+    export_messages,
     labelled,
+    notes_of,
     read_independently,
     samples,
     scene,
@@ -62,7 +64,7 @@ def test_a_recorded_c3d_file_is_exported_as_it_was(tmp_path: Path, name: str, nu
     take = record_scene(tmp_path / "take.lcmlog", C3dScene(original_path), num_frames)
     job = ExportJob(take, copy_path)
     assert export_take(job) == [copy_path]
-    assert job.notes == []
+    assert len(notes_of(job, usual=True)) == 1  # about the grid: residuals are exact, plates as they were
     original, copy = C3d(original_path), C3d(copy_path)
     for group, names in {
         "POINT": ("LABELS", "DESCRIPTIONS", "RATE", "FRAMES", "USED"),
@@ -104,7 +106,9 @@ def test_missing_markers_and_residuals(tmp_path: Path) -> None:
 def test_residuals_have_127_steps_and_those_of_a_damaged_frame_cause_no_warning(tmp_path: Path) -> None:
     residuals = np.random.default_rng(4).uniform(0, 2, 300)
     messages = points(*([(1, 2, 3, value)] for value in residuals))
-    found, _ = export_c3d(tmp_path, [labelled("a"), *messages])
+    job = export_messages(tmp_path, [labelled("a"), *messages], "out.c3d")
+    found = C3d(tmp_path / "out.c3d")
+    assert "out.c3d | residuals rounded to 127 steps | 0.0157 mm each" in notes_of(job, usual=True)
     assert abs(found.residuals[0] - residuals).max() <= residuals.max() / 127 / 2 + 1e-6
     (folder := tmp_path / "damaged").mkdir()
     items = [(1.0, 2.0, 3.0, residual) for residual in (1e-40, 0.5, math.inf)]
@@ -129,15 +133,21 @@ def test_events_have_their_labels_and_times(tmp_path: Path) -> None:
             [
                 ((16, start + 250_000, 7, 1, half), 255_000),
                 ((9, 0, 3, -1, -1), 400_000),
+                ((9, 0, 4, -1, -1), -200_000),
                 ((9, 0, -1, -1, -1), 900_000_000),
             ]
         )
     ]
-    found, _ = export_c3d(tmp_path, [parameters(described), *scene_messages(SCENE, 100), *events])
-    assert found("EVENT", "USED").tolist() == [2]
-    assert found("EVENT", "LABELS") == ["Button", "event 9"]
-    assert found("EVENT", "DESCRIPTIONS") == ["Button id: 7; State: ON; Force: 0.5", "param1: 3"]
-    assert found("EVENT", "TIMES").tolist() == [[0, 0], [0.25, pytest.approx(0.4)]]
+    about = details("ü" * 64)
+    found, notes = export_c3d(tmp_path, [parameters(described), about, *scene_messages(SCENE, 100), *events])
+    assert found("EVENT", "USED").tolist() == [3]
+    assert found("EVENT", "LABELS") == ["event 9", "Button", "event 9"]
+    assert found("EVENT", "DESCRIPTIONS") == ["param1: 4", "Button id: 7; State: ON; Force: 0.5", "param1: 3"]
+    assert found("EVENT", "TIMES").tolist() == [[0, 0, 0], [0, 0.25, pytest.approx(0.4)]]
+    assert "events before the first frame have its time | 1" in notes
+    assert "events of lab far from all frames left out | 1" in notes
+    assert found("EVENT", "SUBJECTS") == ["ü" * 60] * 3
+    assert "texts cut: a C3D file has short ones only | 4 to 120 bytes" in notes
 
 
 def test_events_have_their_side_as_context(tmp_path: Path) -> None:
@@ -245,7 +255,7 @@ CALIBRATION = np.diag([100.0, 100, 200, 5000, 5000, 4000]) + 0.3
 
 def test_plates_without_channels_of_their_own_get_six_each(tmp_path: Path) -> None:
     found, notes = export_c3d(tmp_path, scene(150))
-    assert notes == []
+    assert notes == ["out.c3d | forces became analog channels, six of each plate | 2"]
     names = [f"{name}{plate}" for plate in (1, 2) for name in ("Fx", "Fy", "Fz", "Mx", "My", "Mz")]
     assert found("ANALOG", "LABELS")[3:] == names
     assert found("ANALOG", "UNITS")[3:9] == ["N"] * 3 + ["Nmm"] * 3

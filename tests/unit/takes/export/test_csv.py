@@ -43,7 +43,7 @@ def test_every_value_of_every_component_is_exported_exactly(tmp_path: Path) -> N
         "walk-analog.csv",
         "walk-force.csv",
     ]
-    assert job.notes == []
+    assert notes_of(job) == []
     for component in (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG, ComponentType.FORCE):
         head, rows = read_csv(tmp_path / f"walk-{component.key}.csv")
         assert head[:7] == HEAD

@@ -1,4 +1,4 @@
-"""What is the same in all formats: files, sources, times, and takes without anything to export."""
+"""What several formats have in common: files, times, memory, and takes without anything to export."""
 
 import csv
 import re
@@ -10,23 +10,20 @@ import pytest
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.files import component_rows, spool
-from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, scene_messages
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    frame,
+    markers,
+    parameters,
+    scene_messages,
+)
 from tests.unit.takes.export.exported import SCENE, C3d, export_messages, labelled, notes_of
 from tests.unit.takes.export.test_trc import read_trc
 
 ANALOG = frame(ComponentType.ANALOG, [1, 2])
 EVENT = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
-
-
-@pytest.mark.parametrize("end", [".c3d", ".trc", "-3d.csv"])
-def test_each_source_is_a_file_unless_one_is_chosen(tmp_path: Path, end: str) -> None:
-    extension = end.removeprefix("-3d")
-    messages = [description("left"), description("right")]
-    messages += [markers(2, number, source=source) for number in range(5) for source in ("left", "right")]
-    job = export_messages(tmp_path, messages, f"walk{extension}")
-    assert [path.name for path in job.files.paths] == [f"walk-left{end}", f"walk-right{end}"]
-    job = export_messages(tmp_path, messages, f"one{extension}", source="right")
-    assert [path.name for path in job.files.paths] == [f"one{end}"]
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.mcap_file import McapFile
-from gateway.takes.files.series import ParametersEntry
+from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.take import TakeSource
 from tests.support.takes import (
     START_UTIME,
@@ -64,7 +64,7 @@ NO_TOOL = (MISSING,) * 8
 
 
 def one_of(interval: int) -> str:
-    return f"lab: arrows of forces are drawn for one of {interval} frames"
+    return f"arrows of forces drawn for one of {interval} frames only"
 
 
 def export(
@@ -151,7 +151,10 @@ def test_markers_are_in_metres_without_missing_ones(tmp_path: Path, name: str, m
     assert (logged[1].time_ns, cloud.timestamp.ToNanoseconds()) == (time_ns, time_ns)
 
 
-def test_an_unknown_unit_is_reported(tmp_path: Path) -> None:
+def test_a_converted_or_unknown_unit_is_reported(tmp_path: Path) -> None:
+    for name, expected in (("mm", ["positions converted from mm to m"]), ("m", [])):
+        job = export_messages(tmp_path, [unit(name), markers(1)], f"{name}.mcap")
+        assert [note for note in notes_of(job, usual=True) if "positions" in note] == expected
     job = export_messages(tmp_path, [unit("furlong"), markers(1)], "walk.mcap")
     assert notes_of(job) == [
         "lab: the unit of length 'furlong' is unknown; positions are shown as if it were mm"
@@ -291,6 +294,15 @@ def test_analog_channels_have_their_labels_as_names(tmp_path: Path) -> None:
     assert described["labels"][4:7] == ["Füße", "力", "1st"]
     assert described["fields"] == list(found)[:10]
     assert set(described["units"]) == {"mV"}
+
+
+def test_labels_that_cannot_be_names_are_reported(tmp_path: Path) -> None:
+    for label, is_changed in (("EMG 1", True), ("EMG1", False)):
+        messages = [channels(label), frame(ComponentType.ANALOG, [1.0])]
+        job = export_messages(tmp_path, messages, f"{label}.mcap")
+        notes = notes_of(job, usual=True)
+        assert ("labels of analog changed to names of fields" in notes) == is_changed
+        assert not any("positions" in note for note in notes)
 
 
 def test_other_labels_get_another_topic_because_viewers_decode_a_topic_in_one_way(tmp_path: Path) -> None:

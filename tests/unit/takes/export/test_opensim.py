@@ -228,10 +228,12 @@ def test_samples_outside_the_frames_and_other_components_are_reported(tmp_path: 
         return component is not ComponentType.MARKERS or sample >= 5
 
     shown = SyntheticScene(markers=5, tools=1, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000)
-    notes = notes_of(export_messages(tmp_path, scene(20, shown, keep=keep), "out", format="opensim"))
+    job = export_messages(tmp_path, scene(20, shown, keep=keep), "out", format="opensim")
+    notes = notes_of(job, usual=True)
     assert "samples of force of lab without a frame of the markers left out | 50 of 200" in notes
     assert "samples of analog of lab without a frame of the markers left out | 50 of 200" in notes
-    assert "tools (6D) of lab left out | 20" in notes
+    assert "left out of lab: tools (6D), reliabilities of markers" in notes
+    assert "positions converted from mm to m" in " ".join(notes)
 
 
 def test_a_rate_that_is_no_multiple_is_reported_and_a_file_of_its_own_has_it(tmp_path: Path) -> None:
@@ -291,7 +293,7 @@ def test_axes_are_chosen(tmp_path: Path, up: Axis | None, forward: Axis | None, 
     is_chosen = chosen.has_axes
     assert found.header["Units"] == "mm"  # without --opensim, the unit stays
     assert found.positions[0, 0].tolist() == ([1000 * each for each in position] if is_chosen else [1, 2, 3])
-    assert bool(alone.notes) is is_chosen
+    assert bool(notes_of(alone)) is is_chosen
 
 
 def test_one_axis_cannot_point_up_and_forward(tmp_path: Path) -> None:

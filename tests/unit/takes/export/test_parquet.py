@@ -20,7 +20,7 @@ from gateway.takes.files import event_log, reader
 from gateway.takes.files.tables import TIME_COLUMNS
 from tests.support.documents import ROOT
 from tests.support.takes import START_UTIME, description, details, frame, parameters, record_scene
-from tests.unit.takes.export.exported import export_messages, scene
+from tests.unit.takes.export.exported import export_messages, notes_of, scene
 
 WALK = ROOT / "examples/walk.lcmlog"
 
@@ -40,7 +40,7 @@ def test_pandas_reads_every_number_of_every_component_as_it_was_recorded(name: s
         take = record_scene(tmp_path / "take.lcmlog", recording, 100)
     job = ExportJob(take, tmp_path / "walk.parquet")
     export_take(job)
-    assert job.notes == []
+    assert notes_of(job) == []
     [source] = open_take(take).sources.values()
     assert sorted(job.files.paths) == sorted(tmp_path / f"walk-{key}.parquet" for key in source.series)
     for key, series in source.series.items():

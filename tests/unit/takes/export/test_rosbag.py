@@ -15,7 +15,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
 from gateway.takes.export.job import ExportJob, Note
 from tests.support.takes import START_UTIME, frame, parameters, scene_messages
-from tests.unit.takes.export.exported import NAN, export_messages, labelled
+from tests.unit.takes.export.exported import NAN, export_messages, labelled, notes_of
 
 SCENE = SyntheticScene(markers=3, tools=2, analog=3, plates=2, rate_hz=100, analog_rate_hz=200)
 TYPES = {
@@ -82,7 +82,8 @@ def test_a_bag_has_the_values_of_the_take_in_the_units_of_ros(tmp_path: Path) ->
     assert plates is not None
     factors = [1.0] * 3 + [1e-3 if plates.plates[1].channels[3].unit == "Nmm" else 1.0] * 3
     assert np.allclose(values, lab.forces.values[:, 1] * factors)
-    assert not job.notes
+    assert notes_of(job) == []
+    assert "labels of tools changed to names of topics" in notes_of(job, usual=True)
 
 
 def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
@@ -104,9 +105,10 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     }
     points = np.frombuffer(bag.messages["/mocap/lab/markers"][0][1].data, "<f4").reshape(-1, 5)
     assert np.array_equal(points[:, 0], np.array([1e-3, NAN], np.float32), equal_nan=True)
-    assert [(note.what, note.amount) for note in job.notes] == [
-        ("events of lab left out", "1"),
-        ("messages from before 1970 or after 2106 in analog of lab left out", "1"),
+    assert notes_of(job) == [
+        "forces with NaN of lab left out | 1",
+        "events of lab left out | 1",
+        "messages from before 1970 or after 2106 in analog of lab left out | 1",
     ]
 
 
@@ -115,7 +117,8 @@ def test_units_of_plates_are_converted_and_unknown_lengths_left_out(tmp_path: Pa
     channels = tuple(ForceChannel(str(n), f"c{n}", unit) for n, unit in enumerate(units))
     plate = Parameters(force=ParametersForce((Plate("1", channels=channels),)))
     load = frame(ComponentType.FORCE, [(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)], 0)
-    bag, _ = export(tmp_path, parameters(plate), load)
+    bag, job = export(tmp_path, parameters(plate), load)
+    assert notes_of(job) == ["forces and moments converted to N and N.m"]
     [(_, message)] = bag.messages["/mocap/lab/force_1/wrench"]
     assert triple(message.wrench.force) == (1000.0, 2000.0, 3000.0)
     assert triple(message.wrench.torque) == pytest.approx((4e-3, 5e-3, 6e-3))

@@ -1,0 +1,210 @@
+"""What holds for each format, also for those that will be added: sources, progress, what is reported."""
+
+import csv
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from functools import partial
+from itertools import count, groupby
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+import pytest
+
+from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, export_take
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    details,
+    markers,
+    parameters,
+    scene_messages,
+    write_take,
+)
+from tests.unit.takes.export.exported import C3d, notes_of
+from tests.unit.takes.export.read_mcap import read_mcap
+from tests.unit.takes.export.test_opensim import read_storage
+from tests.unit.takes.export.test_rosbag import Bag
+from tests.unit.takes.export.test_trc import read_trc
+
+NAMES: Final = [*FORMATS, *CHOSEN_FORMATS]
+
+
+def scene_of(rate_hz: float) -> SyntheticScene:
+    return SyntheticScene(markers=2, tools=1, analog=2, plates=1, rate_hz=rate_hz, analog_rate_hz=2 * rate_hz)
+
+
+LEFT, RIGHT = scene_of(100), scene_of(60)
+RIGHT_BEGINS_S: Final = 0.2
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a take of two sources with rates and clocks of their own, of which one began 0.2 s later."""
+    messages: list[Message] = []
+    for name, scene, start_s in (("left", LEFT, 0.0), ("right", RIGHT, RIGHT_BEGINS_S)):
+        messages += [description(name), details("Grace", "day1", "left knee", name)]
+        messages.append(parameters(scene.parameters, source=name))
+        start_us, server_us = round(start_s * 1e6), 10_000_000 * len(name)
+        messages += scene_messages(scene, 60, source=name, start_us=start_us, server_start_us=server_us)
+    # In the order of arrival; descriptions, which have the time of the beginning, stay the first ones.
+    messages.sort(key=lambda message: message[1][8:16])
+    return write_take(tmp_path_factory.mktemp("take") / "take.lcmlog", messages)
+
+
+def job_for(name: str, take: Path, folder: Path, **options: Any) -> ExportJob:
+    """Return the job that exports to a format: an extension, or the option that chooses it."""
+    folder.mkdir(exist_ok=True)
+    suffix = name if name in FORMATS else ".mcap" if name == "ros2" else ""
+    chosen = name if name in CHOSEN_FORMATS else ""
+    return ExportJob(take, folder / f"take{suffix}", chosen, bids=BidsNames("walking"), **options)
+
+
+def since_begin_s(utc: str) -> float:
+    return (datetime.fromisoformat(utc) - datetime.fromtimestamp(START_UTIME / 1e6, UTC)).total_seconds()
+
+
+def utime_s(utime: float) -> float:
+    return utime / 1e6 - START_UTIME / 1e6
+
+
+def trc_start_s(folder: Path, source: str) -> float:
+    path = folder / f"take-{source}.trc"
+    time_0 = path.read_text().splitlines()[0].partition("time_0=")[2]
+    return since_begin_s(time_0) + read_trc(path).times_s[0]
+
+
+def storage_start_s(end: str, folder: Path, source: str) -> float:
+    found = read_storage(folder / f"take-{source}{end}")
+    return since_begin_s(found.header["time_0"]) + float(found.times_s[0])
+
+
+def opensim_start_s(folder: Path, source: str) -> float:
+    starts_s = [storage_start_s(end, folder / "take", source) for end in (".mot", ".sto")]
+    assert starts_s == pytest.approx([trc_start_s(folder / "take", source)] * 2, abs=1e-3)
+    return starts_s[0]
+
+
+def csv_start_s(folder: Path, source: str) -> float:
+    with (folder / f"take-{source}-3d.csv").open() as file:
+        return utime_s(float(next(csv.DictReader(file))["capture_utime"]))
+
+
+def bids_start_s(folder: Path, source: str) -> float:
+    with (folder / "take/sub-Grace/ses-day1/sub-Grace_ses-day1_scans.tsv").open() as file:
+        times = {row["filename"]: row["acq_time"] for row in csv.DictReader(file, delimiter="\t")}
+    name = f"motion/sub-Grace_ses-day1_task-walking_tracksys-{source}Markers_run-1_motion.tsv"
+    return since_begin_s(times[name])
+
+
+FIRST_FRAMES: Final[dict[str, Callable[[Path, str], float]]] = {
+    ".c3d": lambda folder, source: since_begin_s(C3d(folder / f"take-{source}.c3d")("TRIAL", "DATE_TIME")[0]),
+    ".trc": trc_start_s,
+    ".mot": partial(storage_start_s, ".mot"),
+    ".sto": partial(storage_start_s, ".sto"),
+    ".csv": csv_start_s,
+    ".parquet": lambda folder, source: utime_s(
+        pd.read_parquet(folder / f"take-{source}-3d.parquet")["capture_utime"][0]
+    ),
+    ".mcap": lambda folder, source: utime_s(
+        read_mcap(folder / "take.mcap").topics[f"/{source}/markers"][0].time_ns / 1000
+    ),
+    "opensim": opensim_start_s,
+    "bids": bids_start_s,
+    "ros2": lambda folder, source: utime_s(
+        Bag(folder / "take.mcap").messages[f"/mocap/{source}/markers"][0][0] / 1000
+    ),
+}
+"""When the first frame of a source was captured, in s from the beginning of the take, as the files say."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sources_have_their_own_rates_and_the_times_of_this_computer(
+    take: Path, tmp_path: Path, name: str
+) -> None:
+    """Servers have clocks of their own, which start at any time: their files would not fit together."""
+    export_take(job_for(name, take, tmp_path))
+    for source, start_s in (("left", 0.0), ("right", RIGHT_BEGINS_S)):
+        assert FIRST_FRAMES[name](tmp_path, source) == pytest.approx(start_s, abs=2e-3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_source_alone_is_exported_without_its_name(take: Path, tmp_path: Path, name: str) -> None:
+    paths = export_take(job_for(name, take, tmp_path, source="right"))
+    assert not any("left" in str(path.relative_to(tmp_path)) for path in paths)
+    if name != "bids":  # its tracking systems always have the name of the source
+        assert not any("right" in path.name for path in paths)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_who_and_what_a_take_is_about_is_kept_or_reported_and_can_be_replaced(
+    take: Path, tmp_path: Path, name: str
+) -> None:
+    about = {"subject": "Ada", "session": "", "note": "right knee"}
+    job = job_for(name, take, tmp_path, details=about)
+    paths = export_take(job)
+    written = b"".join(str(path.relative_to(tmp_path)).encode() + path.read_bytes() for path in paths)
+    is_kept = job.chosen_format.keeps_details
+    for text, is_new in ((b"Ada", True), (b"right knee", True), (b"Grace", False), (b"day1", False)):
+        assert (text in written) == (is_new and is_kept), text
+    assert ("subject, note" in "".join(notes_of(job, usual=True))) != is_kept
+
+
+Call = tuple[str, int, int]
+
+
+def stages(calls: Iterable[Call]) -> list[tuple[str, list[Call]]]:
+    return [(what, list(found)) for what, found in groupby(calls, lambda call: call[0])]
+
+
+@pytest.fixture(scope="module")
+def long_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a take that is written in several blocks, with messages after 20 s that are not read."""
+    messages = [parameters(LEFT.parameters), details("Grace"), *scene_messages(LEFT, 600)]
+    messages += [parameters(LEFT.parameters, 2, utime=START_UTIME + 20_000_000), markers(2, 2000, version=2)]
+    return write_take(tmp_path_factory.mktemp("long") / "take.lcmlog", messages)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_progress_grows_up_to_the_end_of_each_step(long_take: Path, tmp_path: Path, name: str) -> None:
+    calls: list[Call] = []
+    job = job_for(name, long_take, tmp_path, progress=lambda *call: calls.append(call), to_s=5.5)
+    export_take(job)
+    steps = stages(calls)
+    names = [what for what, _ in steps]
+    assert len(set(names)) == len(names)
+    assert names[0] == "reading take.lcmlog"
+    assert any(what.startswith("writing ") for what in names)
+    assert steps.pop() == (f"saving {job.out.name}", [(f"saving {job.out.name}", 0, 0)])
+    for what, found in steps:
+        done = [each for _, each, _ in found]
+        assert done == sorted(done), what
+        assert {total for _, _, total in found} == {done[-1]}, what
+
+
+class Interruption:
+    """The progress of an export in which the user presses Ctrl-C at a certain call."""
+
+    def __init__(self, number: int) -> None:
+        self._remaining = number
+
+    def __call__(self, _what: str, _done: int, _total: int) -> None:
+        if not self._remaining:
+            raise KeyboardInterrupt
+        self._remaining -= 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_interruption_at_any_time_leaves_nothing(take: Path, tmp_path: Path, name: str) -> None:
+    for number in count():
+        job = job_for(name, take, tmp_path, progress=Interruption(number))
+        try:
+            export_take(job)
+        except KeyboardInterrupt:
+            assert list(tmp_path.rglob("*")) == []
+        else:
+            break
+    assert number >= 3  # reading, writing, saving
+    assert list(tmp_path.rglob("*")) != []
