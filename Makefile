@@ -43,7 +43,7 @@ test: .venv/installed
 # commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
-test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE)
+test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
@@ -117,8 +117,10 @@ screenshots: .venv/installed
 	tests/with-netns unshare --uts sh -c 'echo mocap-pc >/proc/sys/kernel/hostname && exec $(BIN)/python -m tests.screenshots'
 
 # Build a wheel for `pipx install dist/*.whl`, compiled for $(PYTHON) if possible.
+DIST := dist
+
 wheel:
-	@$(PYTHON) -B -m release.build wheel
+	@$(PYTHON) -B -m release.build --dist $(DIST) wheel
 
 # Everything that a release publishes, in dist/: for each file a bill of materials, the licences, and the check sums.
 # A further kind of file is a further target in ARTEFACTS. It puts its files, with a bill of its own, into dist/.
@@ -155,7 +157,7 @@ compiled: build/compiled/complete
 
 build/compiled/complete: .venv/installed $(shell find $(SOURCES) -type f ! -path '*__pycache__*')
 	rm -rf build/compiled
-	$(BIN)/python -B -m release.build --dist build/compiled/wheel wheel
+	$(MAKE) --no-print-directory wheel PYTHON=$(BIN)/python DIST=build/compiled/wheel
 	$(BIN)/pip install --quiet --no-deps --target build/compiled build/compiled/wheel/*.whl
 	touch $@
 
