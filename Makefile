@@ -26,7 +26,7 @@ BARE := build/bare-debian-12/complete
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-install test-compiled check lint types contracts generated docs site lcm-types examples \
+.PHONY: demo lock test test-slow test-install test-compiled check bytecode lint types contracts generated docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
     clone-url clean
@@ -56,7 +56,10 @@ test-install: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/logs/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
+# Left out are the properties of configurations, of parameters and of VRPN, whose code is not compiled.
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/logs/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
+    $(filter-out %/test_config_properties.py %_environment_properties.py %_parameters_properties.py %_vrpn_properties.py, \
+        $(wildcard tests/property/test_*.py)) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d stream) \
     $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
@@ -64,12 +67,16 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/log
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-# The tests use both cores, and wait often enough for the compiler and mypy to run beside them.
+# The tests use both cores, and wait often enough for the compiler, mypy and downloads to run beside them.
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs wheelhouse
-	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
+	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types wheelhouse
 	$(MAKE) --no-print-directory test-slow
 	$(MAKE) --no-print-directory test-compiled
+
+# Write the bytecode of the tests: six workers that start together would each compile all of them, in 10 s.
+bytecode: .venv/installed
+	-env --unset=PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest --collect-only -qq tests >/dev/null
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
