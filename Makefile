@@ -26,7 +26,7 @@ BARE := build/bare-debian-12/complete
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-install test-compiled check lint types contracts generated docs site lcm-types examples \
+.PHONY: demo lock test test-slow test-install test-compiled check bytecode lint types contracts generated docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
     clone-url clean
@@ -43,7 +43,7 @@ test: .venv/installed
 # commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
-test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE)
+test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
@@ -56,7 +56,10 @@ test-install: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/logs/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
+# Left out are the properties of configurations, of parameters and of VRPN, whose code is not compiled.
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/logs/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
+    $(filter-out %/test_config_properties.py %_environment_properties.py %_parameters_properties.py %_vrpn_properties.py, \
+        $(wildcard tests/property/test_*.py)) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d stream) \
     $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
@@ -64,12 +67,16 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/log
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-# The tests use both cores, and wait often enough for the compiler and mypy to run beside them.
+# The tests use both cores, and wait often enough for the compiler, mypy and downloads to run beside them.
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs wheelhouse
-	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
+	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types wheelhouse
 	$(MAKE) --no-print-directory test-slow
 	$(MAKE) --no-print-directory test-compiled
+
+# Write the bytecode of the tests: six workers that start together would each compile all of them, in 10 s.
+bytecode: .venv/installed
+	-env --unset=PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest --collect-only -qq tests >/dev/null
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
@@ -117,8 +124,10 @@ screenshots: .venv/installed
 	tests/with-netns unshare --uts sh -c 'echo mocap-pc >/proc/sys/kernel/hostname && exec $(BIN)/python -m tests.screenshots'
 
 # Build a wheel for `pipx install dist/*.whl`, compiled for $(PYTHON) if possible.
+DIST := dist
+
 wheel:
-	@$(PYTHON) -B -m release.build wheel
+	@$(PYTHON) -B -m release.build --dist $(DIST) wheel
 
 # Everything that a release publishes, in dist/: for each file a bill of materials, the licences, and the check sums.
 # A further kind of file is a further target in ARTEFACTS. It puts its files, with a bill of its own, into dist/.
@@ -155,7 +164,7 @@ compiled: build/compiled/complete
 
 build/compiled/complete: .venv/installed $(shell find $(SOURCES) -type f ! -path '*__pycache__*')
 	rm -rf build/compiled
-	$(BIN)/python -B -m release.build --dist build/compiled/wheel wheel
+	$(MAKE) --no-print-directory wheel PYTHON=$(BIN)/python DIST=build/compiled/wheel
 	$(BIN)/pip install --quiet --no-deps --target build/compiled build/compiled/wheel/*.whl
 	touch $@
 

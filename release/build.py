@@ -17,6 +17,7 @@ import sysconfig
 import tempfile
 import venv
 from collections.abc import Iterator, Mapping, Set
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -63,9 +64,11 @@ def build(kinds: Set[str], folder: Path) -> Iterator[Path]:
     sources, where Python would import it instead of them, so each wheel has its own copy of the sources.
     """
     python = folder / "tools/bin/python"
-    venv.create(folder / "tools", with_pip=True)
-    pip_install = (python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet")
-    run(*pip_install, "--require-hashes", "--requirement", ROOT / "release/build-requirements.txt")
+    has_pip = find_spec("pip") is not None  # Debian's Python has none
+    venv.create(folder / "tools", with_pip=not has_pip)
+    pip = (sys.executable, "-m", "pip", f"--python={python}") if has_pip else (python, "-m", "pip")
+    options = ("--disable-pip-version-check", "--quiet", "--no-compile", "--require-hashes")
+    run(*pip, "install", *options, "--requirement", ROOT / "release/build-requirements.txt")
     environment = reproducible_environment()
     hatchling = (python, "-m", "hatchling", "build", "--directory", folder / "built", "--target")
     run(*hatchling, "sdist", cwd=ROOT, env=environment)

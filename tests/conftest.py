@@ -31,11 +31,14 @@ settings.load_profile("gateway")
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
 _GROUPS: Final = {
-    "installation": ("tests/systemd/",),
+    "machine": ("tests/systemd/test_installing.py", "tests/systemd/test_service.py"),
+    "package": ("tests/systemd/",),
     "release": ("tests/release/",),
     "outages": ("tests/outages/",),
     "sites": ("tests/hostile/test_sites.py",),
     "proxy": ("tests/hostile/test_https_proxy.py",),
+    "browser": ("tests/view/", "tests/site/"),
+    "examples": tuple(f"tests/languages/test_{name}.py" for name in ("examples", "gaps", "live_examples")),
 }
 
 _NEEDS: Final = {
@@ -84,8 +87,8 @@ def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.Abstrac
 class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
     """Runs some groups of tests in one worker each.
 
-    Each test of the installation would boot a machine of its own, and each of the outages needs a core. Those
-    of two sites share both of them.
+    Otherwise each worker would install on a machine of its own, start a browser, and run gateways for the
+    examples. Each of the outages needs a core. Those of two sites share both of them.
     pytest-xdist's own groups have no effect with pytest 9.2.
     """
 

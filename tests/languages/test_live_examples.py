@@ -1,6 +1,5 @@
 """The five programs of docs/how-to/live-python.md, as printed there, with a gateway and simulators."""
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -27,10 +26,10 @@ ENDLESS = {
 SIMULATED = ("--markers", "3", "--tools", "1", "--analog", "2", "--plates", "1", "--rate", "100")
 
 
-@contextlib.contextmanager
-def two_sources(folder: Path) -> Iterator[str]:
-    """Run a gateway with the sources lab and stage; yield its endpoint."""
-    endpoint = free_endpoint()
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The Zenoh endpoint of a gateway with the sources lab and stage."""
+    folder, endpoint = tmp_path_factory.mktemp("gateway"), free_endpoint()
     with simulator(*SIMULATED) as (lab, _), simulator(*SIMULATED) as (stage, _):
         sources = [
             {"name": name, "host": "127.0.0.1", "port": port}
@@ -61,8 +60,8 @@ def test_the_page_has_the_program_as_it_is(name: str) -> None:
 
 @pytest.mark.netns
 @pytest.mark.parametrize("name", ENDLESS)
-def test_a_program_prints_live_data(name: str, tmp_path: Path) -> None:
-    with two_sources(tmp_path) as endpoint, run(name, endpoint) as process:
+def test_a_program_prints_live_data(name: str, endpoint: str) -> None:
+    with run(name, endpoint) as process:
         assert process.stdout is not None
         printed = []
         try:
@@ -76,11 +75,8 @@ def test_a_program_prints_live_data(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.netns
-def test_the_recorder_saves_what_it_has_received(tmp_path: Path) -> None:
-    with (
-        two_sources(tmp_path) as endpoint,
-        run("live_record.py", str(tmp_path / "a.npz"), endpoint) as process,
-    ):
+def test_the_recorder_saves_what_it_has_received(endpoint: str, tmp_path: Path) -> None:
+    with run("live_record.py", str(tmp_path / "a.npz"), endpoint) as process:
         output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
     assert "0 messages were dropped" in output

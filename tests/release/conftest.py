@@ -8,21 +8,21 @@ import pytest
 
 from tests.support.builds import Built, build
 from tests.support.fresh_clones import (
-    QUICK_CC,
     ROOT,
     SYSTEM_PYTHON,
     WHEELHOUSE_PYTHON,
     clone_into,
     pip_environment,
 )
+from tests.support.needs import need
 
 
 @pytest.fixture(scope="session")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Built:
-    """The wheel of this machine: compiled if there is a compiler."""
-    clone = tmp_path_factory.mktemp("clone")
-    clone_into(clone)
-    return build(clone, ["make", "wheel", f"PYTHON={WHEELHOUSE_PYTHON}"], CC=QUICK_CC)
+def compiled() -> Built:
+    """What `make compiled` has built with `make wheel`: it is compiled if there is a compiler."""
+    dist = ROOT / "build/compiled/wheel"
+    need(dist.exists(), "needs the compiled modules: run make compiled first")
+    return Built(dist, "")
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +41,8 @@ def python(pure: Built, tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--without-pip", folder], check=True)
     environment = {**os.environ, **pip_environment()}
     python = folder / "bin/python"
-    pip = [str(WHEELHOUSE_PYTHON), "-m", "pip", f"--python={python}", "install", "--quiet", "--no-deps"]
+    options = ("--quiet", "--no-deps", "--no-compile")
+    pip = [str(WHEELHOUSE_PYTHON), "-m", "pip", f"--python={python}", "install", *options]
     subprocess.run([*pip, "--requirement", str(ROOT / "requirements.txt")], env=environment, check=True)
     subprocess.run([*pip, str(pure.sdist)], env=environment, check=True)
     return python

@@ -22,7 +22,7 @@ from tests.support.needs import need_programs
 from tests.support.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.support.waiting import wait_until
 
-pytestmark = [pytest.mark.netns, pytest.mark.wheelhouse, pytest.mark.xdist_group("debian_package")]
+pytestmark = [pytest.mark.netns, pytest.mark.wheelhouse]
 
 IMAGE: Final = f"localhost/rtc3d-gateway:{__version__}"
 NAME: Final = "gateway"

@@ -15,25 +15,27 @@ from tests.support.builds import SYSTEM_PATH, Built, build, release
 from tests.support.fresh_clones import (
     COMPILED_MODULES,
     ROOT,
-    SYSTEM_PYTHON,
     WHEELHOUSE_PYTHON,
     clone_into,
     files_in,
     pip_environment,
-    skip_if_plain,
+    skip_without_compiler,
 )
+from tests.support.needs import need
 
-# The compiled modules take a minute on a busy machine.
-pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600), pytest.mark.xdist_group("release")]
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")
 def program(compiled: Built, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The program as pipx installs it from the wheel of this machine."""
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    packages = WHEELHOUSE_PYTHON.parents[1] / "lib" / version
+    need(packages.exists(), f"installs from the wheelhouse, which is not for {version}")
     home = tmp_path_factory.mktemp("home")
     folders = {f"PIPX_{name}": str(home / name) for name in ("HOME", "BIN_DIR", "MAN_DIR")}
-    environment = {"PATH": SYSTEM_PATH, "HOME": str(home), **folders, **pip_environment()}
-    pipx = [sys.executable, "-m", "pipx", "install", "--quiet", f"--python={SYSTEM_PYTHON}"]
+    environment = {"PATH": SYSTEM_PATH, "HOME": str(home), **folders, **pip_environment(), "PIP_COMPILE": "0"}
+    pipx = [sys.executable, "-m", "pipx", "install", "--quiet", f"--python={sys.executable}"]
     subprocess.run([*pipx, str(compiled.wheel)], env=environment, check=True)
     return home / "BIN_DIR" / "rtc3d-gateway"
 
@@ -71,7 +73,7 @@ def test_the_wheel_contains_message_types_and_configurations(
 
 
 def test_with_a_compiler_the_wheel_is_compiled_for_this_platform(compiled: Built) -> None:
-    skip_if_plain(compiled.output)
+    skip_without_compiler()
     modules = {
         name.partition(".")[0] + ".py"
         for name in compiled.names_in_wheel
@@ -83,7 +85,7 @@ def test_with_a_compiler_the_wheel_is_compiled_for_this_platform(compiled: Built
 
 def test_a_compiled_module_names_no_folder_of_the_machine_that_built_it(compiled: Built) -> None:
     """Otherwise another machine would not build the same bytes."""
-    skip_if_plain(compiled.output)
+    skip_without_compiler()
     wheel = zipfile.ZipFile(compiled.wheel)
     modules = [wheel.read(name) for name in compiled.names_in_wheel if name.endswith(".so")]
     assert not any(path in module for module in modules for path in (b"/tmp/", b"/include/python"))
@@ -91,7 +93,7 @@ def test_a_compiled_module_names_no_folder_of_the_machine_that_built_it(compiled
 
 def test_a_compiled_wheel_runs_with_old_versions_of_glibc(compiled: Built, tmp_path: Path) -> None:
     """pip refuses a wheel for ``linux`` from an index, and takes one for ``manylinux``."""
-    skip_if_plain(compiled.output)
+    skip_without_compiler()
     code = (
         "import pathlib, sys; from release.wheels import set_manylinux_tag; "
         "set_manylinux_tag(*map(pathlib.Path, sys.argv[1:]))"
@@ -113,10 +115,8 @@ def test_without_a_compiler_the_wheel_is_for_any_platform_and_the_build_reports_
     assert "missing: no-such-compiler (Debian: apt-get install gcc python3-dev)" in line
 
 
-def test_the_program_prints_its_version_and_that_it_is_compiled(
-    compiled: Built, program: Path, tmp_path: Path
-) -> None:
-    skip_if_plain(compiled.output)
+def test_the_program_prints_its_version_and_that_it_is_compiled(program: Path, tmp_path: Path) -> None:
+    skip_without_compiler()
     assert run(program, tmp_path, "--version") == f"rtc3d-gateway {__version__} (compiled)\n"
 
 

@@ -13,7 +13,7 @@ from tests.systemd.test_debian_package import package
 
 __all__ = ["package"]  # a fixture
 
-pytestmark = [pytest.mark.netns, pytest.mark.timeout(1800), pytest.mark.xdist_group("debian_package")]
+pytestmark = [pytest.mark.netns, pytest.mark.timeout(1800)]
 
 
 def test_lintian_finds_no_error(package: Path) -> None:

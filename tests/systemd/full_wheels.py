@@ -18,7 +18,6 @@ pytestmark = [
     pytest.mark.wheelhouse,
     pytest.mark.netns,
     pytest.mark.timeout(1800),
-    pytest.mark.xdist_group("wheels"),
 ]
 
 PIP: Final = f"{CLONE}/venv/bin/pip"

@@ -23,7 +23,6 @@ pytestmark = [
     pytest.mark.wheelhouse,
     pytest.mark.netns,
     pytest.mark.timeout(1800),
-    pytest.mark.xdist_group("debian_package"),
 ]
 
 FULL: Final = bool(os.environ.get("FULL_INSTALLATION"))

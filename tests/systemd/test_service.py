@@ -20,7 +20,6 @@ pytestmark = [
     pytest.mark.systemd,
     pytest.mark.wheelhouse,
     pytest.mark.netns,
-    pytest.mark.xdist_group("machine"),  # installed once
 ]
 
 STATE = "/var/lib/rtc3d-gateway"
