@@ -198,34 +198,6 @@ async def test_receivers_on_zenoh_and_lcm_learn_the_frame() -> None:
     assert in_status == {key: tuple(each) if isinstance(each, list) else each for key, each in FRAME.items()}
 
 
-# Files and recordings ------------------------------------------------------------------------
-
-
-RECORDING = "0000003c 00000003 00000001 00000030 00000005 ffffffff 0000000000000000 00000001 {} "
-RECORDING += "0000000000000000 ffffffff ffffffff ffffffff"
-"""A data packet with one event component of 48 bytes (30h), frame -1; {} is the id (field note 16)."""
-
-
-async def test_recordings_are_started_and_stopped_for_a_single_source() -> None:
-    async with gateway_with_server(remote_control=True) as (server, _, _, peer):
-        await query_all(peer, "mocap/**?set=start")
-        await query(peer, "mocap/lab/parameters?fresh=true")
-        assert server.received == []
-        options = "duration=900,durationunits=seconds"
-        reply = await query(peer, f"mocap/lab/recording?set=start;name=walk 1;options={options}")
-        assert reply.json == {"source": "lab", "sent": "start", "name": "walk 1", "is_named": True}
-        start = f"Recording Start,file=walk 1,{options}"
-        assert reply.attachment == {"reply": f"OK-{start}"}
-        assert (await query(peer, "mocap/lab/recording?set=stop")).json == {"source": "lab", "sent": "stop"}
-        assert server.commands[-2:] == [start, "Recording Stop"]
-        for change in ("start", "stop"):
-            assert (await query(peer, f"mocap/lab/recording?set={change}")).json["sent"] == change
-        await wait_until_async(lambda: len(server.received) == 2)
-        assert server.received == [
-            bytes.fromhex(RECORDING.format(event)) for event in ("00000001", "00000000")
-        ]
-
-
 # Selectors -----------------------------------------------------------------------------------
 
 

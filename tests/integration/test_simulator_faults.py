@@ -21,15 +21,12 @@ from gateway.simulator.faults import (
     Restart,
     Split,
 )
+from gateway.simulator.packet_faults import LateAcknowledgements
 from gateway.simulator.simulator import KINDS, Simulator
 from gateway.simulator.synthetic import SceneSettings
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
-    COMMAND,
-    NO_DATA,
-    command,
-)
+from tests.unit.rtc3d_server.wire import COMMAND, NO_DATA, command, packets_in
 
 FAST_HZ = 1000.0
 NEVER_MS = 600_000
@@ -197,6 +194,14 @@ async def test_a_cut_ends_a_connection_within_a_packet_or_resets_it() -> None:
             simulator.faults.begin(Cut(reset=True))
             with pytest.raises(ConnectionResetError):
                 await again.rest()
+
+
+async def test_bye_is_answered_before_the_connection_ends_despite_any_delay() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Delay(delay_ms=NEVER_MS))
+        simulator.faults.begin(LateAcknowledgements(delay_ms=NEVER_MS))
+        client.send(command("Version 1.0"), command("Bye"))
+        assert packets_in(await client.rest()) == [VERSION, (COMMAND, b"bye")]
 
 
 # Any fault ----------------------------------------------------------------------------------
