@@ -57,10 +57,6 @@ class Lab:
         wait_until(lambda: set(names) <= set(receiver.xml), TIMEOUT_S)
         return receiver
 
-    @property
-    def log(self) -> str:
-        return self.log_file.read_text()
-
     def close(self) -> None:
         self._exit.close()
 

@@ -35,14 +35,11 @@ class SettingsBuilder:
 
     def settings(self, sources: Mapping[str, int], **sections: Any) -> Any:
         """Return settings with sources by name and port; ``sections`` replace the default sections."""
-        own = {"zenoh": self.zenoh(), "lcm": self.lcm()}
+        own = {"zenoh": self.zenoh(), "lcm": LcmSettings(url=self.url)}
         return local_settings(*(local_source(port, name) for name, port in sources.items()), **own | sections)
 
     def zenoh(self, **keys: Any) -> ZenohSettings:
         return ZenohSettings(**{"config": zenoh_keys("peer", listen=self.endpoint), **keys})
-
-    def lcm(self, **keys: Any) -> LcmSettings:
-        return LcmSettings(**{"url": self.url, **keys})
 
 
 @asynccontextmanager
