@@ -39,6 +39,8 @@ def main() -> int:
     ]
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)  # `&` and nohup ignore them, and the tests would inherit that
+    # Otherwise, each worker and each program that a test starts would compile all that it imports.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # In a session of its own, pytest receives one signal for each Ctrl-C: that of ``stop``.
     pytest = subprocess.Popen([sys.executable, "-m", "pytest", *arguments], start_new_session=True)
 

@@ -28,7 +28,6 @@ from tests.contract.frame_rigs import (
     ALL,
     LAB,
     SOURCES,
-    ExampleRig,
     FrameRig,
     NoQueries,
     frame,
@@ -52,7 +51,7 @@ def _rig_of(name: str) -> type[FrameRig] | None:
     return rig
 
 
-RIGS: Final = {"example": ExampleRig} | {name: rig for name in OUTPUTS if (rig := _rig_of(name)) is not None}
+RIGS: Final = {name: rig for name in OUTPUTS if (rig := _rig_of(name)) is not None}
 """The rig of each output that takes whole frames."""
 
 
@@ -73,8 +72,6 @@ every_real_rig = rigs(are_real=True)
 can_be_cut = rigs(lambda rig: rig.listens or rig.has_router)
 has_router = rigs(lambda rig: rig.has_router)
 listens = rigs(lambda rig: rig.listens)
-knows_peers = rigs(lambda rig: rig.knows_peers)
-is_exact = rigs(lambda rig: rig.is_exact)
 converts = rigs(lambda rig: rig.converts)
 
 

@@ -16,11 +16,9 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from gateway.errors import QueryError
-from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
 from gateway.outputs.contract import Answer, KeyPath, Output, ServerParameters
-from gateway.outputs.kind import SubscriptionRequest
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
     MISSING,
@@ -30,7 +28,7 @@ from gateway.rtc3d.components import (
     ComponentType,
     encode_component,
 )
-from gateway.rtc3d.frames import Frame, detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -45,8 +43,6 @@ from gateway.rtc3d.parameters import (
     Tool,
 )
 from gateway.rtc3d.parameters_xml import encode_parameters
-from tests.support.example_output import ExampleOutput, ExampleSettings, ExampleSubscription
-from tests.support.networks import free_port
 
 LAB: Final = "lab"
 HALL: Final = "hall-2"
@@ -79,12 +75,6 @@ class FrameRig(ABC):
 
     has_router: ClassVar[bool] = False
     """Whether the output needs a router, which may come and go."""
-
-    knows_peers: ClassVar[bool] = True
-    """Whether ``wanted`` tells if there is a peer."""
-
-    is_exact: ClassVar[bool] = True
-    """Whether ``watch_wanted`` is exact: frames that nobody receives are not counted as sent."""
 
     converts: ClassVar[bool] = True
     """Whether peers get poses in metres and in the source's frame, not what the server sent."""
@@ -299,52 +289,3 @@ def stamp(version: int = 1) -> Stamp:
     """Return the stamp of a frame that has just arrived."""
     now_us = time.time_ns() // 1000
     return Stamp(now_us, now_us - 2000, session=1, parameters_version=version)
-
-
-# The rigs ------------------------------------------------------------------------------------------
-
-
-class _ExampleOutput(ExampleOutput):
-    def count_losses(self, _source: str, _losses: Losses) -> None:
-        """Count none: ``losses`` are those of the tests."""
-
-
-class ExampleRig(FrameRig):
-    """The example of an output, whose network is this process."""
-
-    converts = False
-    is_exact = False
-
-    def __init__(self) -> None:
-        self._received: list[Received] = []
-        self._settings = ExampleSettings(enabled=True, address=f"rig {free_port()}", whole_frames=True)
-        self._subscriptions: list[ExampleSubscription] = []
-        self.output = self.create()
-
-    def create(self) -> Output:
-        return _ExampleOutput(self._settings)
-
-    def _receive(self, name: str, message: bytes) -> None:
-        source, _, key = name.rpartition("/")
-        if key != "frame":
-            return
-        for each in split_frame(message, detect_byte_order(message, "big")).components:
-            if each.type is ComponentType.TOOLS:
-                xs = each.items()["x"].tolist()
-                self._received += [(source, x / 1000) for x in xs if not math.isnan(x)]
-
-    def subscribe(self) -> None:
-        address = self._settings.address
-        self._subscriptions.append(
-            ExampleSubscription(address, SubscriptionRequest(address=address), self._receive)
-        )
-
-    def unsubscribe(self) -> None:
-        while self._subscriptions:
-            self._subscriptions.pop().close()
-
-    def stall(self) -> None:
-        """Nothing can stall: the peer is called with each frame."""
-
-    def close(self) -> None:
-        self.unsubscribe()

@@ -20,7 +20,6 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber
 from gateway.takes.files.event_log import EventLogReader
 from tests.support.lcm_relay import LcmRelay
-from tests.support.memory_output import MemoryOutput
 from tests.support.needs import need_programs
 from tests.support.networks import (
     add_multicast_route,
@@ -68,28 +67,6 @@ class Rig(Protocol):
 
     def close(self) -> None:
         """Close the subscriber and the network."""
-
-
-class MemoryRig:
-    remedies = ("start it",)
-
-    def __init__(self) -> None:
-        self.names = {MARKERS: "lab/3d", ANALOG: "lab/analog", PROBE: "hall-2/6d/Probe 1"}
-        self.output = MemoryOutput()
-
-    @property
-    def received(self) -> list[tuple[str, bytes]]:
-        return [("/".join((topic.source, *topic.path)), message) for topic, message in self.output.messages]
-
-    def subscribe(self) -> None: ...
-
-    def cut(self) -> None:
-        self.output.is_open = False
-
-    def restore(self) -> None:
-        self.output.is_open = True
-
-    def close(self) -> None: ...
 
 
 class ZenohRig:

@@ -9,7 +9,7 @@ import threading
 from gateway.outputs.registry import OUTPUTS
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
-from tests.contract.frame_lab import RIGS, Lab, every_real_rig, every_rig, is_exact, knows_peers, lab, offered
+from tests.contract.frame_lab import RIGS, Lab, every_real_rig, every_rig, lab, offered
 from tests.contract.frame_rigs import ALL, HALL, LAB, SOURCES, frame, labelled, odd_frames, stamp
 from tests.support.waiting import wait_until_async
 
@@ -39,7 +39,7 @@ async def test_frames_arrive_in_order_under_the_name_of_their_source(lab: Lab) -
     assert {source: lab.lost(source) for source in SOURCES} == {source: {} for source in SOURCES}
 
 
-@is_exact
+@every_rig
 async def test_frames_that_nobody_receives_do_not_count_as_sent(lab: Lab) -> None:
     lab.serve()
     await lab.open()
@@ -73,7 +73,7 @@ async def test_a_second_peer_receives_as_well(lab: Lab) -> None:
     await wait_until_async(both_receive)
 
 
-@knows_peers
+@every_rig
 async def test_only_frames_for_peers_are_wanted(lab: Lab) -> None:
     lab.serve()
     await lab.open()
@@ -93,27 +93,23 @@ async def test_only_frames_for_peers_are_wanted(lab: Lab) -> None:
     await lab.subscribe()
 
 
-@knows_peers
+@every_rig
 async def test_each_change_of_what_is_wanted_is_reported_in_the_event_loop(lab: Lab) -> None:
-    """If it is exact."""
     threads: list[str] = []
     publisher = lab.output.frame_publisher(LAB)
     assert publisher is not None
-    is_exact = lab.output.watch_wanted(LAB, lambda: threads.append(threading.current_thread().name))
-    assert is_exact is lab.rig.is_exact
+    assert lab.output.watch_wanted(LAB, lambda: threads.append(threading.current_thread().name))
     lab.output.announce(LAB)
     lab.set_parameters(LAB, labelled())
     lab.serve(HALL)
     await lab.open()
     await asyncio.to_thread(lab.rig.subscribe)
     await wait_until_async(lambda: publisher.wants(WIRE_ORDER))
-    if is_exact:
-        await wait_until_async(lambda: threads)
-        threads.clear()
+    await wait_until_async(lambda: threads)
+    threads.clear()
     await asyncio.to_thread(lab.rig.unsubscribe)
     await wait_until_async(lambda: not publisher.wants(WIRE_ORDER))
-    if is_exact:
-        await wait_until_async(lambda: threads)
+    await wait_until_async(lambda: threads)
     assert set(threads) <= {threading.current_thread().name}
     publisher.close()
     lab.output.withdraw(LAB)

@@ -14,23 +14,21 @@ from tests.contract.rigs import (
     PROBE,
     LcmRelayRig,
     LcmRig,
-    MemoryRig,
     Rig,
     TakesRig,
     ZenohRig,
 )
 from tests.support.waiting import wait_until
 
-NETWORKED = [
+RIGS = [
     pytest.param(ZenohRig, id="zenoh"),
     pytest.param(LcmRig, id="lcm-multicast", marks=pytest.mark.netns),
     pytest.param(LcmRelayRig, id="lcm-relay"),
     pytest.param(TakesRig, id="takes"),
 ]
-without_memory = pytest.mark.parametrize("rig", NETWORKED, indirect=True)
 
 
-@pytest.fixture(params=[pytest.param(MemoryRig, id="memory"), *NETWORKED])
+@pytest.fixture(params=RIGS)
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     rig: Rig = request.param()
     try:
@@ -194,7 +192,6 @@ def test_sources_can_be_announced_and_withdrawn_in_any_state(rig: Rig) -> None:
 # Reconnecting -------------------------------------------------------------------------------------
 
 
-@without_memory
 def test_an_output_started_without_a_network_sends_once_the_network_works(rig: Rig) -> None:
     rig.cut()
     rig.output.start()
@@ -234,7 +231,6 @@ def test_a_lost_network_is_reported_and_messages_leave_again_once_it_is_back(rig
     assert not {message for _, message in rig.received} & set(sending.refused)
 
 
-@without_memory
 def test_closing_is_safe_without_a_network(rig: Rig) -> None:
     rig.cut()
     rig.output.start()

@@ -10,7 +10,7 @@ from tests.support.gateway_process import GatewayProcess, gaps, gateway_process,
 from tests.support.needs import need_programs
 from tests.support.waiting import wait_until
 
-RATE_HZ: Final = 200
+RATE_HZ: Final = 100
 
 SHIM: Final = r"""
 #define _GNU_SOURCE

@@ -20,10 +20,9 @@ from gateway.service.gateway import Gateway
 from gateway.simulator.faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.support.networks import free_port, lcm_url, open_zenoh
+from tests.support.networks import lcm_url, open_zenoh
 from tests.support.queried_gateway import (
     ParameterServer,
-    parameters_xml,
     query,
     run_gateway,
     wait_until_cached,
@@ -49,8 +48,6 @@ class Listener:
         """The versions of frames that arrived before the parameters."""
         self.poses: set[str] = set()
         """The keys or channels of poses per tool."""
-        self.newest: Any = None
-        """The newest message with parameters on LCM."""
 
     def on_parameters(self, xml: bytes, version: int) -> None:
         self.versions.append(version)
@@ -74,7 +71,6 @@ class Listener:
     def on_lcm(self, channel: str, data: bytes) -> None:
         match decode(data):
             case rtc3d.parameters_t() as message:
-                self.newest = message
                 self.on_parameters(message.xml.encode(), message.parameters_version)
             case rtc3d.markers_t() as message:
                 self.on_frame(message.parameters_version)
@@ -127,29 +123,6 @@ async def gateway_with_cache(server: ParameterServer, router: str, url: str) -> 
         yield gateway
 
 
-async def test_parameters_are_published_for_every_connection(router: str) -> None:
-    port, url = free_port(), lcm_url()
-    first, second = ParameterServer("Marker before"), ParameterServer("Marker after")
-    with listeners(router, url) as (on_zenoh, on_lcm):
-        async with run_gateway(port, router=router, lcm_url=url) as gateway:
-            async with ScriptedServer(first.script, port):
-                await on_zenoh.wait_for(first.xml)
-                await on_lcm.wait_for(first.xml)
-                message = on_lcm.newest
-                assert (message.sequence, message.session, message.parameters_version) == (0, 1, 1)
-                assert message.capture_utime <= message.utime
-            async with ScriptedServer(second.script, port):
-                await on_zenoh.wait_for(second.xml)
-                await on_lcm.wait_for(second.xml)
-                assert on_lcm.newest.session > message.session
-                assert (on_zenoh.versions[0], on_zenoh.versions[-1], on_lcm.versions[-1]) == (1, 2, 2)
-                await wait_until_cached(gateway)
-                with zenoh_peer(router) as peer:
-                    reply = await query(peer, KEY)
-                    assert (reply.payload, reply.attachment["parameters_version"]) == (second.xml, 2)
-                    assert (await query(peer, "mocap/lab/3d")).attachment["parameters_version"] == 2
-
-
 async def test_late_subscribers_get_the_parameters_without_asking_the_server_and_others_not_again(
     router: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,18 +140,6 @@ async def test_late_subscribers_get_the_parameters_without_asking_the_server_and
                 await query(peer, KEY)
             assert len(on_zenoh.xml) == num_before
         assert server.commands == commands
-
-
-async def test_a_change_found_by_a_fresh_query_is_published(router: str) -> None:
-    server, url = ParameterServer(), lcm_url()
-    with listeners(router, url) as (on_zenoh, on_lcm):
-        async with gateway_with_cache(server, router, url):
-            with zenoh_peer(router) as peer:
-                for marker, key in (("One more", KEY), ("Another", f"{KEY}/3d")):
-                    server.xml = parameters_xml(marker)
-                    assert marker.encode() in (await query(peer, f"{key}?fresh=true")).payload
-                    await on_zenoh.wait_for(server.xml)  # all parameters, also for one section
-                    await on_lcm.wait_for(server.xml)
 
 
 async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(

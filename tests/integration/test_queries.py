@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import rtc3d
-import zenoh
 
 from gateway.config.settings import StreamSettings
 from gateway.messages.decode import decode, to_json
@@ -115,19 +114,6 @@ async def test_on_lcm_parameters_are_the_servers_xml() -> None:
 # Frames, schemas and the coordinate frame -----------------------------------------------------
 
 
-async def test_without_frames_the_current_frame_is_requested() -> None:
-    """It is no part of the stream, so it has no number of its own."""
-    server = ParameterServer()
-    server.has_measurement = False
-    async with gateway_with_server(server) as (_, _, gateway, peer):
-        [status] = gateway.sources[0].statuses
-        await wait_until_async(lambda: status.state.value == "no measurement")
-        server.has_measurement = True
-        message = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
-        assert (message.frame_number, message.sequence, message.session) == (7, -1, 1)
-        assert server.commands[-1] == "SendCurrentFrame 3D"
-
-
 USE_SCHEMAS = """
 import importlib, pathlib, sys
 for folder in sorted(pathlib.Path(sys.argv[1]).iterdir()):
@@ -212,53 +198,6 @@ async def test_receivers_on_zenoh_and_lcm_learn_the_frame() -> None:
     assert in_status == {key: tuple(each) if isinstance(each, list) else each for key, each in FRAME.items()}
 
 
-# Files and recordings ------------------------------------------------------------------------
-
-
-async def test_a_c3d_file_is_stored_announced_and_answered(tmp_path: Path) -> None:
-    content, second = c3d_file(bytes(range(256)) * 1000, 300_000), c3d_file(b"the second")
-    async with gateway_with_server(spool=tmp_path) as (server, _, _, peer):
-        assert (await query(peer, "mocap/lab/c3d")).code == "nothing-yet"
-        announced: list[zenoh.Sample] = []
-        peer.declare_subscriber("mocap/lab/c3d", announced.append)
-        await query(peer, "mocap/lab/status")  # its reply arrives after the subscription is active
-        server.send(packet(5, content))
-        await wait_until_async(lambda: announced)
-        assert str(announced[0].encoding) == "application/json"
-        description = json.loads(announced[0].payload.to_bytes())
-        reply = await query(peer, "mocap/lab/c3d")
-        assert (reply.payload, reply.attachment) == (content, description)
-        assert (tmp_path / description["name"]).read_bytes() == content
-        server.send(packet(5, second))
-        await wait_until_async(lambda: len(announced) == 2)
-        assert (await query(peer, "mocap/*/c3d")).payload == second
-
-
-RECORDING = "0000003c 00000003 00000001 00000030 00000005 ffffffff 0000000000000000 00000001 {} "
-RECORDING += "0000000000000000 ffffffff ffffffff ffffffff"
-"""A data packet with one event component of 48 bytes (30h), frame -1; {} is the id (field note 16)."""
-
-
-async def test_recordings_are_started_and_stopped_for_a_single_source() -> None:
-    async with gateway_with_server(remote_control=True) as (server, _, _, peer):
-        await query_all(peer, "mocap/**?set=start")
-        await query(peer, "mocap/lab/parameters?fresh=true")
-        assert server.received == []
-        options = "duration=900,durationunits=seconds"
-        reply = await query(peer, f"mocap/lab/recording?set=start;name=walk 1;options={options}")
-        assert reply.json == {"source": "lab", "sent": "start", "name": "walk 1", "is_named": True}
-        start = f"Recording Start,file=walk 1,{options}"
-        assert reply.attachment == {"reply": f"OK-{start}"}
-        assert (await query(peer, "mocap/lab/recording?set=stop")).json == {"source": "lab", "sent": "stop"}
-        assert server.commands[-2:] == [start, "Recording Stop"]
-        for change in ("start", "stop"):
-            assert (await query(peer, f"mocap/lab/recording?set={change}")).json["sent"] == change
-        await wait_until_async(lambda: len(server.received) == 2)
-        assert server.received == [
-            bytes.fromhex(RECORDING.format(event)) for event in ("00000001", "00000000")
-        ]
-
-
 # Selectors -----------------------------------------------------------------------------------
 
 
@@ -327,6 +266,3 @@ async def test_through_a_router_a_wildcard_for_sources_is_answered_by_every_sour
             replies = {reply.key: reply.payload for reply in await query_all(peer, "mocap/*/parameters")}
             assert replies == {"mocap/lab/parameters": first.xml, "mocap/hall/parameters": second.xml}
             assert (await query(peer, "mocap/lab/markers")).code == "bad-request"
-
-
-# Limits and failures -------------------------------------------------------------------------

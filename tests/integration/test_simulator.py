@@ -224,18 +224,6 @@ async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it
     assert caplog.text.count("does not read") == 1
 
 
-async def test_a_client_can_disconnect_while_it_streams() -> None:
-    async with Simulator(CountingScene(FAST_HZ)) as simulator:
-        async with connected(simulator) as client:
-            await client.ask("StreamFrames")
-            await client.frames(3)
-            client.writer.transport.abort()
-        await until(lambda: not simulator.connections)
-        async with connected(simulator) as client:
-            await client.ask("StreamFrames 3D")
-            assert consecutive(await client.frames(20))
-
-
 async def test_sent_frames_are_counted_for_each_client_and_in_total() -> None:
     received: Counter[str] = Counter()
     num_frames = 0

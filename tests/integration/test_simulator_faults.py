@@ -12,7 +12,6 @@ import pytest
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.simulator.faults import (
-    ChangeScene,
     Cut,
     Delay,
     Fault,
@@ -27,13 +26,7 @@ from gateway.simulator.simulator import KINDS, Simulator
 from gateway.simulator.synthetic import SceneSettings
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
-    COMMAND,
-    NO_DATA,
-    WireComponent,
-    command,
-    packets_in,
-)
+from tests.unit.rtc3d_server.wire import COMMAND, NO_DATA, command, packets_in
 
 FAST_HZ = 1000.0
 NEVER_MS = 600_000
@@ -74,20 +67,6 @@ async def clear_and_check(simulator: Simulator, client: RawClient) -> None:
 # The server ---------------------------------------------------------------------------------
 
 
-async def test_the_measurement_can_stop_and_start() -> None:
-    async with playing() as (simulator, client):
-        await client.ask("StreamFrames 3D")
-        await client.frames(5)
-        first = simulator.faults.begin(NoMeasurement())
-        second = simulator.faults.begin(NoMeasurement())
-        assert await client.reply() == (NO_DATA, b"")
-        simulator.faults.end(first)
-        assert simulator.elapsed_us() is None
-        simulator.faults.end(second)
-        assert numbers(await client.frames(5)) == [1, 2, 3, 4, 5]
-        await clear_and_check(simulator, client)
-
-
 async def test_a_restarted_server_plays_its_recording_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """With ``once``, each measurement waits for the first request for frames again."""
     monkeypatch.setattr("gateway.rtc3d_server.measurement.LEAD_US", 10_000)
@@ -116,30 +95,6 @@ async def test_a_server_whose_port_was_taken_comes_back_when_it_is_free(
         await until(lambda: simulator.is_listening)
         async with connected(simulator) as again:
             assert await again.ask("Version 1.0") == VERSION
-
-
-async def frames_up_to(client: RawClient, num_markers: int) -> list[list[WireComponent]]:
-    frames: list[list[WireComponent]] = []
-    async with asyncio.timeout(TIMEOUT_S):
-        while not frames or len(frames[-1][0].items) != num_markers:
-            frames += await client.frames(1)
-    return frames
-
-
-async def test_the_scene_changes_during_a_stream_and_back() -> None:
-    async with playing() as (simulator, client):
-        await client.ask("StreamFrames 3D")
-        frames = await client.frames(5)
-        scene = SceneSettings(markers=7, rate_hz=FAST_HZ, marker_label="M")
-        change = simulator.faults.begin(ChangeScene(scene=scene))
-        frames += await frames_up_to(client, num_markers=7)
-        described = simulator.scene.parameters.markers
-        assert described is not None
-        assert [marker.label for marker in described.markers] == [f"M {k}" for k in range(1, 8)]
-        simulator.faults.end(change)
-        frames += await frames_up_to(client, num_markers=2)
-        assert consecutive(frames)
-        await clear_and_check(simulator, client)
 
 
 async def test_a_restarted_server_has_the_same_port_a_new_measurement_and_the_new_markers() -> None:

@@ -41,6 +41,9 @@ class ExampleSettings(OutputSettings):
     whole_frames: Switch = False
     """Whether whole frames are published instead of single components."""
 
+    tool_poses: Switch = False
+    """Whether each tool has a topic of its own."""
+
 
 class ExampleSubscription:
     """Receives what is published at ``address``, of all sources or of one, in the publisher's thread."""
@@ -134,6 +137,7 @@ class ExampleOutput(Output):
 
     def __init__(self, settings: ExampleSettings) -> None:
         self.settings = settings
+        self.has_tool_poses = settings.tool_poses
         self.is_open = False
         self.topics: list[Topic] = []
         self.announced: set[str] = set()
@@ -169,8 +173,9 @@ class ExampleOutput(Output):
         self.num_maintained += 1
 
     def is_configured_like(self, other: Output) -> bool:
-        """Return whether the settings are the same."""
-        return isinstance(other, ExampleOutput) and self.settings == other.settings
+        """Return whether the settings are the same, but for the poses of tools."""
+        poses = {"tool_poses": self.settings.tool_poses}
+        return isinstance(other, ExampleOutput) and self.settings == other.settings.model_copy(update=poses)
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count one ignored request for every source."""

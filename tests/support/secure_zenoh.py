@@ -70,7 +70,7 @@ def run_gateway_with_simulator(
 ) -> Iterator[Path]:
     """Run a simulator and a gateway with ``zenoh_config``, as YAML; yield its log file once frames arrive."""
     log = folder / "gateway.log"
-    with simulator("--rate", "50") as (port, _), log.open("wb") as output:
+    with simulator("--rate", "50", "--analog-rate", "50") as (port, _), log.open("wb") as output:
         zenoh = {"config": yaml.safe_load(zenoh_config)}
         spool = {"directory": str(folder / "spool")}
         config = write_config(folder / "gateway.yaml", port, zenoh=zenoh, spool=spool)

@@ -57,11 +57,12 @@ async def lab() -> AsyncIterator[Lab]:
 async def test_without_a_gateway_all_commands_say_the_same(side: str) -> None:
     """Scripts see a status and one line with what to check; only echo waits for a gateway."""
     place = Lab(ParameterServer(), free_endpoint(), lcm_url())
-    commands = ("list", "params", "top", "top --once", "top --once --json", "echo --seconds 8", "list --json")
+    commands = ["list", "params", "top", "top --once", "top --once --json", "take stop"]
+    commands += ["echo --seconds 8", "list --json"]
     router = await asyncio.to_thread(open_zenoh, "router", listen=place.endpoint)
     with contextlib.closing(router):
         ended = await asyncio.gather(*(run(*each.split(), *place.options(side)) for each in commands))
-    assert [done.status for done in ended] == [3, 3, 3, 3, 3, 0, 3]
+    assert [done.status for done in ended] == [3, 3, 3, 3, 3, 3, 0, 3]
     assert {done.stdout for done in ended[:-1]} == {""}
     assert json.loads(ended[-1].stdout) == {"sources": [], "num_left_out": 0}
     [sentence] = {done.stderr for done in ended}

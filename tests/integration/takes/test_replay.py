@@ -166,10 +166,8 @@ async def test_the_parameters_of_a_replay_can_be_queried(tmp_path: Path, subscri
         tokens = [str(reply.ok.key_expr) for reply in subscribers.session.liveliness().get("**") if reply.ok]
         assert sorted(tokens) == ["replay/lab/alive", "replay/lab/server"]
         on_lcm = ("--lcm", "--url", subscribers.url, "--prefix", "REPLAY")
-        on_zenoh = ("--connect", subscribers.endpoint, "--prefix", "replay")
-        for options in (on_lcm, on_zenoh):
-            ended = await run("params", "--json", "--source", "lab", *options)
-            assert json.loads(ended.stdout)["lab"]["parameters"]["3d"]["markers"][0]["label"] == "hand"
+        ended = await run("params", "--json", "--source", "lab", *on_lcm)
+        assert json.loads(ended.stdout)["lab"]["parameters"]["3d"]["markers"][0]["label"] == "hand"
 
 
 async def test_a_replay_does_not_mix_with_somebody_else(tmp_path: Path, subscribers: Subscribers) -> None:

@@ -58,15 +58,6 @@ def test_up_and_angles_turn_about_fixed_axes(transform: dict[str, Any], axes: li
     assert [moved(frame, 1, 0, 0), moved(frame, 0, 1, 0), moved(frame, 0, 0, 1)] == axes
 
 
-def test_the_rotation_follows_up_and_the_translation_follows_both() -> None:
-    frame = frame_of("mm", up="y", rotation_deg={"yaw": 90}, translation_m=[10, 0, 1])
-    assert moved(frame, 0, 0, 1000) == [11, 0, 1]  # to -y by up, to x by yaw
-    half = round(math.sqrt(0.5), 3)
-    turned = frame_of("m", rotation_xyzw=[0, 0, half, half]).rotation_xyzw
-    assert turned == pytest.approx(frame_of("m", rotation_deg={"yaw": 90}).rotation_xyzw)
-    assert math.hypot(*turned) == pytest.approx(1)
-
-
 NUMBER = "expected a number from -1000000 to 1000000"
 QUATERNION = "expected a list of four numbers, x y z w, such as [0, 0, 0, 1]"
 

@@ -236,6 +236,17 @@ async def test_a_changed_output_is_replaced_and_its_numbers_continue(
     assert events[2:5] == [("stop queries", "local"), ("close", "local"), ("start", "new")]
 
 
+async def test_switching_tool_poses_keeps_the_output() -> None:
+    async with running(settings()) as gateway:
+        output = example(gateway)
+        for is_on in (True, False, True):
+            section = ExampleSettings(enabled=True, tool_poses=is_on)
+            changed = settings().model_copy(update={"example": section})
+            assert await gateway.reload(changed) == ["output example changed"]
+            assert await gateway.reload(changed) == []
+            assert (example(gateway), gateway.outputs[0].has_tool_poses) == (output, is_on)
+
+
 async def test_a_new_output_gets_the_known_parameters_and_the_state_of_every_source(servers: Servers) -> None:
     async with streaming(settings("lab", "hall")) as gateway:
         servers["lab"].connection.send_frames(1)

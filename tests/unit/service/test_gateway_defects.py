@@ -89,7 +89,7 @@ async def test_a_defect_in_one_source_is_logged_once_and_the_source_recovers(
     failing = let_fail(monkeypatch, owner, method)
     async with streaming(settings("lab", "hall")) as gateway:
         failing.add("lab")
-        for _ in range(60):  # the servers send frames, and that of lab breaks off
+        for _ in range(20):  # the servers send frames, and that of lab breaks off
             for name in ("lab", "hall"):
                 servers[name].connection.send_frames(1)
             await asyncio.sleep(1)

@@ -181,17 +181,6 @@ async def test_the_source_shows_streaming_while_any_stream_has_frames(new_lab: N
             assert lab.output.streaming[-1] is is_streaming
 
 
-async def test_a_source_that_replaces_another_continues_its_numbers(new_lab: NewLab) -> None:
-    before = new_lab(streams=TWO_STREAMS)
-    before.source.history.sessions.newest = 5
-    before.source.history.parameters_version = 7
-    before.source.publish_status()
-    after = new_lab(before.source.history)
-    assert [(each.session, each.parameters_version) for each in after.source.statuses] == [(5, 7)]
-    after.source.publish_status()
-    assert [message.sequence for message in after.messages("status")] == [1]
-
-
 async def test_a_file_is_stored_and_announced(
     new_lab: NewLab, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -207,22 +207,6 @@ async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
 # --- C3D files
 
 
-async def test_a_c3d_file_is_passed_on_in_pieces_until_the_session_ends(lab: Lab) -> None:
-    await lab.streaming()
-    file = packet(5, b"content")
-    lab.connection.send(file[:11])
-    lab.connection.send(file[11:])
-    assert (lab.files.pieces, lab.files.interruptions) == ([b"con", b"tent"], [])
-    lab.connection.send(file[:-1])
-    lab.server.closes_at_bye = False
-    closing = asyncio.create_task(lab.session.close())
-    await settle()
-    assert lab.files.interruptions == ["the connection to 192.0.2.20:3020 was closed by the gateway"]
-    lab.connection.send(b"t" + packet(5, b"another"))
-    assert lab.files.pieces[2:] == [b"conten"]
-    await closing
-
-
 async def send_slowly(lab: Lab, pause_s: float) -> None:
     file = packet(5, bytes(20))
     lab.connection.send(file[:9])

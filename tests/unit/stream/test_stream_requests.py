@@ -9,7 +9,7 @@ import pytest
 from gateway.errors import LinkError, RequestError, SilenceError
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.stream.state import StreamState
-from tests.support.clocks import settle, until
+from tests.support.clocks import until
 from tests.support.servers import error, markers_frame, ok, packet
 from tests.unit.stream.scripted_server import BROKEN_FRAME, XML, Answer, obliging, refusing, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, now_s
@@ -295,12 +295,3 @@ async def test_a_refused_or_ignored_stop_leaves_the_stream_as_it_is() -> None:
     assert not stopping.done()
     assert await stopping
     assert lab.status.rate == ""
-
-
-async def test_the_end_of_the_connection_ends_the_handshake() -> None:
-    lab = Lab(silent_to(""))
-    starting = asyncio.create_task(lab.start())
-    await settle()
-    lab.connection.end()
-    with pytest.raises(LinkError, match="was closed by the server"):
-        await starting

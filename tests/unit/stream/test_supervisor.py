@@ -20,7 +20,7 @@ from gateway.stream.replies import Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.supervisor import STEADY_S, Backoff, Callbacks, Listener, Supervisor
-from tests.support.clocks import STEP_S, read_clocks, settle, until
+from tests.support.clocks import STEP_S, read_clocks, until
 from tests.support.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
 from tests.unit.stream.session_lab import CollectedFiles
@@ -315,41 +315,12 @@ def _raise_defect(*_: object) -> None:
     raise ZeroDivisionError("by the test")
 
 
-async def test_there_is_a_session_from_the_handshake_to_the_end() -> None:
-    lab = Lab()
-    lab.server.answer = silent_to("Version")
-    async with running(lab):
-        await until(lambda: lab.server.connections)
-        assert lab.supervisor.session is None  # the handshake is not done
-        await lab.ready()
-        lab.server.refuses = True
-        lab.server.connection.end()
-        await settle()
-        assert lab.supervisor.session is None
-
-
 async def test_cancelling_sends_bye() -> None:
     lab = Lab()
     async with running(lab):
         await lab.ready()
     assert lab.server.connection.commands[-1] == "Bye"
     assert not lab.server.connection.is_open
-
-
-async def test_the_tasks_of_a_session_end_with_it() -> None:
-    """Each session has one task, which follows the demand."""
-    lab = Lab(on_demand=True)
-    tasks_before = len(asyncio.all_tasks())
-    async with running(lab):
-        await lab.ready()
-        await settle()
-        tasks_of_one = len(asyncio.all_tasks())
-        lab.server.connection.end()
-        await lab.ready(2)
-        await settle()
-        assert len(asyncio.all_tasks()) == tasks_of_one
-    await settle()
-    assert len(asyncio.all_tasks()) == tasks_before
 
 
 async def test_records_carry_the_source_the_stream_and_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -360,16 +331,6 @@ async def test_records_carry_the_source_the_stream_and_the_server(monkeypatch: p
     async with running(lab):
         await until(lambda: seen)
     assert seen == [{"source": "lab", "stream": "3d", "peer": "192.0.2.20:3020"}]
-
-
-async def test_files_and_restarts_of_the_server_are_passed_on() -> None:
-    lab = Lab()
-    async with running(lab):
-        await lab.ready()
-        lab.server.connection.send_frames(1000)
-        lab.server.connection.send_frames(1)
-        lab.server.connection.send(packet(5, b"C3D"))
-    assert (lab.restarts, lab.files.pieces) == (1, [b"C3D"])
 
 
 async def test_frames_that_stay_late_halve_the_rate() -> None:

@@ -159,22 +159,6 @@ async def test_a_number_of_channels_that_goes_up_and_down_is_counted_and_not_fol
 # Subscriptions --------------------------------------------------------------------------------
 
 
-async def test_a_source_is_wanted_while_a_viewer_subscribes_to_its_frames() -> None:
-    async with serving("lab", "hall") as (port, [lab, hall]):
-        await lab.wait_until_wanted(False)
-        async with viewing(port, "/lab/markers") as first:
-            await lab.wait_until_wanted()
-            async with viewing(port, "/lab/tools", "/lab/parameters"):
-                first.unsubscribe("/lab/markers")
-                for topic in ("plates", "parameters", "events"):
-                    first.subscribe(f"/hall/{topic}")
-                await hall.wait_until_wanted()
-                await lab.wait_until_wanted()
-            await lab.wait_until_wanted(False)
-            first.unsubscribe("/hall/events")
-            await hall.wait_until_wanted(False)
-
-
 async def test_the_components_of_the_topics_that_viewers_subscribe_to_are_wanted() -> None:
     """Frames without any of them do not count as sent."""
     async with watching("/lab/markers", "/lab/plates", given=channels("EMG 1")) as (lab, viewer):

@@ -1,7 +1,6 @@
 """The output for ROS 2: sources, subscribers and life cycle, and what a real router shows of it."""
 
 import asyncio
-import threading
 from typing import Any
 
 import pytest
@@ -180,17 +179,6 @@ def test_closing_ends_the_thread_and_the_session(monkeypatch: pytest.MonkeyPatch
     assert not lab.output.offer(lambda: None)
     lab.output.submit(lambda: None)
     assert lab.sender.calls == [lab.output._undeclare_all]
-
-
-def test_an_output_that_was_never_started_has_no_threads() -> None:
-    """The doctor and the configuration only look at it."""
-    before = threading.active_count()
-    output = Ros2Output(Ros2Settings(enabled=True))
-    output.frame_publisher("lab")
-    output.publish_parameters("lab", parameters(("wand",)))
-    assert threading.active_count() == before
-    output.close()
-    assert not output.health().connected
 
 
 # With a real router -------------------------------------------------------------------------

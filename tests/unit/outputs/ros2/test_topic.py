@@ -6,9 +6,8 @@ import struct
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_typestore
 
-from gateway.messages.ros2 import HUMBLE, ROS_TYPES, TF_MESSAGE, RosType
+from gateway.messages.ros2 import TF_MESSAGE, RosType
 from gateway.messages.ros2_names import MAX_PART_CHARS, ros_name, unique_ros_names
 from gateway.outputs.ros2.topic import Node, QoS, SeenEntity, attachment, data_key, gid_of, seen_entity
 
@@ -78,19 +77,6 @@ def test_gids_are_those_that_nodes_compute_from_the_token(token: str, low: int, 
 def test_defaults_of_rmw_zenoh_are_left_out_of_tokens(qos: QoS, code: str) -> None:
     """A node encodes a token anew before it hashes it; a default that is written changes the gid."""
     assert qos.code == code
-
-
-@pytest.mark.parametrize("ros_type", ROS_TYPES, ids=lambda ros_type: ros_type.name)
-@pytest.mark.parametrize("store", [Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL])
-def test_hashes_are_those_of_rosbags(ros_type: RosType, store: Stores) -> None:
-    """rosbags computes them from the definitions.
-
-    The wheels of ROS 2 Jazzy and Kilted have the same ones (share/PACKAGE/msg/TYPE.json). They lack tf2_msgs,
-    but calculate_type_hash of their rosidl_generator_type_description returns its hash.
-    """
-    assert get_typestore(store).hash_rihs01(ros_type.name) == ros_type.type_hash
-    assert ros_type.hash_in("jazzy") == ros_type.type_hash
-    assert ros_type.hash_in(HUMBLE) == "TypeHashNotSupported"
 
 
 # Names --------------------------------------------------------------------------------------
