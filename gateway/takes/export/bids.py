@@ -258,9 +258,9 @@ def _sidecar(data_set: DataSet, recording: _Recording, channels: list[_Channel])
         **{f"{kind}ChannelCount": counts[kind] for kind in _TYPES},
         "TrackedPointsCount": len({channel.tracked_point for channel in channels} - {""}),
     }
-    rows, times_us = (each - each.mean() for each in (grid.rows, measurement.captures))
-    if rows @ times_us > 0:  # the slope of the line through all times, because each has a jitter
-        content["SamplingFrequencyEffective"] = 1e6 * float((rows @ rows) / (rows @ times_us))
+    rate_hz = measurement.captured_rate_hz
+    if rate_hz is not None:
+        content["SamplingFrequencyEffective"] = rate_hz
     if parameters.general:
         content["SoftwareVersions"] = f"{parameters.general.name} {parameters.general.version}".strip()
     if measurement.source.details.note:

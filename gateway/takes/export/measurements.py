@@ -191,7 +191,8 @@ class Placed:
         """
         block = np.full((stop - start, *self.series.values.shape[1:]), np.nan, np.float32)
         for part in self.parts:
-            first, last = np.searchsorted(part.rows, [start, stop])
+            # Of another dtype, the limits would have all rows copied.
+            first, last = np.searchsorted(part.rows, np.array([start, stop], part.rows.dtype))
             block[part.rows[first:last] - start] = part.series.values[_some(part.frames, first, last)]
         release_pages()
         return block
@@ -217,6 +218,21 @@ class Measurement(NamedTuple):
     def captures(self) -> Array:
         """The times of capture of the frames of ``base``."""
         return self.base.capture_utime[self.grid.frames]
+
+    @property
+    def captured_rate_hz(self) -> float | None:
+        """The rows per second of capture; None if it is not known.
+
+        It is the slope of the line through all times, because each has a jitter.
+        """
+        rows, captures = self.grid.rows, self.captures
+        mean_row, mean_us = rows.mean(), captures.mean()
+        squares = products = 0.0
+        for start, stop in pieces(len(rows)):
+            steps = rows[start:stop] - mean_row
+            squares += float(steps @ steps)
+            products += float(steps @ (captures[start:stop] - mean_us))
+        return _SECOND_US * squares / products if products > 0 else None
 
     def runs_of(self, key: str) -> list[Series]:
         """Return the runs of a component that were captured at the time of this measurement."""

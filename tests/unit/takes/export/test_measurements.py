@@ -7,8 +7,10 @@ import pytest
 
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.takes import open_take
-from gateway.takes.export.measurements import Grid, place
+from gateway.takes.export.measurements import Grid, Measurement, place
+from gateway.takes.files import spool
 from gateway.takes.files.series import Series
+from gateway.takes.files.take import TakeSource
 from tests.support.takes import START_UTIME, markers, parameters, write_take
 
 
@@ -115,3 +117,18 @@ def test_only_a_gap_of_up_to_ten_seconds_is_filled(tmp_path: Path, gap_s: float,
     assert [each for found in grids for each in frames_of(found)] == [*range(9)]
     assert [found.rows[0] for found in grids] == [0] * num_grids
     assert [len(found.rows) for found in grids] == [[9], [5, 4]][num_grids - 1]
+
+
+def test_the_rate_of_capture_is_the_slope_through_all_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool, "_PIECE_ROWS", 7)
+    found = series(tmp_path, [(n, 10_010 * n) for n in range(100) if n % 9])
+    [placed] = place(found)
+    measurement = Measurement(TakeSource("lab"), {}, found, placed)
+    slope_us = np.polyfit(placed.rows, found.capture_utime - START_UTIME, 1)[0]
+    assert measurement.captured_rate_hz == pytest.approx(1e6 / slope_us, rel=1e-9)
+    assert 99 < 1e6 / slope_us < 101
+    single = series(tmp_path, [(0, 0)])
+    [placed] = place(single)
+    assert measurement._replace(base=single, grid=placed).captured_rate_hz is None
