@@ -5,6 +5,7 @@ C3D, TRC and BIDS have a rate and no times. A frame that is missing becomes a ro
 others keep their places. The times of capture are not used: their jitter would bend the grid.
 """
 
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -191,11 +192,19 @@ class Placed:
         """
         block = np.full((stop - start, *self.series.values.shape[1:]), np.nan, np.float32)
         for part in self.parts:
-            # Of another dtype, the limits would have all rows copied.
-            first, last = np.searchsorted(part.rows, np.array([start, stop], part.rows.dtype))
+            first, last = _bounds(part.rows, start, stop)
             block[part.rows[first:last] - start] = part.series.values[_some(part.frames, first, last)]
         release_pages()
         return block
+
+
+def _bounds(rows: Array, start: int, stop: int) -> tuple[int, int]:
+    """Return where the rows from ``start`` on begin, and where those before ``stop`` end. Rows increase."""
+    limits = np.minimum([start, stop], np.iinfo(rows.dtype).max)
+    first, last = np.searchsorted(
+        rows, limits.astype(rows.dtype)
+    ).tolist()  # of their dtype: rows are not copied
+    return first, last
 
 
 class Measurement(NamedTuple):
@@ -237,8 +246,12 @@ class Measurement(NamedTuple):
     def runs_of(self, key: str) -> list[Series]:
         """Return the runs of a component that were captured at the time of this measurement."""
         first, last = self.captures.min() - _MARGIN_US, self.captures.max() + _MARGIN_US
-        found = self.runs.get(key, [])
-        return [run for run in found if run.capture_utime.max() >= first and run.capture_utime.min() <= last]
+        found = []
+        for run in self.runs.get(key, []):
+            if run.capture_utime.max() >= first and run.capture_utime.min() <= last:
+                found.append(run)
+            release_pages()
+        return found
 
     def parts(self, run: Series, rows_per_row: int) -> list[Part]:
         """Return the parts of another component's run in this measurement; [] if it is of another one.
@@ -252,7 +265,7 @@ class Measurement(NamedTuple):
             if first_row is not None:
                 rows = grid.rows
                 rows += first_row  # in place: `place` made them for this call, and a copy could take 30 MB
-                first, last = np.searchsorted(rows, [0, stop])
+                first, last = _bounds(rows, 0, stop)
                 if first < last:
                     parts.append(Part(run, rows[first:last], _some(grid.frames, first, last)))
         return parts
@@ -395,8 +408,8 @@ def sampled(
 
 def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
     """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
-    found = int(np.diff(np.searchsorted(measurement.grid.rows, [first, first + count])).sum())
-    missing = count - found
+    start, stop = _bounds(measurement.grid.rows, first, first + count)
+    missing = count - (stop - start)
     if missing:
         job.note("frames missing in the take are empty", path.name, f"{missing} of {count}")
 
@@ -425,7 +438,7 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 def seconds_of_row(measurement: Measurement, row: int) -> float:
     """Return when a row of a measurement was captured, in seconds since the beginning of the take."""
     base, grid = measurement.base, measurement.grid
-    num_first = int(np.searchsorted(grid.rows, max(_AVERAGED_S * grid.rate_hz, 1)))
+    _, num_first = _bounds(grid.rows, 0, max(math.ceil(_AVERAGED_S * grid.rate_hz), 1))
     starts_s = base.seconds_of(measurement.captures[:num_first]) - grid.rows[:num_first] / grid.rate_hz
     same_clock = abs(starts_s - starts_s[0]) <= _CLOCK_STEP_S
     return float(np.median(starts_s[same_clock])) + row / grid.rate_hz

@@ -333,7 +333,7 @@ def test_frames_with_very_many_channels_are_left_out_and_reported(tmp_path: Path
 def test_labels_that_change_all_the_time_are_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.takes.export.mcap._MAX_CHANNELS", 50)
+    monkeypatch.setattr("gateway.takes.export.mcap_file._MAX_CHANNELS", 50)
     messages = [frame(ComponentType.ANALOG, [0.0] * number, number) for number in range(1, 60)]
     with pytest.raises(TakeError, match="labels in the take change so often"):
         export_messages(tmp_path, messages, "walk.mcap")
