@@ -54,7 +54,7 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
                 [take] = (tmp_path / "takes").glob("*/*.lcmlog")
                 job = ExportJob(take, tmp_path / "take.mcap")
                 await asyncio.to_thread(export_take, job)
-                assert job.notes == []
+                assert [note for note in job.notes if note.amount] == []
                 exported = raw_messages(tmp_path / "take.mcap")
                 last_ns = {topic: exported[topic][-1][0] for topic in (f"/lab/{name}" for name in FRAMES)}
                 await viewer.wait_until(
@@ -66,6 +66,8 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
     for name in FRAMES:
         live = [(log.time_ns, log.data) for log in viewer.received[f"/lab/{name}"]]
         first = live.index(exported[f"/lab/{name}"][0])
-        assert live[first : first + len(exported[f"/lab/{name}"])] == exported[f"/lab/{name}"]
+        interval = 5 if name == "forces" else 1  # arrows are drawn for some frames of a file only
+        stop = first + interval * len(exported[f"/lab/{name}"])
+        assert live[first:stop:interval] == exported[f"/lab/{name}"]
     assert description.pop("frame")["frame_id"] == "lab"
     assert len(description["3d"]["labels"]) == 20

@@ -26,15 +26,15 @@ def test_a_restart_of_the_router_costs_nothing_that_the_history_has(tmp_path: Pa
 
         def restart(_: int) -> None:
             routers[-1].close()
-            wait_for_frames(gateway, 200)
+            wait_for_frames(gateway, 400)
             routers.append(open_zenoh("router", listen=endpoint))
-            wait_for_frames(gateway, 50)
+            wait_for_frames(gateway, 100)
 
         ended = record_past(path, gateway, ("--connect", endpoint), restart)
         assert_same_bytes(path, gateway.published)
     assert ended.status == 0, ended
     assert ended.stdout.endswith("complete: no gaps\n")
-    assert refilled(ended) > 100
+    assert refilled(ended) > 200
 
 
 def test_a_recorder_on_lcm_that_stands_still_loses_nothing(tmp_path: Path) -> None:
