@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +15,8 @@ from typing import Any, Final
 import rich
 import viser
 import websockets.asyncio.server
+from viser.infra import Message
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 from gateway.client.transport import GatewaySubscriber
 from gateway.display.live import LiveData
@@ -27,6 +29,24 @@ from gateway.takes.files.reader import TakeReader
 from gateway.takes.replay.play_list import Selection, take_length_us
 from gateway.takes.replay.player import Player
 from gateway.takes.replay.timeline import time_text
+
+_push = AsyncMessageBuffer.push
+
+
+def _push_from_any_thread(buffer: AsyncMessageBuffer, message: Message) -> None:
+    """Queue a message for browsers.
+
+    viser 1.1 wakes what waits for messages in the thread that pushes them, too. That fails if the event loop
+    changes at this moment who waits. The message is in the queue by then, so it is enough to wake the loop.
+    """
+    try:
+        _push(buffer, message)
+    except RuntimeError:
+        with suppress(RuntimeError):  # the loop is closed
+            buffer.event_loop.call_soon_threadsafe(buffer.message_event.set)
+
+
+AsyncMessageBuffer.push = _push_from_any_thread  # type: ignore[method-assign, assignment]
 
 
 class ViewServer(viser.ViserServer):

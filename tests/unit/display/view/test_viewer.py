@@ -53,6 +53,25 @@ def test_each_of_three_pages_sees_the_data(viewer: Viewer, lab: Lab, server: Vie
     wait_until(lambda: not server.get_clients())
 
 
+def test_a_page_gets_everything_although_its_connection_changes_meanwhile(
+    viewer: Viewer, lab: Lab, server: ViewServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Setting an event in another thread fails if its waiters change at that moment."""
+    event = server._connection.get_message_buffer().message_event
+    set_event = event.set
+
+    def set_unless_waiters_change() -> None:
+        if threading.current_thread() is threading.main_thread():
+            raise RuntimeError("deque mutated during iteration")
+        set_event()
+
+    with page_client(server) as page:
+        wait_until(lambda: bool(server.get_clients()))
+        monkeypatch.setattr(event, "set", set_unless_waiters_change)
+        show(viewer, lab, times=1)
+        page.wait_for(POINTS, "points")
+
+
 def test_the_view_of_a_page_is_fitted_once_and_when_it_wants(
     viewer: Viewer, lab: Lab, server: ViewServer
 ) -> None:
