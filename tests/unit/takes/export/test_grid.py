@@ -7,7 +7,8 @@ import pytest
 
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.takes import open_take
-from gateway.takes.export.measurements import Grid, Measurement, place
+from gateway.takes.export.grid import Grid, place
+from gateway.takes.export.measurements import Measurement
 from gateway.takes.files import spool
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import TakeSource
