@@ -23,6 +23,7 @@ from google.protobuf.descriptor_pb2 import (
 )
 
 from gateway.descriptions.labels import fitting_labels
+from gateway.messages.encode import split_rows
 from gateway.rtc3d.components import Items
 
 MAX_UTIME: Final = ((1 << 32) - 1) * 1_000_000
@@ -174,8 +175,7 @@ class ProtobufRecord:
         """Return a message for each row of ``values``, shape (rows, fields)."""
         table = np.tile(self._template, (len(values), 1))
         table[:, self._places] = np.ascontiguousarray(values, "<f4")[..., np.newaxis].view(np.uint8)
-        content, size = table.tobytes(), table.shape[1]
-        return [content[start : start + size] for start in range(0, len(content), size)]
+        return split_rows(table)
 
 
 FloatRecord = CdrRecord | ProtobufRecord

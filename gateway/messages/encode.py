@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import rtc3d
 
 from gateway.messages.coordinate_frame import CoordinateFrame
@@ -196,3 +197,9 @@ def tool_poses(
         + (_CONTENT.pack(*head, False, *_NO_POSE) if pose is None else _CONTENT.pack(*head, True, *pose))
         for pose, sequence in zip(frame.poses(component.items(), accept_zeros=True), sequences, strict=True)
     ]
+
+
+def split_rows(table: npt.NDArray[np.uint8]) -> list[bytes]:
+    """Return each row of a table of bytes, shape (rows, bytes)."""
+    content, size = table.tobytes(), table.shape[1]
+    return [content[start : start + size] for start in range(0, len(content), size)]

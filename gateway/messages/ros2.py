@@ -18,6 +18,8 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from gateway.messages.encode import split_rows
+
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 """The first bytes of every message: CDR version 1, little-endian, no options."""
 
@@ -165,8 +167,7 @@ def _rows(*parts: bytes | Array) -> list[bytes]:
     table = np.empty((num_rows, ends[-1]), np.uint8)
     for start, stop, block in zip([0, *ends], ends, blocks, strict=False):
         table[:, start:stop] = block
-    content, size = table.tobytes(), ends[-1]
-    return [content[start : start + size] for start in range(0, len(content), size)]
+    return split_rows(table)
 
 
 def _bytes_of_rows(rows: Array) -> Array:

@@ -41,11 +41,14 @@ def _push_from_any_thread(buffer: AsyncMessageBuffer, message: Message) -> None:
     """
     try:
         _push(buffer, message)
-    except RuntimeError:
+    except RuntimeError as error:
+        if str(error) != "deque mutated during iteration":
+            raise
         with suppress(RuntimeError):  # the loop is closed
             buffer.event_loop.call_soon_threadsafe(buffer.message_event.set)
 
 
+# mypy takes the function for a bound method, which has no parameter for the buffer.
 AsyncMessageBuffer.push = _push_from_any_thread  # type: ignore[method-assign, assignment]
 
 

@@ -47,10 +47,10 @@ class _FoxgloveExport(SourceExport):
             interval = max(1, round((run.measured_rate_hz or _ARROWS_HZ) / _ARROWS_HZ))
             if interval > 1:
                 self.notes[f"arrows of forces drawn for one of {interval} frames only"] = None
-        entries = run.content.entries[rows]
-        for part in np.split(rows, np.flatnonzero(np.diff(entries)) + 1):
+        entries = run.content.entries
+        for part in np.split(rows, np.flatnonzero(np.diff(entries[rows])) + 1):
             utimes = run.capture_utime[part].tolist()
-            index = int(run.content.entries[part[0]])
+            index = int(entries[part[0]])
             converter = self._converters.get(index)
             if converter is None:
                 converter = self._new_converter(index, int(run.parameters_version[part[0]]))

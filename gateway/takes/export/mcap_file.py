@@ -87,7 +87,8 @@ def _note_metres(job: ExportJob, take: Take) -> None:
     """Report that positions are converted to m."""
     for source in take.sources.values():
         for entry in source.parameters:
-            unit, parameters = entry.parameters.length_unit, entry.parameters
+            parameters = entry.parameters
+            unit = parameters.length_unit
             if (parameters.markers or parameters.tools) and metres_per_unit(unit) not in {None, 1.0}:
                 job.note(f"positions converted from {unit} to m")
 

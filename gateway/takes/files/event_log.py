@@ -247,8 +247,8 @@ class _Window:
             if columns and (
                 found := columns.get(data[start + _HEADER_BYTES : message_start + _FINGERPRINT_BYTES])
             ):
-                found[0].append(utime)
-                found[1].append(data[message_start:stop])
+                found.utimes.append(utime)
+                found.messages.append(data[message_start:stop])
             else:
                 channel = data[start + _HEADER_BYTES : message_start]
                 name = names.get(channel) or self._name(channel)
