@@ -29,6 +29,7 @@ from tests.support.queried_gateway import (
     run_gateway,
     until_a_frame,
     wait_until_cached,
+    wait_until_found,
     zenoh_peer,
 )
 from tests.support.servers import ScriptedServer, c3d_file, packet
@@ -263,6 +264,8 @@ async def test_through_a_router_a_wildcard_for_sources_is_answered_by_every_sour
         await wait_until_cached(lab_gateway)
         await wait_until_cached(hall_gateway)
         with zenoh_peer(router) as peer:
+            for source in ("lab", "hall"):
+                await wait_until_found(peer, source)
             replies = {reply.key: reply.payload for reply in await query_all(peer, "mocap/*/parameters")}
             assert replies == {"mocap/lab/parameters": first.xml, "mocap/hall/parameters": second.xml}
             assert (await query(peer, "mocap/lab/markers")).code == "bad-request"

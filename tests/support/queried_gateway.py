@@ -159,6 +159,16 @@ async def wait_until_cached(gateway: Gateway) -> None:
     await wait_until_async(lambda: all(stream.session for stream in source.streams))
 
 
+async def wait_until_found(session: zenoh.Session, source: str, num_gateways: int = 1) -> None:
+    """Wait until ``session`` sees ``num_gateways`` that answer queries about ``source``.
+
+    A router learns about a gateway some time after that has connected.
+    """
+    # Each gateway declares this token of its own after what answers its queries.
+    tokens = f"mocap/{source}/parameters/@adv/**"
+    await wait_until_async(lambda: len(list(session.liveliness().get(tokens))) == num_gateways)
+
+
 class Reply(NamedTuple):
     """One reply to a query: a payload with its encoding and attachment, or an error and its code."""
 

@@ -20,7 +20,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.support.commands import Completed, run, run_in_process
 from tests.support.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.support.parameters import spec_xml
-from tests.support.queried_gateway import ParameterServer, run_gateway, wait_until_cached
+from tests.support.queried_gateway import ParameterServer, run_gateway, wait_until_cached, wait_until_found
 from tests.support.servers import ScriptedServer
 from tests.support.waiting import wait_until_async
 
@@ -173,7 +173,7 @@ async def test_sources_of_several_gateways_are_shown_and_one_without_a_server_hi
     """On Zenoh also two with the same name."""
     endpoint, url = free_endpoint(), lcm_url()
     servers = ParameterServer("of the first"), ParameterServer("of the second")
-    with contextlib.closing(open_zenoh("router", listen=endpoint)):
+    with contextlib.closing(open_zenoh("router", listen=endpoint)) as router:
         async with (
             ScriptedServer(servers[0].script) as a,
             ScriptedServer(servers[1].script) as b,
@@ -182,11 +182,13 @@ async def test_sources_of_several_gateways_are_shown_and_one_without_a_server_hi
             await wait_until_cached(one)
             async with run_gateway(b.port, router=endpoint) as other:
                 await wait_until_cached(other)
+                await wait_until_found(router, "lab", 2)
                 same = await run("params", "--json", "--connect", endpoint)
             async with run_gateway(b.port, lcm_url=url, name="hall-2") as other:
                 await wait_until_cached(other)
                 several = await run("params", "--json", "--lcm", "--url", url)
             async with run_gateway(free_port(), router=endpoint, name="hall"):
+                await wait_until_found(router, "hall")
                 partly = await run("params", "3d", "--json", "--connect", endpoint)
     assert (same.status, list(labels(same))) == (0, ["lab", "lab_2"])
     assert set(labels(same).values()) == {"of the first", "of the second"}
