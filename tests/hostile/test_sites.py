@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -145,6 +146,12 @@ def replies(session: zenoh.Session, selector: str) -> list[zenoh.Reply]:
 
 def wait_for_reply(session: zenoh.Session, selector: str) -> None:
     wait_until(lambda: any(reply.ok for reply in replies(session, selector)))
+
+
+def test_no_connection_of_router_b_is_for_the_routers_own_messages() -> None:
+    """Zenoh sends them, of priority 0, all on the one that opened first, so that none overtakes another."""
+    ranges = re.findall(r"\?prio=(\d)-(\d)", shipped_file("sites/router-b.json5"))
+    assert [each for first, last in ranges for each in range(int(first), int(last) + 1)] == [*range(1, 8)]
 
 
 def test_a_display_at_site_b_gets_paced_data_and_nothing_else(sites: Sites) -> None:
