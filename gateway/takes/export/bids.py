@@ -38,6 +38,7 @@ from gateway.takes.export.measurements import (
     utc_text,
 )
 from gateway.takes.export.number_text import number_rows, rounded
+from gateway.takes.export.plates import unit_notes
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import Take, TakeSource
 
@@ -185,11 +186,11 @@ def _conversions(job: ExportJob, series: Series) -> list[list[tuple[str, float]]
     if series.key == "force":
         job.note("forces and moments have the type MISC: Motion-BIDS has no type for them")
         force = series.parameters_of(0).force
-        plates = [*force.plates] if force else []
-        units = [units_of(plate) for plate in plates[: len(series.labels)]]
+        plates = force.plates[: len(series.labels)] if force else ()
+        for note in unit_notes(plates):
+            job.note(note)
+        units = [units_of(plate) for plate in plates]
         units += [(1.0, 1.0)] * (len(series.labels) - len(units))
-        if any(unit != (1.0, 1.0) for unit in units):
-            job.note("forces and moments converted to N and N.m")
         return [[("N", force)] * _NUM_FORCES + [("N.m", moment)] * _NUM_FORCES for force, moment in units]
     unit = series.unit or "mm"
     metres = metres_per_unit(unit)

@@ -232,8 +232,8 @@ class ExportJob:
 
     def utimes(self, take: "Take") -> tuple[float, float]:
         """Return from when on, and before when, the events are to be exported, in µs since 1970."""
-        first = -math.inf if self.from_s is None else take.start_utime + round(self.from_s * 1e6)
-        stop = math.inf if self.to_s is None else take.start_utime + round(self.to_s * 1e6)
+        first = -math.inf if self.from_s is None else take.start_utime + self.from_s * 1e6
+        stop = math.inf if self.to_s is None else take.start_utime + self.to_s * 1e6
         return first, stop
 
     def note_malformed(self, take: "Take") -> None:

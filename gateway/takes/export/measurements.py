@@ -5,7 +5,7 @@ Each has a grid: see ``grid``.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -59,6 +59,11 @@ class Placed:
     def num_items(self) -> int:
         """The number of markers, channels or plates."""
         return int(self.series.values.shape[1])
+
+    def count(self, start: int, stop: int) -> int:
+        """Return how many of the rows ``start`` to ``stop`` were recorded."""
+        limits = (bounds(part.rows, start, stop) for part in self.parts)
+        return sum(last - first for first, last in limits)
 
     def block(self, start: int, stop: int) -> Array:
         """Return the values of rows ``start`` to ``stop``, NaN where one is missing.
@@ -219,7 +224,10 @@ def note_grid(job: ExportJob, measurement: Measurement) -> None:
 def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iterator[list[Measurement]]:
     """Yield the measurements of each of the components that a source has, with its frames as their base."""
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
-    runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
+    # Nor is a component that never has any, such as 6D without tools.
+    runs = {
+        key: series.without_empty_frames().runs() for key, series in source.series.items() if series.labels
+    }
     for key in keys:
         if key in runs:
             yield [Measurement(source, runs, run, grid) for run in runs[key] for grid in place(run)]
@@ -278,6 +286,24 @@ def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: in
     missing = count - (stop - start)
     if missing:
         job.note("frames missing in the take are empty", path.name, f"{missing} of {count}")
+
+
+def note_samples_left_out(
+    job: ExportJob, sources: Iterable[TakeSource], written: Mapping[tuple[str, str], int]
+) -> None:
+    """Report samples of analog channels and forces that are in no file.
+
+    ``written`` is how many are, by the name of the source and the key of the component.
+    """
+    for source in sources:
+        for key in ("analog", "force"):
+            total = len(source.series[key].without_empty_frames()) if key in source.series else 0
+            count = written.get((source.name, key), 0)
+            if count < total:
+                job.note(
+                    f"samples of {key} of {source.name} that fit no frame left out",
+                    amount=f"{total - count} of {total}",
+                )
 
 
 def _nearest(times: Array, wanted: Array) -> Array:

@@ -176,6 +176,12 @@ def test_other_units_become_si_units(tmp_path: Path) -> None:
     assert "forces and moments converted to N and N.m" in notes_of(job)
 
 
+def test_a_component_without_items_is_no_tracking_system(tmp_path: Path) -> None:
+    """Servers send 6D frames also if no tool is defined."""
+    export(tmp_path, [markers(1), frame(ComponentType.TOOLS, [])])
+    assert runs_of(tmp_path) == {("labMarkers", "1")}
+
+
 def test_a_plate_that_sends_nothing_has_no_channels(tmp_path: Path) -> None:
     export(tmp_path, [parameters(SCENE.parameters), frame(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])])
     assert len(table(only(tmp_path, "*_channels.tsv"))) == 6
