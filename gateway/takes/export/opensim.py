@@ -299,7 +299,7 @@ def _write_table(
     The times say where rows are missing. ``more`` are lines of the header.
     """
     file = job.files.create(path)
-    file.write(f"{path.stem}\nversion=1\nnRows=".encode())
+    file.write(f"{printable(path.stem)}\nversion=1\nnRows=".encode())
     place_of_count = file.tell()
     file.write(b" " * _COUNT_WIDTH)
     time_0 = utc_text(samples.measurement)

@@ -251,8 +251,8 @@ def test_forces_with_another_rate_than_the_channels_are_reported(tmp_path: Path)
     assert notes == [
         "force left out: its rate is not that of the analog channels; export to .mot has it",
         *(
-            f"force plate {number} (Force plate {number}) left out: neither its analog channels nor its forces "
-            "are there at this rate"
+            f"force plate {number} (Force plate {number}) left out: neither its analog channels nor its "
+            "forces are there at this rate"
             for number in (1, 2)
         ),
         "samples of force of lab that fit no frame left out | 50 of 50",
