@@ -252,6 +252,9 @@ _ALONE: Final = {"analog": ".sto", "force": ".mot"}
 """The formats that have one component, at any rate."""
 
 _RATIO_TOLERANCE: Final = 0.02
+_MAX_RATIO_ERROR: Final = 0.1
+"""How much the rate of samples may differ from a multiple of that of the frames, in samples per frame; 1000 Hz
+is none of 60 Hz."""
 
 
 def sampled(
@@ -263,9 +266,12 @@ def sampled(
     """
     found: dict[tuple[int, tuple[str, ...]], list[Part]] = {}
     for run in measurement.runs_of(key):
-        ratio = place(run)[0].rate_hz / measurement.grid.rate_hz
+        # By the time stamps, because announced rates can be a little wrong. With a ratio that is not the true
+        # one, samples would get further away from their frames with each frame.
+        ratio = place(run)[0].measured_hz / measurement.grid.measured_hz
         count = round(ratio)
-        fits = count >= 1 and abs(ratio - count) <= _RATIO_TOLERANCE * count and count == (samples or count)
+        tolerance = min(_RATIO_TOLERANCE * count, _MAX_RATIO_ERROR)
+        fits = count >= 1 and abs(ratio - count) <= tolerance and count == (samples or count)
         parts = measurement.parts(run, max(count, 1))
         if parts and fits:
             found.setdefault((count, run.labels), []).extend(parts)

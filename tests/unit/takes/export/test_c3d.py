@@ -232,14 +232,21 @@ def test_readers_find_the_exact_ratio_of_odd_rates(tmp_path: Path, rate_hz: floa
     assert read_independently(tmp_path / "out.c3d").analog.shape == (30 * ratio, 1)
 
 
-def test_analog_with_a_rate_that_c3d_cannot_have_is_reported(tmp_path: Path) -> None:
-    odd = SyntheticScene(markers=2, tools=0, analog=3, plates=0, rate_hz=100, analog_rate_hz=250)
-    found, notes = export_c3d(tmp_path, scene(50, odd))
+@pytest.mark.parametrize(("rate_hz", "analog_rate_hz"), [(100, 250), (60, 1000), (30, 2000), (100, 1080)])
+def test_analog_with_a_rate_that_c3d_cannot_have_is_reported(
+    tmp_path: Path, rate_hz: float, analog_rate_hz: float
+) -> None:
+    """With 17 samples of 1000 Hz in each of 60 frames a second, channels would drift by 20 ms per second."""
+    odd = SyntheticScene(
+        markers=2, tools=0, analog=3, plates=0, rate_hz=rate_hz, analog_rate_hz=analog_rate_hz
+    )
+    found, notes = export_c3d(tmp_path, scene(60, odd))
+    count = int(60 * analog_rate_hz / rate_hz)
     assert notes == [
         "analog left out: its rate is not a multiple of that of the frames; export to .sto has it",
-        "samples of analog of lab that fit no frame left out | 125 of 125",
+        f"samples of analog of lab that fit no frame left out | {count} of {count}",
     ]
-    assert found.points.shape == (4, 2, 50)
+    assert found.points.shape == (4, 2, 60)
 
 
 def test_forces_with_another_rate_than_the_channels_are_reported(tmp_path: Path) -> None:
