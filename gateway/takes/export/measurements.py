@@ -253,8 +253,7 @@ _ALONE: Final = {"analog": ".sto", "force": ".mot"}
 
 _RATIO_TOLERANCE: Final = 0.02
 _MAX_RATIO_ERROR: Final = 0.1
-"""How much the rate of samples may differ from a multiple of that of the frames, in samples per frame; 1000 Hz
-is none of 60 Hz."""
+"""How many samples per frame a rate may differ from a multiple of that of the frames."""
 
 
 def sampled(
