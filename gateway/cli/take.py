@@ -295,7 +295,7 @@ def export(
     ):
         if value is not None and kind not in kinds:
             raise typer.BadParameter(f"{option} is for {join_or(kinds)} only")
-    bodies_of_plates = tuple(body.strip() for body in bodies.split(",")) if bodies else ()
+    bodies_of_plates = tuple(filter(None, map(str.strip, (bodies or "").split(","))))
     job = ExportJob(
         file,
         out,

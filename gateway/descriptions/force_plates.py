@@ -29,7 +29,6 @@ CALIBRATED: Final = 4
 
 ADDED_LABELS: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 
-_MOMENT_UNIT: Final = re.compile(r"\s*k?n\W?(mm|cm|m)\s*", re.IGNORECASE)
 _TOLERANCE: Final = 1e-3
 """How much computed loads may differ from recorded ones, as a part of the largest."""
 
@@ -115,8 +114,9 @@ def channels_from_loads(loads: Array, geometry: PlateGeometry) -> Array:
     ``loads`` has the shape (samples, 6): forces and moments in the laboratory's axes, the moments about the
     centre of the plate's surface.
     """
-    force = loads[:, :3] @ geometry.rotation
-    moment = loads[:, 3:] @ geometry.rotation - np.cross(force, _reader_origin(geometry.origin))
+    with np.errstate(invalid="ignore"):  # loads can be infinite
+        force = loads[:, :3] @ geometry.rotation
+        moment = loads[:, 3:] @ geometry.rotation - np.cross(force, _reader_origin(geometry.origin))
     return np.concatenate([force, moment], axis=1)
 
 
@@ -128,11 +128,13 @@ def is_equal(computed: Array, recorded: Array) -> bool:
     return bool((difference <= _TOLERANCE * np.maximum(largest, 1e-6)).all())
 
 
-def moment_factor(moment_unit: str, position_unit: str) -> float:
-    """Return what turns moments in their own unit into those with the unit of positions: 1000 for Nm and
-    mm."""
-    match = _MOMENT_UNIT.fullmatch(moment_unit)
-    return _length_factor(match[1], position_unit) if match else 1.0
+def moment_factor(plate: Plate, position_unit: str) -> float:
+    """Return what turns a plate's moments into the product of the units of its forces and of positions.
+
+    It is 1000 for N, Nm and mm; 1 if the unit of moments or positions is unknown or missing.
+    """
+    newton_metres, metres = _newton_metres(plate), metres_per_unit(position_unit)
+    return newton_metres / units_of(plate)[0] / metres if newton_metres and metres else 1.0
 
 
 def _position(point: Point, unit: str) -> Array:
@@ -156,8 +158,8 @@ METRES_PER_NEWTON: Final = 1e-3
 MIN_FORCE_N: Final = 10.0
 """Below this force on the surface, the centre of pressure is noise, and no arrow is drawn."""
 
-_UNIT_OF_FORCE: Final = re.compile(r"\s*(k?)N\s*", re.IGNORECASE)
-_UNIT_OF_MOMENT: Final = re.compile(r"\s*(k?)N\W?(\w+)\s*", re.IGNORECASE)
+_UNIT_OF_FORCE: Final = re.compile(r"(k?)N", re.IGNORECASE)
+_UNIT_OF_MOMENT: Final = re.compile(r"(k?)N\W?(\w+)", re.IGNORECASE)
 
 Vector = tuple[float, float, float]
 
@@ -218,12 +220,32 @@ def up_axis_of(parameters: Iterable[Parameters]) -> UpAxis | None:
 
 def units_of(plate: Plate) -> tuple[float, float]:
     """Return the units of a plate's forces and moments, in N and in Nm; unknown ones count as N and Nm."""
-    units = [channel.unit for channel in plate.channels]
-    force = _UNIT_OF_FORCE.fullmatch(units[0] if units else "")
-    moment = _UNIT_OF_MOMENT.fullmatch(units[3] if len(units) > 3 else "")
-    newtons = 1000.0 if force and force[1] else 1.0
-    newton_metres = (1000.0 if moment[1] else 1.0) * (metres_per_unit(moment[2]) or 1.0) if moment else 1.0
-    return newtons, newton_metres
+    return _newtons(plate) or 1.0, _newton_metres(plate) or 1.0
+
+
+def unknown_units(plate: Plate) -> list[str]:
+    """Return the units of a plate's forces and moments that are given, but not known."""
+    found = ((_unit(plate, 0), _newtons(plate)), (_unit(plate, _FIRST_MOMENT), _newton_metres(plate)))
+    return [unit for unit, factor in found if unit and factor is None]
+
+
+_FIRST_MOMENT: Final = 3
+
+
+def _unit(plate: Plate, channel: int) -> str:
+    units = [found.unit.strip() for found in plate.channels[channel:][:1]]
+    return units[0] if units else ""
+
+
+def _newtons(plate: Plate) -> float | None:
+    match = _UNIT_OF_FORCE.fullmatch(_unit(plate, 0))
+    return (1000.0 if match[1] else 1.0) if match else None
+
+
+def _newton_metres(plate: Plate) -> float | None:
+    match = _UNIT_OF_MOMENT.fullmatch(_unit(plate, _FIRST_MOMENT))
+    metres = metres_per_unit(match[2]) if match else None
+    return metres * (1000.0 if match[1] else 1.0) if match and metres else None
 
 
 def force_on(plate: PlacedPlate, load: tuple[float, ...]) -> PlateForce | None:

@@ -38,6 +38,7 @@ from gateway.takes.export.measurements import (
     utc_text,
 )
 from gateway.takes.export.number_text import number_rows, rounded
+from gateway.takes.export.plates import unit_notes
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import Take, TakeSource
 
@@ -119,14 +120,16 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
     So what all sources recorded at the same time is one run. If the labels of the markers change while the
     analog channels go on, a new run begins that has no analog channels.
     """
-    names = fitting_labels([*take.sources], bids_label, _MAX_NAME_BYTES, "source")
-    for source, name in zip(take.sources, names, strict=True):
-        note_label(job, "source", source, bids_label(name))
+    labels: list[str] = []
+    for position, source_name in enumerate(take.sources, start=1):
+        label = bids_label(source_name)[:_MAX_NAME_BYTES] or f"source{position}"
+        while label in labels:
+            label += "2"
+        labels.append(label)
+        note_label(job, "source", source_name, label)
     found = [
-        _Recording(
-            bids_label(name) + _LABELS[measurement.base.key], measurement, seconds_of_row(measurement, 0)
-        )
-        for name, source in zip(names, take.sources.values(), strict=True)
+        _Recording(label + _LABELS[measurement.base.key], measurement, seconds_of_row(measurement, 0))
+        for label, source in zip(labels, take.sources.values(), strict=True)
         for measurements in measurements_by_component(source, tuple(_LABELS))
         for measurement in measurements
     ]
@@ -173,7 +176,9 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
     if series.key == "analog":
         job.note("analog channels have the type MISC: Motion-BIDS has no type for them")
     else:
-        frames = {"reference_frame": {"Levels": {measurement.source.name: _reference_frame(measurement)}}}
+        frames = {
+            "reference_frame": {"Levels": {printable(measurement.source.name): _reference_frame(measurement)}}
+        }
         write_json(job, data_set.path(recording.label, run, "channels.json"), frames)
     return path
 
@@ -185,11 +190,11 @@ def _conversions(job: ExportJob, series: Series) -> list[list[tuple[str, float]]
     if series.key == "force":
         job.note("forces and moments have the type MISC: Motion-BIDS has no type for them")
         force = series.parameters_of(0).force
-        plates = [*force.plates] if force else []
-        units = [units_of(plate) for plate in plates[: len(series.labels)]]
+        plates = force.plates[: len(series.labels)] if force else ()
+        for note in unit_notes(plates):
+            job.note(note)
+        units = [units_of(plate) for plate in plates]
         units += [(1.0, 1.0)] * (len(series.labels) - len(units))
-        if any(unit != (1.0, 1.0) for unit in units):
-            job.note("forces and moments converted to N and N.m")
         return [[("N", force)] * _NUM_FORCES + [("N.m", moment)] * _NUM_FORCES for force, moment in units]
     unit = series.unit or "mm"
     metres = metres_per_unit(unit)
@@ -216,7 +221,7 @@ def _channels(
             type=kind,
             tracked_point="" if series.key == "analog" else printable(label),
             units=unit,
-            reference_frame="" if component == NOT_AVAILABLE else measurement.source.name,
+            reference_frame="" if component == NOT_AVAILABLE else printable(measurement.source.name),
             description=printable(description),
             sampling_frequency=measurement.grid.rate_hz,
         )

@@ -83,16 +83,16 @@ def open_data_set(job: ExportJob, take: Take) -> DataSet:
         session=_label(job, "session", {each.session for each in details}),
         task=_label(job, "task", {job.bids.task or ""}, is_required=True),
     )
-    if job.out.is_dir() and any(job.out.iterdir()) and not (job.out / _DESCRIPTION).exists():
+    folder = job.out
+    job.files.create_folder(folder)
+    job.files.lock_folder(folder)  # before it is looked at: another export may be creating it
+    if any(folder.iterdir()) and not (folder / _DESCRIPTION).exists():
         raise SelectionError(
             f"{job.out} has files, but no {_DESCRIPTION}, so it is no BIDS data set; choose a new folder"
         )
-    folder = job.out
-    job.files.create_folder(folder)
     for part in (data_set.folder / "motion").relative_to(job.out).parts:
         folder /= part
         job.files.create_folder(folder)
-    job.files.lock_folder(job.out)
     add_rows(job, job.out / _PARTICIPANTS, "participant_id", [{"participant_id": f"sub-{data_set.subject}"}])
     if not (job.out / _DESCRIPTION).exists():
         _describe(job)
@@ -107,6 +107,10 @@ def _label(job: ExportJob, name: str, texts: set[str], *, is_required: bool = Fa
         raise SelectionError(f"the sources of {job.take} have different {name}s, {both}; choose by --{name}")
     text = next(iter(texts), "")
     label = bids_label(text)
+    if text and not label:
+        raise SelectionError(
+            f"the {name} {text!r} has no letter from A to Z and no digit, as BIDS needs; choose by --{name}"
+        )
     if is_required and not label:
         raise SelectionError(f"{job.take} does not say the {name}, and BIDS needs it; add --{name}")
     note_label(job, name, text, label)
@@ -156,7 +160,7 @@ def add_rows(job: ExportJob, path: Path, key: str, rows: Sequence[dict[str, str]
         write_table(job, path, [*rows[0]], [[*row.values()] for row in rows])
         return
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise TakeError(f"{path} is not in UTF-8, as BIDS wants it; correct or remove it") from None
     lines = [line.split("\t") for line in text.split("\n") if line]

@@ -10,6 +10,7 @@ second of 55 markers and 69 analog channels), does not report a full disk, and c
 
 import struct
 import textwrap
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -33,6 +34,7 @@ from gateway.takes.export.measurements import (
     event_seconds,
     named_measurements,
     note_missing,
+    note_samples_left_out,
     utc_text,
 )
 from gateway.takes.export.plates import PlatePlan
@@ -70,11 +72,16 @@ _BLOCK_VALUES: Final = 500_000  # values in memory at once: 2 MB
 def export_c3d(job: ExportJob) -> None:
     """Write each measurement of each source to a file of its own."""
     belongs: dict[str, Array] = {}
-    for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
+    written: Counter[tuple[str, str]] = Counter()
+    named = named_measurements(job, _KEYS, "markers, analog channels or forces")
+    for measurement, path in named:
         content = content_of(job, measurement)
         _write(job, content, path)
         source = measurement.source.name
+        written[source, "analog"] += content.num_samples(content.analog)
+        written[source, "force"] += content.num_samples(content.forces)
         belongs[source] = belongs.get(source, False) | _is_near(content, _event_seconds(content))
+    note_samples_left_out(job, {found.source.name: found.source for found, _ in named}.values(), written)
     for source, is_in_file in belongs.items():
         if not is_in_file.all():
             job.note(f"events of {source} far from all frames left out", amount=int((~is_in_file).sum()))
@@ -113,8 +120,15 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
     note_missing(job, path, content.measurement, content.first_row, content.num_frames)
     if incomplete_samples:
         job.note("analog samples missing in the take are NaN", path.name, incomplete_samples)
+    _note_plates_and_time(job, content, path)
+
+
+def _note_plates_and_time(job: ExportJob, content: C3dContent, path: Path) -> None:
     if content.added_plates:
         job.note("forces became analog channels, six of each plate", path.name, len(content.added_plates))
+    for plan in content.added_plates:
+        if plan.moment_factor != 1.0:
+            job.note(f"moments converted to {_force_unit(plan)}{content.unit}", path.name)
     if content.start_s * content.rate_hz >= 1:
         utc = utc_text(content.measurement, content.start_s)
         job.note(
@@ -218,10 +232,13 @@ def _channel_texts(content: C3dContent) -> tuple[list[str], list[str], list[str]
         )
     for plan in content.added_plates:
         labels += [f"{label}{plan.position + 1}" for label in ADDED_LABELS]
-        force = (plan.plate.channels[0].unit if plan.plate.channels else "") or "N"
-        units += [force] * 3 + [force + content.unit] * 3
+        units += [_force_unit(plan)] * 3 + [_force_unit(plan) + content.unit] * 3
         descriptions += [plan.plate.label] * 6
     return labels, descriptions, units
+
+
+def _force_unit(plan: PlatePlan) -> str:
+    return (plan.plate.channels[0].unit if plan.plate.channels else "") or "N"
 
 
 def _padded(texts: list[str], count: int) -> list[str]:

@@ -106,6 +106,13 @@ class C3dContent(NamedTuple):
         """The plates whose channels follow the server's own analog channels."""
         return [plan for plan in self.plates if plan.is_added]
 
+    def num_samples(self, placed: Placed | None) -> int:
+        """Return how many recorded samples of a component are in the frames."""
+        if placed is None:
+            return 0
+        first = self.first_row * self.samples_per_frame
+        return placed.count(first, first + self.num_frames * self.samples_per_frame)
+
     def points(self, start: int, stop: int) -> Array:
         """Return the markers of frames, shape (frames, markers, 4)."""
         if self.markers is None:
@@ -122,7 +129,8 @@ class C3dContent(NamedTuple):
         if self.forces is not None and self.added_plates:
             loads = self.forces.block(first, last)
             parts += [channels_from_loads(plan.loads_of(loads), plan.geometry) for plan in self.added_plates]
-        return np.concatenate(parts, axis=1, dtype=np.float32)
+        with np.errstate(over="ignore"):  # moments in a smaller unit can be beyond float32
+            return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
 def content_of(job: ExportJob, measurement: Measurement) -> C3dContent:

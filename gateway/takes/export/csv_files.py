@@ -7,6 +7,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from gateway.descriptions.labels import distinct
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.number_text import number_rows
@@ -22,7 +23,7 @@ def export_csv(job: ExportJob) -> None:
     for table, part in table_parts(job):
         if table not in files:
             files[table] = job.files.create(table.path)
-            titles = [_title(column) for column in table.columns]
+            titles = distinct(map(_title, table.columns), lambda title, _: title)
             files[table].write(_record([*TIME_COLUMNS, *titles]))
         files[table].write(b"\r\n".join([*_lines(part), b""]))
 

@@ -16,7 +16,9 @@ MAX_GAP_S: Final = 10.0
 """After a longer gap, a new grid begins."""
 
 _TOLERANCE: Final = 0.02
-"""How much the measured rate may differ from the announced one, as a part of it, to be the same rate."""
+"""How much the measured rate may differ from the announced one, as a part of it, to be the same rate.
+
+For half of the announced rate it is half as much, and so on."""
 
 
 Frames: TypeAlias = Array | slice
@@ -27,10 +29,12 @@ class Grid(NamedTuple):
     """Where frames of a series belong: ``rows`` has the row of each of ``frames``, which are indices.
 
     Both are in order of time; no row occurs twice. ``times_us`` are the server's time stamps of these frames
-    (``has_time_stamps``), or their times of capture if the server sends none.
+    (``has_time_stamps``), or their times of capture if the server sends none. ``rate_hz`` is the rate that
+    files have, and ``measured_hz`` that of the time stamps; without time stamps, both are the same.
     """
 
     rate_hz: float
+    measured_hz: float
     rows: Array
     frames: Frames
     times_us: Array
@@ -57,6 +61,7 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     times = stamps if has_time_stamps else captures
     period_us = _period_us(times, sequence)
     rate_hz = _rate_hz(period_us, run.rate_hz)
+    measured_hz = 1e6 / period_us if period_us and has_time_stamps else rate_hz
     max_gap = MAX_GAP_S * rate_hz
     rows = np.zeros(len(times), np.int32)
     cuts: list[int] = []
@@ -81,7 +86,7 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     for start, stop in zip([0, *cuts], [*cuts, len(times)], strict=True):
         rows[start:stop] -= rows[start]
         chosen = some_frames(frames, start, stop)
-        grids.append(Grid(rate_hz, rows[start:stop], chosen, times[start:stop], has_time_stamps))
+        grids.append(Grid(rate_hz, measured_hz, rows[start:stop], chosen, times[start:stop], has_time_stamps))
     return grids
 
 
@@ -129,7 +134,8 @@ def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:
     measured_hz = 1e6 / period_us
     if announced_hz:
         divisor = max(1, round(announced_hz / measured_hz))
-        if abs(announced_hz / divisor - measured_hz) <= _TOLERANCE * measured_hz:
+        # A high rate has parts near any other, such as 1000/33 Hz near 30 Hz.
+        if abs(announced_hz / divisor - measured_hz) <= _TOLERANCE / divisor * measured_hz:
             return announced_hz / divisor
     rounded_hz = round(measured_hz)
     return float(rounded_hz) if abs(rounded_hz - measured_hz) <= 0.001 * measured_hz else measured_hz

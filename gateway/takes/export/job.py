@@ -4,6 +4,7 @@ The formats are imported when they are used: the command line lists them, and nu
 """
 
 import math
+import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from gateway.config.words import join_or
 from gateway.errors import SelectionError, TakeError
+from gateway.messages.topics import unique_name
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.takes.files.new_file import NewFiles
 
@@ -74,6 +76,9 @@ _NOUNS: Final = {
 """What the components are called in notes."""
 
 _MAX_NAMED: Final = 10
+
+_NOT_IN_NAMES: Final = re.compile(r"[/\x00-\x1f\x7f-\x9f]")
+"""What names of files do not get: slashes and control characters."""
 
 
 def export_take(job: "ExportJob") -> list[Path]:
@@ -166,6 +171,8 @@ class ExportJob:
     opensim: OpenSimOptions = OpenSimOptions()
     bids: BidsNames = BidsNames()
     files: NewFiles = field(default_factory=NewFiles)
+    stems: set[str] = field(default_factory=set)
+    """The names of files so far, without extensions."""
 
     @property
     def chosen_format(self) -> Format:
@@ -232,8 +239,8 @@ class ExportJob:
 
     def utimes(self, take: "Take") -> tuple[float, float]:
         """Return from when on, and before when, the events are to be exported, in µs since 1970."""
-        first = -math.inf if self.from_s is None else take.start_utime + round(self.from_s * 1e6)
-        stop = math.inf if self.to_s is None else take.start_utime + round(self.to_s * 1e6)
+        first = -math.inf if self.from_s is None else take.start_utime + self.from_s * 1e6
+        stop = math.inf if self.to_s is None else take.start_utime + self.to_s * 1e6
         return first, stop
 
     def note_malformed(self, take: "Take") -> None:
@@ -244,9 +251,18 @@ class ExportJob:
                     self.note(f"malformed messages of {key} of {source.name} left out", amount=count)
 
     def file_name(self, *parts: str) -> Path:
-        """Return the name of one of several files: the name of ``out`` with these parts at its end."""
-        stem = "-".join([self.out.stem, *(part.replace("/", "_") for part in parts if part)])
-        return self.out.with_name(stem + self.out.suffix)
+        """Return the name of a further file: the name of ``out`` with these parts at its end.
+
+        Each has another name, also if those of sources differ only in what a file cannot have, or if a source
+        is called like the measurement of another one. This is reported.
+        """
+        wanted = "-".join([self.out.stem, *(_NOT_IN_NAMES.sub("_", part) for part in parts if part)])
+        stem = unique_name(wanted, self.stems, len(wanted) + 10)
+        path = self.out.with_name(stem + self.out.suffix)
+        if stem != wanted:
+            self.note(f"this is {'-'.join(filter(None, parts))}: another file has that name", path.name)
+        self.stems.add(stem)
+        return path
 
 
 def nothing_to_export(job: ExportJob, what: str) -> TakeError:

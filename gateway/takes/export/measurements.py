@@ -5,7 +5,7 @@ Each has a grid: see ``grid``.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -59,6 +59,11 @@ class Placed:
     def num_items(self) -> int:
         """The number of markers, channels or plates."""
         return int(self.series.values.shape[1])
+
+    def count(self, start: int, stop: int) -> int:
+        """Return how many of the rows ``start`` to ``stop`` were recorded."""
+        limits = (bounds(part.rows, start, stop) for part in self.parts)
+        return sum(last - first for first, last in limits)
 
     def block(self, start: int, stop: int) -> Array:
         """Return the values of rows ``start`` to ``stop``, NaN where one is missing.
@@ -219,7 +224,10 @@ def note_grid(job: ExportJob, measurement: Measurement) -> None:
 def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iterator[list[Measurement]]:
     """Yield the measurements of each of the components that a source has, with its frames as their base."""
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
-    runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
+    # Nor is a component that never has any, such as 6D without tools.
+    runs = {
+        key: series.without_empty_frames().runs() for key, series in source.series.items() if series.labels
+    }
     for key in keys:
         if key in runs:
             yield [Measurement(source, runs, run, grid) for run in runs[key] for grid in place(run)]
@@ -244,6 +252,8 @@ _ALONE: Final = {"analog": ".sto", "force": ".mot"}
 """The formats that have one component, at any rate."""
 
 _RATIO_TOLERANCE: Final = 0.02
+_MAX_RATIO_ERROR: Final = 0.1
+"""How many samples per frame a rate may differ from a multiple of that of the frames."""
 
 
 def sampled(
@@ -255,9 +265,12 @@ def sampled(
     """
     found: dict[tuple[int, tuple[str, ...]], list[Part]] = {}
     for run in measurement.runs_of(key):
-        ratio = place(run)[0].rate_hz / measurement.grid.rate_hz
+        # By the time stamps, because announced rates can be a little wrong. With a ratio that is not the true
+        # one, samples would get further away from their frames with each frame.
+        ratio = place(run)[0].measured_hz / measurement.grid.measured_hz
         count = round(ratio)
-        fits = count >= 1 and abs(ratio - count) <= _RATIO_TOLERANCE * count and count == (samples or count)
+        tolerance = min(_RATIO_TOLERANCE * count, _MAX_RATIO_ERROR)
+        fits = count >= 1 and abs(ratio - count) <= tolerance and count == (samples or count)
         parts = measurement.parts(run, max(count, 1))
         if parts and fits:
             found.setdefault((count, run.labels), []).extend(parts)
@@ -278,6 +291,24 @@ def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: in
     missing = count - (stop - start)
     if missing:
         job.note("frames missing in the take are empty", path.name, f"{missing} of {count}")
+
+
+def note_samples_left_out(
+    job: ExportJob, sources: Iterable[TakeSource], written: Mapping[tuple[str, str], int]
+) -> None:
+    """Report samples of analog channels and forces that are in no file.
+
+    ``written`` is how many are, by the name of the source and the key of the component.
+    """
+    for source in sources:
+        for key in ("analog", "force"):
+            total = len(source.series[key].without_empty_frames()) if key in source.series else 0
+            count = written.get((source.name, key), 0)
+            if count < total:
+                job.note(
+                    f"samples of {key} of {source.name} that fit no frame left out",
+                    amount=f"{total - count} of {total}",
+                )
 
 
 def _nearest(times: Array, wanted: Array) -> Array:

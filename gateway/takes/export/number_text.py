@@ -16,6 +16,8 @@ def number_rows(values: Array, missing: bytes = b"", separator: bytes = b",") ->
 
     ``missing`` stands for NaN and infinity. orjson writes 32-bit floats 30 times as fast as ``str``.
     """
+    if not len(values):
+        return []
     text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
     if not np.isfinite(values).all():
         text = text.replace(b"null", missing)

@@ -32,17 +32,17 @@ from gateway.takes.export.measurements import (
     Measurement,
     Placed,
     named_measurements,
+    note_samples_left_out,
     sampled,
     seconds_of_row,
     utc_text,
 )
 from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.export.opensim_labels import opensim_labels
-from gateway.takes.export.plates import PlatePlan, plan_plates
+from gateway.takes.export.plates import PlatePlan, plan_plates, unit_notes
 from gateway.takes.export.trc import write_trc
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.reader import SUFFIX
-from gateway.takes.files.take import TakeSource
 
 _BLOCK_ROWS: Final = 500
 
@@ -51,9 +51,9 @@ def export_opensim(job: ExportJob) -> None:
     """Write each measurement of each source to files in a folder, which is created if it does not exist."""
     job.files.create_folder(job.out)
     job = replace(job, out=job.out / f"{job.take.absolute().name.removesuffix(SUFFIX)}.trc")
-    found = named_measurements(job, ("3d", "analog", "force"), "markers, analog channels or forces")
+    named = named_measurements(job, ("3d", "analog", "force"), "markers, analog channels or forces")
     written: Counter[tuple[str, str]] = Counter()
-    for measurement, path in found:
+    for measurement, path in named:
         has_markers = measurement.base.key == "3d"
         analog = _Samples.of(job, measurement, "analog")
         forces = _Samples.of(job, measurement, "force")
@@ -64,8 +64,10 @@ def export_opensim(job: ExportJob) -> None:
         bodies = () if loads is None else _bodies(job, mot, loads.plans)
         if has_markers:
             unit = measurement.base.unit or "mm"
-            job.note(f"positions converted from {unit} to m", path.name)
-            write_trc(job, measurement, path, "m", rotation, _metres(job, unit))
+            metres = _metres(job, unit)
+            if metres != 1.0:
+                job.note(f"positions converted from {unit} to m", path.name)
+            write_trc(job, measurement, path, "m", rotation, metres)
         if loads is not None:
             _write_mot(job, mot, loads, rotation)
             _write_external_loads(job, mot, loads.plans, bodies)
@@ -73,8 +75,7 @@ def export_opensim(job: ExportJob) -> None:
             _write_sto(job, path.with_suffix(".sto"), analog)
         for key, samples in (("analog", analog), ("force", forces)):
             written[measurement.source.name, key] += 0 if samples is None else samples.num_placed
-    for source in {measurement.source.name: measurement.source for measurement, _ in found}.values():
-        _note_samples_left_out(job, source, written)
+    note_samples_left_out(job, {found.source.name: found.source for found, _ in named}.values(), written)
 
 
 def export_mot(job: ExportJob) -> None:
@@ -96,17 +97,6 @@ def export_sto(job: ExportJob) -> None:
         analog = _Samples.of(job, measurement, "analog")
         if analog is not None:
             _write_sto(job, path, analog)
-
-
-def _note_samples_left_out(job: ExportJob, source: TakeSource, written: Counter[tuple[str, str]]) -> None:
-    for key in ("analog", "force"):
-        count = written[source.name, key]
-        total = len(source.series[key].without_empty_frames()) if key in source.series else 0
-        if count < total:
-            job.note(
-                f"samples of {key} of {source.name} without a frame of the markers left out",
-                amount=f"{total - count} of {total}",
-            )
 
 
 def _metres(job: ExportJob, unit: str) -> float:
@@ -175,7 +165,11 @@ class _PlateLoads(NamedTuple):
         plans = plan_plates(job, parameters, unit, channels, recorded)
         by_plan = ((plan, recorded if plan.is_added else channels) for plan in plans)
         plates = [(plan, placed) for plan, placed in by_plan if placed is not None]
-        return cls(plates, samples, _metres(job, unit)) if plates else None
+        if not plates:
+            return None
+        for note in unit_notes((plan.plate for plan, _ in plates), f"N.{unit}"):
+            job.note(note)
+        return cls(plates, samples, _metres(job, unit))
 
     @property
     def plans(self) -> list[PlatePlan]:
@@ -305,7 +299,7 @@ def _write_table(
     The times say where rows are missing. ``more`` are lines of the header.
     """
     file = job.files.create(path)
-    file.write(f"{path.stem}\nversion=1\nnRows=".encode())
+    file.write(f"{printable(path.stem)}\nversion=1\nnRows=".encode())
     place_of_count = file.tell()
     file.write(b" " * _COUNT_WIDTH)
     time_0 = utc_text(samples.measurement)

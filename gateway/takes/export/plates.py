@@ -1,5 +1,6 @@
 """How each force plate is exported: from which channels or loads readers get what was recorded."""
 
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ from gateway.descriptions.force_plates import (
     moment_factor,
     own_channels,
     possible_types,
+    units_of,
+    unknown_units,
 )
 from gateway.rtc3d.parameters import Parameters, Plate
 from gateway.takes.export.job import ExportJob
@@ -25,7 +28,6 @@ _MAX_PLATES: Final = 255
 
 _COMPARED_BLOCKS: Final = 20
 _COMPARED_ROWS: Final = 1000  # of each block
-_FIRST_MOMENT: Final = 3
 
 
 class PlatePlan(NamedTuple):
@@ -82,8 +84,7 @@ def plan_plates(
         if geometry is None:
             job.note(f"{name} left out: its parameters do not give the corners of a rectangle")
             continue
-        moments = plate.channels[_FIRST_MOMENT:][:1]
-        factor = moment_factor(moments[0].unit if moments else "", unit)
+        factor = moment_factor(plate, unit)
         plan = PlatePlan(index, plate, geometry, FORCES_AND_MOMENTS, (), False, factor)
         own = _with_own_channels(plan, parameters, analog, forces)
         if own is not None:
@@ -93,8 +94,23 @@ def plan_plates(
             plans.append(plan._replace(channels=channels, is_added=True))
             num_channels += 6
         else:
-            job.note(f"{name} left out: the take has neither its analog channels nor its forces")
+            job.note(f"{name} left out: neither its analog channels nor its forces are there at this rate")
     return plans
+
+
+def unit_notes(plates: Iterable[Plate], moment_unit: str = "N.m") -> list[str]:
+    """Return what has to be reported about the units of plates whose loads become N and N.m.
+
+    ``moment_unit`` is what unknown moments count as.
+    """
+    plates = [*plates]
+    notes = []
+    if any(units_of(plate) != (1.0, 1.0) for plate in plates):
+        notes.append("forces and moments converted to N and N.m")
+    unknown = dict.fromkeys(unit for plate in plates for unit in unknown_units(plate))
+    if unknown:
+        notes.append(f"unknown units of plates, {', '.join(unknown)}, count as N and {moment_unit}")
+    return notes
 
 
 def _with_own_channels(

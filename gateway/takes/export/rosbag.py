@@ -41,6 +41,7 @@ from gateway.messages.ros2_names import (
 from gateway.messages.topics import unique_name
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.mcap_file import SourceExport, export_to_mcap
+from gateway.takes.export.plates import unit_notes
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import TakeSource
@@ -125,14 +126,13 @@ class _RosExport(SourceExport):
 
     def _forces(self, run: Series, rows: Array) -> Iterable[TopicMessages]:
         force = run.parameters_of(0).force
-        plates = force.plates if force else ()
+        plates = force.plates[: run.values.shape[1]] if force else ()
+        self.notes |= dict.fromkeys(unit_notes(plates))
         for index in range(run.values.shape[1]):
             newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
             loads = run.values[rows, index] * np.array([newtons] * 3 + [newton_metres] * 3)
             is_known = ~np.isnan(loads).any(axis=1)
             self.count("forces with NaN", ~is_known)
-            if (newtons, newton_metres) != (1.0, 1.0):
-                self.notes["forces and moments converted to N and N.m"] = None
             utimes = run.capture_utime[rows][is_known]
             encoded = self._stamped.encode_rows(ros_stamps(utimes), loads[is_known])
             yield self._messages(wrench_topic(plate_name(index + 1)), WRENCH_STAMPED, utimes, encoded)

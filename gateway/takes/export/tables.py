@@ -15,7 +15,7 @@ from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series, SeriesBuilder
-from gateway.takes.files.tables import TIME_COLUMNS, Column, value_columns
+from gateway.takes.files.tables import Column, value_columns
 from gateway.takes.files.take import Take, TakeSource
 
 _MAX_TABLES: Final = 200
@@ -55,8 +55,8 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
                 parts = (name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
                 table = Table(source, key, columns, job.file_name(*parts))
                 tables[name, key, columns] = table
-                for label in sorted({*run.labels} & {*TIME_COLUMNS}):
-                    job.note(f"the channel {label} of {name} is the column {label}_2")
+                if key == "analog":
+                    _note_columns(job, name, run, columns)
             yield table, run
     if not tables:
         raise nothing_to_export(job, "frames")
@@ -64,6 +64,13 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
         if count > 1:
             job.note(f"the labels of {key} of {name} change: each set of labels has a file", amount=count)
     job.note_malformed(take)
+
+
+def _note_columns(job: ExportJob, source: str, run: Series, columns: tuple[Column, ...]) -> None:
+    """Report channels that are called like one of the first columns."""
+    for label, column in zip(run.labels, columns, strict=True):
+        if label != column.name:
+            job.note(f"the channel {label} of {source} is the column {column.name}")
 
 
 def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:

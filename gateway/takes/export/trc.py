@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from gateway.descriptions.labels import printable
 from gateway.takes.export.axes import rotation_of
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import (
@@ -73,7 +74,7 @@ def _head(job: ExportJob, measurement: Measurement, name: str, unit: str) -> str
     grid = measurement.grid
     labels = opensim_labels(job, name, measurement.base.labels, "marker")
     rate = f"{grid.rate_hz:.10g}"
-    values = (rate, rate, grid.num_rows, len(labels), unit, rate, 1, grid.num_rows)
+    values = (rate, rate, grid.num_rows, len(labels), printable(unit), rate, 1, grid.num_rows)
     axes = [f"{axis}{number}" for number in range(1, len(labels) + 1) for axis in "XYZ"]
     lines = [
         # Readers take the rest of the line as the name of the file. They allow no more keys in the next two.

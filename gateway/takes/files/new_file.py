@@ -1,6 +1,7 @@
 """The names of takes, and new files that appear under their names when they are complete."""
 
 import contextlib
+import errno
 import os
 import re
 import secrets
@@ -160,7 +161,7 @@ class NewFiles:
             raise
 
     def _as_take_error(self, error: OSError) -> TakeError:
-        path = self.paths[-1] if self.paths else error.filename
+        path = error.filename2 or (self.paths[-1] if self.paths else error.filename)
         if isinstance(error, FileExistsError):
             return _exists(path)
         return TakeError(f"{path} cannot be written: {error.strerror or error}; nothing was written")
@@ -174,7 +175,7 @@ def _rename(temporary: Path, path: Path) -> None:
         raise
     except OSError:  # a file system without hard links, such as that of a USB stick
         if os.path.lexists(path):
-            raise FileExistsError from None
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), temporary, None, path) from None
         temporary.rename(path)
 
 

@@ -67,6 +67,8 @@ def _grid(series: Series, rate_hz: float, from_s: float | None, to_s: float | No
     """Return the times in µs since 1970, int64: multiples of the period since the beginning of the take."""
     first_s = float(series.seconds.min()) if from_s is None else from_s
     last_s = float(series.seconds.max()) if to_s is None else to_s
+    if not (math.isfinite(first_s) and math.isfinite(last_s)):
+        raise TakeError(f"cannot resample from {first_s:g} s to {last_s:g} s; give numbers, or None for all")
     first, last = math.ceil(first_s * rate_hz - 1e-6), math.floor(last_s * rate_hz + 1e-6)
     num_rows = last - first + 1
     # A pause of days, or a damaged time of capture, would become rows of NaN that fill the memory.

@@ -93,7 +93,7 @@ EXISTS = "exists already, and nothing is overwritten"
         ("a.c3d", ("--task", "x"), "--task is for --bids only", 2),
         (
             "a",
-            ("--opensim", "--bodies", "toes,heel"),
+            ("--opensim", "--bodies", "toes, ,heel"),
             "--bodies must have a name for each plate in walk.mot: 1, not 2",
             2,
         ),

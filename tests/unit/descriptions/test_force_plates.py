@@ -20,10 +20,12 @@ from gateway.descriptions.force_plates import (
     own_channels,
     placed_plates,
     possible_types,
+    unknown_units,
     up_axis_of,
 )
 from gateway.rtc3d.parameters import (
     AnalogChannel,
+    ForceChannel,
     Parameters,
     ParametersAnalog,
     ParametersForce,
@@ -71,15 +73,39 @@ def test_positions_have_the_unit_of_the_points() -> None:
         assert geometry.corners[0].tolist() == pytest.approx(corner)
 
 
+def plate_in(force_unit: str, moment_unit: str) -> Plate:
+    units = [force_unit] * 3 + [moment_unit] * 3
+    return replace(PLATE, channels=tuple(ForceChannel(str(n), unit=unit) for n, unit in enumerate(units)))
+
+
 @pytest.mark.parametrize(
-    ("moment_unit", "position_unit", "factor"),
+    ("force_unit", "moment_unit", "position_unit", "factor"),
     [
-        *(("Nm", "mm", 1000), ("Nmm", "mm", 1), ("N.m", "mm", 1000), ("N·mm", "m", 0.001)),
-        *(("N*m", "m", 1), ("", "mm", 1), ("lbf", "mm", 1), ("Nm", "furlong", 1)),
+        *(
+            ("N", "Nm", "mm", 1000),
+            ("N", " Nmm", "mm", 1),
+            ("N", "N.m", "mm", 1000),
+            ("N", "N·mm", "m", 0.001),
+        ),
+        *(("N", "N*m", "m", 1), ("N", "", "mm", 1), ("N", "lbf", "mm", 1), ("N", "Nm", "furlong", 1)),
+        *(
+            ("kN", "kNm", "mm", 1000),
+            ("kN", "Nm", "m", 0.001),
+            ("N", "kNm", "m", 1000),
+            ("", "Nm", "cm", 100),
+        ),
     ],
 )
-def test_moments_have_the_unit_of_the_points(moment_unit: str, position_unit: str, factor: float) -> None:
-    assert moment_factor(moment_unit, position_unit) == pytest.approx(factor)
+def test_moments_have_the_units_of_forces_and_points(
+    force_unit: str, moment_unit: str, position_unit: str, factor: float
+) -> None:
+    found = moment_factor(plate_in(force_unit, moment_unit), position_unit)
+    assert found == pytest.approx(factor)
+
+
+def test_units_that_are_not_known_are_named() -> None:
+    assert unknown_units(plate_in("lb", "N furlong")) == ["lb", "N furlong"]
+    assert unknown_units(plate_in("kN", "")) == unknown_units(PLATE) == []
 
 
 def test_own_channels_are_found_by_their_ids() -> None:

@@ -89,6 +89,7 @@ USUAL_NOTES = (
     "labels of analog changed to names of fields",
     "labels of force changed to names of fields",
     "residuals rounded to 127 steps",
+    "moments converted to Nmm",
 )
 """How those notes begin that most exports of a format have."""
 

@@ -176,6 +176,12 @@ def test_other_units_become_si_units(tmp_path: Path) -> None:
     assert "forces and moments converted to N and N.m" in notes_of(job)
 
 
+def test_a_component_without_items_is_no_tracking_system(tmp_path: Path) -> None:
+    """Servers send 6D frames also if no tool is defined."""
+    export(tmp_path, [markers(1), frame(ComponentType.TOOLS, [])])
+    assert runs_of(tmp_path) == {("labMarkers", "1")}
+
+
 def test_a_plate_that_sends_nothing_has_no_channels(tmp_path: Path) -> None:
     export(tmp_path, [parameters(SCENE.parameters), frame(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)])])
     assert len(table(only(tmp_path, "*_channels.tsv"))) == 6
@@ -218,8 +224,9 @@ def test_what_sources_record_at_the_same_time_is_one_run(tmp_path: Path) -> None
 
 
 def test_sources_whose_names_have_equal_letters_are_different_tracking_systems(tmp_path: Path) -> None:
-    export(tmp_path, [markers(1, number, source=name) for number in range(5) for name in ("a1", "a_1")])
-    assert runs_of(tmp_path) == {("a1Markers", "1"), ("a12Markers", "1")}
+    names = ("a12", "a1", "a_1")
+    export(tmp_path, [markers(1, number, source=name) for number in range(5) for name in names])
+    assert runs_of(tmp_path) == {("a12Markers", "1"), ("a1Markers", "1"), ("a122Markers", "1")}
 
 
 def test_new_labels_begin_a_run_while_other_components_go_on(tmp_path: Path) -> None:
@@ -295,14 +302,25 @@ def test_subject_and_session_come_from_the_take_in_letters_and_digits(tmp_path: 
         assert f"{note}: BIDS has letters and digits only" in notes_of(job)
 
 
-@pytest.mark.parametrize(
-    ("subject", "task", "missing"), [("", "rest", "subject"), ("-", "rest", "subject"), ("01", "", "task")]
-)
+@pytest.mark.parametrize(("subject", "task", "missing"), [("", "rest", "subject"), ("01", "", "task")])
 def test_a_data_set_needs_a_subject_and_a_task(tmp_path: Path, subject: str, task: str, missing: str) -> None:
     problem = f"does not say the {missing}, and BIDS needs it; add --{missing}"
     with pytest.raises(SelectionError, match=problem):
         export(tmp_path, [markers(1)], BidsNames(task), subject=subject)
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
+
+
+@pytest.mark.parametrize("name", ["subject", "session", "task"])
+def test_a_name_without_latin_letters_or_digits_is_an_error(tmp_path: Path, name: str) -> None:
+    about = {"subject": "01", "session": "2", "task": "rest", name: "歩行"}
+    problem = f"the {name} '歩行' has no letter from A to Z and no digit, as BIDS needs; choose by --{name}"
+    with pytest.raises(SelectionError, match=problem):
+        export(
+            tmp_path,
+            [details(session=about["session"]), markers(1)],
+            BidsNames(about["task"]),
+            subject=about["subject"],
+        )
 
 
 def test_sources_with_different_subjects_need_a_choice(tmp_path: Path) -> None:
@@ -375,7 +393,18 @@ def test_two_exports_to_one_data_set_cannot_lose_rows(tmp_path: Path) -> None:
         other.lock_folder(tmp_path / "study")
         with pytest.raises(TakeError, match=r"another program is writing to .*study"):
             export(tmp_path, [markers(1)])
+        (tmp_path / "study/dataset_description.json").unlink()  # as while the other one creates the data set
+        with pytest.raises(TakeError, match=r"another program is writing to .*study"):
+            export(tmp_path, [markers(1)])
+
+
+def test_tables_of_spreadsheets_get_further_rows(tmp_path: Path) -> None:
+    """They can begin with a byte order mark, and their lines can end in CR LF."""
     export(tmp_path, [markers(1)])
+    table_path = tmp_path / "study/participants.tsv"
+    table_path.write_bytes("\ufeffparticipant_id\tage\r\nsub-01\t34\r\n".encode())
+    export(tmp_path, [markers(1)], subject="02")
+    assert table_path.read_bytes() == b"participant_id\tage\nsub-01\t34\nsub-02\tn/a\n"
 
 
 def test_a_take_without_samples_is_an_error(tmp_path: Path) -> None:

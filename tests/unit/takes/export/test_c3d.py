@@ -29,6 +29,7 @@ from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob, export_take
 from tests.support.takes import (
+    SERVER_START_US,
     START_UTIME,
     Message,
     description,
@@ -231,11 +232,38 @@ def test_readers_find_the_exact_ratio_of_odd_rates(tmp_path: Path, rate_hz: floa
     assert read_independently(tmp_path / "out.c3d").analog.shape == (30 * ratio, 1)
 
 
-def test_analog_with_a_rate_that_c3d_cannot_have_is_reported(tmp_path: Path) -> None:
-    odd = SyntheticScene(markers=2, tools=0, analog=3, plates=0, rate_hz=100, analog_rate_hz=250)
-    found, [note] = export_c3d(tmp_path, scene(50, odd))
-    assert note == "analog left out: its rate is not a multiple of that of the frames; export to .sto has it"
-    assert found.points.shape == (4, 2, 50)
+@pytest.mark.parametrize(("rate_hz", "analog_rate_hz"), [(100, 250), (60, 1000), (30, 2000), (100, 1080)])
+def test_analog_with_a_rate_that_c3d_cannot_have_is_reported(
+    tmp_path: Path, rate_hz: float, analog_rate_hz: float
+) -> None:
+    """With 17 samples of 1000 Hz in each of 60 frames a second, channels would drift by 20 ms per second."""
+    odd = SyntheticScene(
+        markers=2, tools=0, analog=3, plates=0, rate_hz=rate_hz, analog_rate_hz=analog_rate_hz
+    )
+    found, notes = export_c3d(tmp_path, scene(60, odd))
+    count = int(60 * analog_rate_hz / rate_hz)
+    assert notes == [
+        "analog left out: its rate is not a multiple of that of the frames; export to .sto has it",
+        f"samples of analog of lab that fit no frame left out | {count} of {count}",
+    ]
+    assert found.points.shape == (4, 2, 60)
+
+
+def test_forces_with_another_rate_than_the_channels_are_reported(tmp_path: Path) -> None:
+    messages = scene(50, keep=lambda key, _: key is not ComponentType.FORCE)
+    for number in range(50):
+        time_us = SERVER_START_US + 10_000 * number
+        messages.append(frame(ComponentType.FORCE, [(0,) * 6] * 2, number, timestamp_us=time_us))
+    _, notes = export_c3d(tmp_path, messages)
+    assert notes == [
+        "force left out: its rate is not that of the analog channels; export to .mot has it",
+        *(
+            f"force plate {number} (Force plate {number}) left out: neither its analog channels nor its "
+            "forces are there at this rate"
+            for number in (1, 2)
+        ),
+        "samples of force of lab that fit no frame left out | 50 of 50",
+    ]
 
 
 def test_analog_without_markers(tmp_path: Path) -> None:
@@ -254,8 +282,10 @@ CALIBRATION = np.diag([100.0, 100, 200, 5000, 5000, 4000]) + 0.3
 
 
 def test_plates_without_channels_of_their_own_get_six_each(tmp_path: Path) -> None:
-    found, notes = export_c3d(tmp_path, scene(150))
+    job = export_messages(tmp_path, scene(150), "out.c3d")
+    found, notes = C3d(tmp_path / "out.c3d"), notes_of(job)
     assert notes == ["out.c3d | forces became analog channels, six of each plate | 2"]
+    assert "out.c3d | moments converted to Nmm" in notes_of(job, usual=True)
     names = [f"{name}{plate}" for plate in (1, 2) for name in ("Fx", "Fy", "Fz", "Mx", "My", "Mz")]
     assert found("ANALOG", "LABELS")[3:] == names
     assert found("ANALOG", "UNITS")[3:9] == ["N"] * 3 + ["Nmm"] * 3
@@ -270,6 +300,15 @@ def test_plates_without_channels_of_their_own_get_six_each(tmp_path: Path) -> No
         corners = np.array([[corner.x, corner.y] for corner in described.corners])
         centre = corners.mean(axis=0)[:, None] + np.stack([-moment_nmm[1], moment_nmm[0]]) / force[2]
         assert np.allclose(plate["center_of_pressure"][:2, loaded], centre[:, loaded], atol=0.1)
+
+
+def test_forces_beyond_all_numbers_cause_no_warning(tmp_path: Path) -> None:
+    loads = ((0, 0, math.inf, 0, 0, 0), (0, 0, 1, 1e38, 0, 0))  # Nm, which become Nmm
+    frames = [frame(ComponentType.FORCE, [load] * 2, number) for number, load in enumerate(loads)]
+    export_c3d(tmp_path, [parameters(SCENE.parameters), *frames])
+    found = read_independently(tmp_path / "out.c3d").analog
+    assert not np.isfinite(found[0]).all()
+    assert math.isinf(found[1, 3])
 
 
 def plate_messages(plate: Plate, channels: Any, loads: Any) -> list[Message]:

@@ -80,6 +80,9 @@ def test_what_markers_and_analog_do_not_both_have_at_the_ends_is_left_out(
     assert np.array_equal(found.analog[:3], samples(10 * first, 10 * last))
     assert np.array_equal(found.points[0], x_of(first, last), equal_nan=True)
     assert ("frames at the ends left out" in "".join(notes)) == (last - first < len(markers))
+    count, total = len(analog) - 10 * (last - first), len(analog)
+    left_out = f"samples of analog of lab that fit no frame left out | {count} of {total}"
+    assert (left_out in notes) == (count > 0)
 
 
 def test_each_measurement_is_a_file(tmp_path: Path) -> None:

@@ -9,12 +9,14 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
+    AnalogChannel,
     EventDefinition,
     EventParameter,
     ForceChannel,
     Marker,
     Parameters,
     Parameters3D,
+    ParametersAnalog,
     ParametersEvents,
     ParametersForce,
     Plate,
@@ -82,6 +84,18 @@ def test_titles_have_labels_and_units(tmp_path: Path) -> None:
     ):
         expected = [f"{label} {title}" for title in titles.split(",")]
         assert read_csv(tmp_path / f"walk-{key}.csv")[0][7:] == expected
+
+
+def test_titles_differ_also_if_a_label_ends_like_a_unit(tmp_path: Path) -> None:
+    channels = (AnalogChannel("1", "x (V)", unit=""), AnalogChannel("2", "x", unit="V"))
+    described = Parameters(analog=ParametersAnalog(channels))
+    export_messages(tmp_path, [parameters(described), frame(ComponentType.ANALOG, [1, 2])], "walk.csv")
+    assert read_csv(tmp_path / "walk-analog.csv")[0][7:] == ["x (V)", "x (V)_2"]
+
+
+def test_markers_called_like_a_column_of_time_change_nothing(tmp_path: Path) -> None:
+    job = export_messages(tmp_path, [labelled("session"), markers(1)], "walk.csv")
+    assert notes_of(job) == []
 
 
 def test_missing_values_are_empty_and_extreme_ones_exact(tmp_path: Path) -> None:

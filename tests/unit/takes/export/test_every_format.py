@@ -1,7 +1,7 @@
 """What holds for each format, also for those that will be added: sources, progress, what is reported."""
 
 import csv
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from functools import partial
 from itertools import count, groupby
@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import pandas as pd
 import pytest
+import rtc3d
 
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, export_take
@@ -136,6 +137,39 @@ def test_one_source_alone_is_exported_without_its_name(take: Path, tmp_path: Pat
     assert not any("left" in str(path.relative_to(tmp_path)) for path in paths)
     if name != "bids":  # its tracking systems always have the name of the source
         assert not any("right" in path.name for path in paths)
+
+
+def source_messages(name: str, channels: str, *, num_measurements: int = 1) -> Iterator[Message]:
+    """Yield the messages of a source of any name, whose channels begin with MOCAP_ and ``channels``."""
+    about = rtc3d.take_t()
+    about.utime, about.source, about.channels = START_UTIME, name, f"MOCAP_{channels}"
+    yield f"MOCAP_{channels}_TAKE", about.encode()
+    yield parameters(LEFT.parameters, source=channels)
+    for session in range(num_measurements):
+        yield from scene_messages(
+            LEFT, 20, source=channels, session=session, start_us=session * 1_000_000, sequence=session * 1000
+        )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_sources_cannot_break_files_or_replace_those_of_others(tmp_path: Path, name: str) -> None:
+    messages = [
+        *source_messages("a/b", "A", num_measurements=2),
+        *source_messages("a_b", "B"),
+        *source_messages("a_b-2", "C"),
+        *source_messages("tab\tline\n", "D"),
+    ]
+    take = write_take(tmp_path / "take.lcmlog", messages)
+    paths = export_take(job_for(name, take, tmp_path / "out", details={"subject": "01"}))
+    assert all(path.name.isprintable() for path in paths)
+    match name:
+        case ".mot" | ".sto":
+            names = {"take-a_b-1", "take-a_b-2", "take-a_b", "take-a_b-2_2", "take-tab_line_"}
+            assert {path.stem for path in paths} == names
+            assert all(len(read_storage(path).times_s) == 40 for path in paths)
+        case "bids":
+            tables = [path.read_text().splitlines() for path in paths if path.name.endswith("_channels.tsv")]
+            assert {len({line.count("\t") for line in lines}) for lines in tables} == {1}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,6 +1,7 @@
 """What several formats have in common: files, times, memory, and takes without anything to export."""
 
 import csv
+import math
 import re
 from datetime import datetime
 from pathlib import Path
@@ -33,6 +34,8 @@ EVENT = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
         (".trc", [ANALOG], {}, r"take\.lcmlog has no markers, and \.trc holds nothing else"),
         (".trc", [markers(1)], {"from_s": 5.0}, "has no markers between --from and --to"),
         (".csv", [description(), labelled("a")], {}, "has no frames"),
+        (".csv", [markers(1)], {"from_s": math.inf}, "has no frames between --from and --to"),
+        (".sto", [frame(ComponentType.ANALOG, [])], {}, "has no analog channels"),
         (
             ".csv",
             [description(), markers(1)],

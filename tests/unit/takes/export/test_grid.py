@@ -68,7 +68,13 @@ def test_missing_frames_keep_their_rows(tmp_path: Path, lost_before_the_gateway:
 
 @pytest.mark.parametrize(
     ("announced_hz", "step_us", "expected_hz"),
-    [(100.0, 50_000, 20.0), (59.94, 16683.35, 59.94), (None, 5000, 200.0), (2000.0, 7_000, 1e6 / 7000)],
+    [
+        (100.0, 50_000, 20.0),
+        (59.94, 16683.35, 59.94),
+        (None, 5000, 200.0),
+        (2000.0, 7_000, 1e6 / 7000),
+        (1000.0, 33_333.3, 30.0),
+    ],
 )
 def test_the_rate_is_the_announced_one_if_that_was_recorded(
     tmp_path: Path, announced_hz: float | None, step_us: float, expected_hz: float

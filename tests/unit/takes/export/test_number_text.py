@@ -14,6 +14,7 @@ def test_missing_values_and_separators() -> None:
     values = np.array([[np.nan, 1.0], [2.0, np.inf]], np.float32)
     assert number_rows(values, b"n/a", b"\t") == [b"n/a\t1.0", b"2.0\tn/a"]
     assert number_rows(values[:, :0]) == [b"", b""]
+    assert number_rows(values[:0]) == []
 
 
 def test_numbers_are_read_back_exactly() -> None:

@@ -153,18 +153,33 @@ def test_ground_reactions_worked_out_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("unit", "moment_unit", "factors"), [("N", "Nmm", (1, 1000)), ("kN", "kNm", (0.001, 0.001))]
+    ("unit", "moment_unit", "factors"),
+    [("N", "Nmm", (1, 1000)), ("kN", "kNm", (0.001, 0.001)), ("kN", "Nm", (0.001, 1))],
 )
 def test_units_of_the_server_become_newtons_and_metres(
     tmp_path: Path, unit: str, moment_unit: str, factors: tuple[float, float]
 ) -> None:
     channels = tuple(replace(each, unit=unit if n < 3 else moment_unit) for n, each in enumerate(NEWTONS))
     load = tuple(value * factors[n > 2] for n, value in enumerate(STEP))
-    export_messages(tmp_path, step_messages(load, plate=replace(PLATE, channels=channels)), "walk.mot")
+    messages = step_messages(load, plate=replace(PLATE, channels=channels))
+    job = export_messages(tmp_path, messages, "walk.mot")
+    assert "forces and moments converted to N and N.m" in notes_of(job)
     [force], [position], [moment] = vectors_of(read_storage(tmp_path / "walk.mot"), 1)
     assert force == pytest.approx([10, 800, -20])
     assert position == pytest.approx([0.25, 0, -0.4])
     assert moment == pytest.approx([0, 0.5, 0], abs=1e-6)
+
+
+def test_unknown_units_of_a_plate_are_reported(tmp_path: Path) -> None:
+    channels = tuple(replace(each, unit="lb" if n < 3 else "lb.in") for n, each in enumerate(NEWTONS))
+    job = export_messages(tmp_path, step_messages(STEP, plate=replace(PLATE, channels=channels)), "walk.mot")
+    assert "unknown units of plates, lb, lb.in, count as N and N.mm" in notes_of(job)
+
+
+def test_positions_in_metres_are_not_converted(tmp_path: Path) -> None:
+    messages = [labelled("a", unit="m"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)])]
+    job = export_messages(tmp_path, messages, "out", format="opensim")
+    assert "converted" not in "".join(notes_of(job, usual=True))
 
 
 def test_forces_on_the_plate_become_those_on_the_person(tmp_path: Path) -> None:
@@ -230,8 +245,8 @@ def test_samples_outside_the_frames_and_other_components_are_reported(tmp_path: 
     shown = SyntheticScene(markers=5, tools=1, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000)
     job = export_messages(tmp_path, scene(20, shown, keep=keep), "out", format="opensim")
     notes = notes_of(job, usual=True)
-    assert "samples of force of lab without a frame of the markers left out | 50 of 200" in notes
-    assert "samples of analog of lab without a frame of the markers left out | 50 of 200" in notes
+    assert "samples of force of lab that fit no frame left out | 50 of 200" in notes
+    assert "samples of analog of lab that fit no frame left out | 50 of 200" in notes
     assert "left out of lab: tools (6D), reliabilities of markers" in notes
     assert "positions converted from mm to m" in " ".join(notes)
 

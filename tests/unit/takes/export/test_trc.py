@@ -114,3 +114,9 @@ def test_a_unit_that_opensim_does_not_know_is_reported(tmp_path: Path) -> None:
     messages = [labelled("a", unit="inch"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)])]
     job = export_messages(tmp_path, messages, "walk.trc")
     assert notes_of(job) == ["walk.trc | the unit is inch; OpenSim expects mm or m"]
+
+
+def test_a_unit_cannot_break_the_head(tmp_path: Path) -> None:
+    messages = [labelled("a", unit="m\tm"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)])]
+    export_messages(tmp_path, messages, "walk.trc")
+    assert (tmp_path / "walk.trc").read_text().splitlines()[2].split("\t")[3:6] == ["1", "m_m", "100"]

@@ -25,9 +25,9 @@ def test_a_file_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
 
 
 def create(folder: Path, error: BaseException | None = None, *, appears: bool = False) -> None:
-    """Write two files; fail, or let another program create the second one meanwhile."""
+    """Write three files; fail, or let another program create the second one meanwhile."""
     with NewFiles() as files:
-        for number in (1, 2):
+        for number in (1, 2, 3):
             files.create(folder / f"walk-{number}.c3d").write(b"x")
         if error is not None:
             raise error
@@ -42,7 +42,7 @@ def create(folder: Path, error: BaseException | None = None, *, appears: bool = 
         (KeyboardInterrupt("stop"), "stop"),
         (
             OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
-            "walk-2.c3d cannot be written: No space left on device",
+            "walk-3.c3d cannot be written: No space left on device",
         ),
     ],
 )
@@ -69,7 +69,7 @@ def test_what_exists_is_not_replaced(tmp_path: Path, target: str) -> None:
 
 
 def test_a_file_that_appears_meanwhile_is_not_replaced_and_none_of_the_others_remains(tmp_path: Path) -> None:
-    with pytest.raises(TakeError, match="exists already"):
+    with pytest.raises(TakeError, match=r"walk-2\.c3d exists already"):
         create(tmp_path, appears=True)
     assert names(tmp_path) == {"walk-2.c3d"}
     assert (tmp_path / "walk-2.c3d").read_bytes() == b"mine"
@@ -87,8 +87,8 @@ def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "link", no_links)
     (tmp_path / "other").mkdir()
     create(tmp_path / "other")
-    assert names(tmp_path / "other") == {"walk-1.c3d", "walk-2.c3d"}
-    with pytest.raises(TakeError, match="exists already"):
+    assert names(tmp_path / "other") == {"walk-1.c3d", "walk-2.c3d", "walk-3.c3d"}
+    with pytest.raises(TakeError, match=r"walk-2\.c3d exists already"):
         create(tmp_path, appears=True)
     assert names(tmp_path) == {"other", "walk-2.c3d"}
 
