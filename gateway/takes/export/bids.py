@@ -95,7 +95,7 @@ class _Channel(NamedTuple):
 
 def export_bids(job: ExportJob) -> None:
     """Add the take to a data set, which is created if it does not exist: a run for each measurement."""
-    take = job.open_take()
+    take = job.open_take(job.chosen_format.components)
     runs = _runs(job, take)
     data_set = open_data_set(job, take)
     first_run = job.bids.run if job.bids.run is not None else data_set.next_run()

@@ -187,7 +187,7 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     """
     by_source = {
         source.name: found
-        for source in job.open_take().sources.values()
+        for source in job.open_take({*keys, *job.chosen_format.components}).sources.values()
         if (found := next(measurements_by_component(source, keys), []))
     }
     total = sum(map(len, by_source.values()))

@@ -70,14 +70,13 @@ def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
     """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
     reader = TakeReader(job.take)
     first, stop = job.utimes(take)
-    for batches in reader.batches():
+    for batches in reader.batches(stop):
         for batch in batches:
             source = take.sources.get(batch.source)
             if source is None or batch.key not in COMPONENTS_BY_KEY:
                 continue
             component = COMPONENTS_BY_KEY[batch.key]
-            events = zip(batch.utimes, batch.messages, strict=True)
-            messages = [message for utime, message in events if first <= utime < stop]
+            messages = batch.messages_between(first, stop)
             if not messages:
                 continue
             rows = decode_rows(component, messages)
@@ -88,3 +87,4 @@ def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
             if series is not None:
                 yield source.name, batch.key, series
         job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)
+    job.progress(f"writing {job.out.name}", reader.num_bytes, reader.num_bytes)
