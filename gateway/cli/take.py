@@ -275,6 +275,7 @@ def export(
     """
     from rich.console import Console
 
+    from gateway.cli.take_report import size_text
     from gateway.display.terminal import print_list
 
     if from_s is not None and to_s is not None and from_s >= to_s:
@@ -311,8 +312,7 @@ def export(
         paths = export_take(job)
     print_list(Console(stderr=True), ["file", "changed, rounded or left out", "how much"], job.notes)
     for path in paths:
-        size = path.stat().st_size
-        print(f"{path} ({size / 1e6:.1f} MB)" if size >= 100_000 else f"{path} ({size / 1e3:.1f} kB)")
+        print(f"{path} ({size_text(path.stat().st_size)})")
 
 
 @contextmanager

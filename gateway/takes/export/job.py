@@ -61,7 +61,10 @@ CHOSEN_FORMATS: Final = {
     "bids": Format("bids", "export_bids"),
     "ros2": Format("rosbag", "export_rosbag", ("3d", "6d", "analog", "force"), lacks=_FOR_VIEWERS),
 }
-"""The formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
+"""The formats that an option chooses."""
+
+_FOLDERS: Final = ("opensim", "bids")
+"""Those whose files are in a folder, ``out``."""
 
 _EXTRAS: Final = {".mcap": ("foxglove-sdk", "foxglove"), ".parquet": ("pyarrow", "parquet")}
 """The package that files of an extension need, and the extra that installs it."""
@@ -82,9 +85,16 @@ def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     extension = job.out.suffix.lower()
     if job.format == "ros2" and extension != ".mcap":
-        raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does")
+        raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does; add .mcap")
+    if job.format in _FOLDERS and extension in FORMATS:
+        raise SelectionError(
+            f"--{job.format} writes a folder, and {job.out} is the name of a file; omit {extension}"
+        )
     if not job.format and extension not in FORMATS:
-        raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
+        raise SelectionError(
+            f"{job.out} has no known extension; choose {join_or(FORMATS)}, "
+            "or --opensim or --bids for a folder"
+        )
     chosen = job.chosen_format
     with job.files:
         try:
