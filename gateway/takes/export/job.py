@@ -3,7 +3,6 @@
 The formats are imported when they are used: the command line lists them, and numpy is slow to import.
 """
 
-import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -243,12 +242,6 @@ class ExportJob:
             left_out += [what for key, what in chosen.lacks.items() if key in recorded]
             if left_out:
                 self.note(f"left out of {source.name}: {', '.join(left_out)}")
-
-    def utimes(self, take: "Take") -> tuple[float, float]:
-        """Return from when on, and before when, the events are to be exported, in µs since 1970."""
-        first = -math.inf if self.from_s is None else take.start_utime + round(self.from_s * 1e6)
-        stop = math.inf if self.to_s is None else take.start_utime + round(self.to_s * 1e6)
-        return first, stop
 
     def note_malformed(self, take: "Take") -> None:
         """Report messages that could not be read."""

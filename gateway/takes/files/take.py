@@ -124,7 +124,7 @@ def open_take(
     ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
     much memory as their part of the file, unless there is a ``spool_folder``: then large ones are in
     temporary files there, and cannot be changed. Damage is skipped and counted. Raises TakeError if there is
-    no take, and SelectionError, a TakeError, if a source or component is not in it.
+    no take, and SelectionError, a TakeError, if a source is not in it or a component does not exist.
 
     Of several takes, ``open_take([first, second])``, sources of the same name are joined in the order of
     their times, and others are side by side; seconds count from the earliest take. A message that several
@@ -140,8 +140,7 @@ def open_take(
         raise TakeError("there is no take to open; name at least one")
     takes: list[Take] = []
     start_utime = readers[0].start_utime
-    limits_s = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
-    first_utime, end_utime = (start_utime + limit_s * 1e6 for limit_s in limits_s)
+    first_utime, end_utime = utime_range(start_utime, from_s, to_s)
     total = sum(reader.num_bytes for reader in readers)
     chosen = COMPONENTS_BY_KEY.keys() if components is None else components
     for reader in readers:
@@ -164,6 +163,13 @@ def open_take(
         opened = ", ".join(str(reader.path) for reader in readers)
         raise SelectionError(f"{opened} has no source {min(missing)!r}; its sources are: {names}")
     return takes[0] if len(takes) == 1 else _join_takes(takes)
+
+
+def utime_range(start_utime: int, from_s: float | None, to_s: float | None) -> tuple[float, float]:
+    """Return the times of a part of a take in µs since 1970: from which on, and before which."""
+    first = -math.inf if from_s is None else start_utime + round(from_s * 1e6)
+    end = math.inf if to_s is None else start_utime + round(to_s * 1e6)
+    return first, end
 
 
 def _join_takes(takes: Sequence[Take]) -> Take:
