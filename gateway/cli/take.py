@@ -237,35 +237,47 @@ def export(
         bool,
         typer.Option(
             "--opensim",
-            help="OUT is a folder for OpenSim: markers, ground reactions, analog channels.",
+            help="Write files for OpenSim to the folder OUT: markers, ground reactions, analog channels.",
         ),
     ] = False,
     up: Annotated[
         Axis | None,
         typer.Option(
-            help="The server's axis that points up, which becomes Y; the default is that of the plates, or z."
+            help="For OpenSim: the server's axis that points up, such as y or -z; "
+            "the default is that of the plates, or z."
         ),
     ] = None,
     forward: Annotated[
         Axis | None,
-        typer.Option(help="The server's axis that becomes X; the default is x, or z if x points up."),
+        typer.Option(
+            help="For OpenSim: the server's axis that becomes X; the default is x, or z if x points up."
+        ),
     ] = None,
     min_force: Annotated[
         float | None,
-        typer.Option(min=0.0, help="The force in N at which contact with a plate begins; the default is 10."),
+        typer.Option(
+            min=0.0,
+            help="For OpenSim: the force in N at which contact with a plate begins; the default is 10.",
+        ),
     ] = None,
     bodies: Annotated[
         str | None,
         typer.Option(
-            help="The model's bodies that step on the plates, in the order of the plates: calcn_r,calcn_l."
+            help="For --opensim: the model's body that steps on each plate, such as calcn_r,calcn_l."
         ),
     ] = None,
     bids: Annotated[
-        bool, typer.Option("--bids", help="Write to a Motion-BIDS data set; OUT is its folder, new or not.")
+        bool,
+        typer.Option("--bids", help="Add the take to a Motion-BIDS data set; OUT is its folder, new or not."),
     ] = False,
-    task: Annotated[str | None, typer.Option(help="The task in BIDS, such as walking.")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="For --bids, which needs it: the task, such as walking.")
+    ] = None,
     run: Annotated[
-        int | None, typer.Option(min=1, help="The number of the run in BIDS; the default is the next one.")
+        int | None,
+        typer.Option(
+            min=1, help="For --bids: the number of the first run; the default is the next free one."
+        ),
     ] = None,
     quiet: options.NoProgressOption = False,
 ) -> None:
@@ -275,6 +287,7 @@ def export(
     """
     from rich.console import Console
 
+    from gateway.cli.take_report import size_text
     from gateway.display.terminal import print_list
 
     if from_s is not None and to_s is not None and from_s >= to_s:
@@ -311,8 +324,7 @@ def export(
         paths = export_take(job)
     print_list(Console(stderr=True), ["file", "changed, rounded or left out", "how much"], job.notes)
     for path in paths:
-        size = path.stat().st_size
-        print(f"{path} ({size / 1e6:.1f} MB)" if size >= 100_000 else f"{path} ({size / 1e3:.1f} kB)")
+        print(f"{path} ({size_text(path.stat().st_size)})")
 
 
 @contextmanager

@@ -213,9 +213,9 @@ def write_report(statistics: TakeStatistics, console: Console) -> None:
 
 
 def _report(statistics: TakeStatistics) -> Iterator[RenderableType]:
-    num_bytes, num_files = statistics.num_bytes, len(statistics.files)
-    size = f"{num_bytes / 1e6:.1f} MB" if num_bytes >= 100_000 else f"{num_bytes} bytes"
-    yield f"{statistics.path}: {size}" + (f", {num_files} files" if num_files > 1 else "")
+    num_files = len(statistics.files)
+    files_text = f", {num_files} files" if num_files > 1 else ""
+    yield f"{statistics.path}: {size_text(statistics.num_bytes)}{files_text}"
     try:
         begin = datetime.fromtimestamp(statistics.start_utime / 1e6).astimezone()
         begin_text = begin.strftime("%Y-%m-%d %H:%M:%S %Z")

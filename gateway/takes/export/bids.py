@@ -13,7 +13,6 @@ import numpy as np
 
 from gateway.descriptions.force_plates import placed_plates, units_of
 from gateway.descriptions.labels import event_text, fitting_labels, printable
-from gateway.errors import TakeError
 from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import AnalogChannel, Marker, Tool
 from gateway.takes.export.bids_data_set import (
@@ -28,8 +27,8 @@ from gateway.takes.export.bids_data_set import (
 )
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.measurements import (
-    MAX_FILES,
     Measurement,
+    check_number,
     event_seconds,
     measurements_by_component,
     note_grid,
@@ -96,7 +95,7 @@ class _Channel(NamedTuple):
 
 def export_bids(job: ExportJob) -> None:
     """Add the take to a data set, which is created if it does not exist: a run for each measurement."""
-    take = job.open_take()
+    take = job.open_take(job.chosen_format.components)
     runs = _runs(job, take)
     data_set = open_data_set(job, take)
     first_run = job.bids.run if job.bids.run is not None else data_set.next_run()
@@ -135,11 +134,7 @@ def _runs(job: ExportJob, take: Take) -> list[list[_Recording]]:
     ]
     if not found:
         raise nothing_to_export(job, "markers, tools, analog channels or forces")
-    if len(found) > MAX_FILES:
-        raise TakeError(
-            f"{job.take} has {len(found)} measurements, and each becomes a file; "
-            "choose a part by --from and --to"
-        )
+    check_number(job, len(found))
     runs: list[list[_Recording]] = []
     for recording in sorted(found, key=lambda each: each.start_s):
         for run in runs:

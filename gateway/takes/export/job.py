@@ -3,12 +3,12 @@
 The formats are imported when they are used: the command line lists them, and numpy is slow to import.
 """
 
-import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from gateway.config.words import join_or
@@ -25,27 +25,28 @@ class Format(NamedTuple):
     """A format: the module and the function that write the files of a job, and what they keep of a take.
 
     ``components`` are the keys of those that it has; ``keeps_details`` says whether it has the subject, the
-    session and the note. ``lacks`` is what else it never has, in words.
+    session and the note. ``lacks`` is what else it never has, in words, by the component that has it, or
+    "parameters"; "" stands for all components.
     """
 
     module: str
     function: str
     components: Collection[str] = COMPONENTS_BY_KEY.keys()
     keeps_details: bool = True
-    lacks: tuple[str, ...] = ()
+    lacks: Mapping[str, str] = MappingProxyType({})
 
 
-_RELIABILITIES: Final = "reliabilities of markers"
-_PARAMETERS: Final = "parameters except labels and units"
-_FOR_VIEWERS: Final = ("errors of tools", "frame numbers", "server's time stamps")
+_RELIABILITIES: Final = {"3d": "reliabilities of markers"}
+_PARAMETERS: Final = {"parameters": "parameters except labels and units"}
+_FOR_VIEWERS: Final = {"6d": "errors of tools", "": "frame numbers, server's time stamps"}
 
 FORMATS: Final = {
     ".c3d": Format("c3d", "export_c3d", ("3d", "analog", "force", "event")),
-    ".trc": Format("trc", "export_trc", ("3d",), keeps_details=False, lacks=(_RELIABILITIES,)),
+    ".trc": Format("trc", "export_trc", ("3d",), keeps_details=False, lacks=_RELIABILITIES),
     ".mot": Format("opensim", "export_mot", ("force",), keeps_details=False),
     ".sto": Format("opensim", "export_sto", ("analog",), keeps_details=False),
-    ".csv": Format("csv_files", "export_csv", keeps_details=False, lacks=(_PARAMETERS,)),
-    ".parquet": Format("parquet", "export_parquet", lacks=(_PARAMETERS,)),
+    ".csv": Format("csv_files", "export_csv", keeps_details=False, lacks=_PARAMETERS),
+    ".parquet": Format("parquet", "export_parquet", lacks=_PARAMETERS),
     ".mcap": Format("mcap", "export_mcap", lacks=_FOR_VIEWERS),
 }
 """The formats by the extension of the new file."""
@@ -56,12 +57,15 @@ CHOSEN_FORMATS: Final = {
         "export_opensim",
         ("3d", "analog", "force"),
         keeps_details=False,
-        lacks=(_RELIABILITIES,),
+        lacks=_RELIABILITIES,
     ),
     "bids": Format("bids", "export_bids"),
     "ros2": Format("rosbag", "export_rosbag", ("3d", "6d", "analog", "force"), lacks=_FOR_VIEWERS),
 }
-"""The formats that an option chooses. The files of all but ros2 are in a folder, ``out``."""
+"""The formats that an option chooses."""
+
+_FOLDERS: Final = ("opensim", "bids")
+"""Those whose files are in a folder, ``out``."""
 
 _EXTRAS: Final = {".mcap": ("foxglove-sdk", "foxglove"), ".parquet": ("pyarrow", "parquet")}
 """The package that files of an extension need, and the extra that installs it."""
@@ -85,9 +89,16 @@ def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     extension = job.out.suffix.lower()
     if job.format == "ros2" and extension != ".mcap":
-        raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does")
+        raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does; add .mcap")
+    if job.format in _FOLDERS and extension in FORMATS:
+        raise SelectionError(
+            f"--{job.format} writes a folder, and {job.out} is the name of a file; omit {extension}"
+        )
     if not job.format and extension not in FORMATS:
-        raise SelectionError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
+        raise SelectionError(
+            f"{job.out} has no known extension; choose {join_or(FORMATS)}, "
+            "or --opensim or --bids for a folder"
+        )
     chosen = job.chosen_format
     with job.files:
         try:
@@ -188,10 +199,10 @@ class ExportJob:
         if note not in self.notes:
             self.notes.append(note)
 
-    def open_take(self, components: Collection[str] | None = None) -> "Take":
+    def open_take(self, components: Collection[str]) -> "Take":
         """Return the chosen part of the take, and report what could not be read or has no place.
 
-        ``components`` are the keys of those to load; None means all. Raises TakeError.
+        ``components`` are the keys of those to load. Raises TakeError.
         """
         from gateway.takes.files.take import open_take  # noqa: PLC0415 - see above
 
@@ -220,28 +231,24 @@ class ExportJob:
                 self.note(
                     f"no parameters of {source.name} in the take: labels, units and rates are not known"
                 )
-        if components is None:
-            self.progress(f"arranging the frames of {self.take.name}", 0, 0)
-            self.note_malformed(take)
+        self.note_malformed(take)
         self._note_left_out(take)
+        if components:
+            self.progress(f"arranging the frames of {self.take.name}", 0, 0)
         return take
 
     def _note_left_out(self, take: "Take") -> None:
         """Report what a take has and the format has no place for."""
         chosen = self.chosen_format
         for source in take.sources.values():
-            left_out = [_NOUNS[key] for key in source.series if key not in chosen.components]
+            recorded = source.recorded | {"", *(["parameters"] if source.parameters else [])}
+            components = source.recorded.difference(chosen.components)
+            left_out = [noun for key, noun in _NOUNS.items() if key in components]
             if not chosen.keeps_details:
                 left_out += [name for name, text in source.details._asdict().items() if text]
-            left_out += chosen.lacks
+            left_out += [what for key, what in chosen.lacks.items() if key in recorded]
             if left_out:
                 self.note(f"left out of {source.name}: {', '.join(left_out)}")
-
-    def utimes(self, take: "Take") -> tuple[float, float]:
-        """Return from when on, and before when, the events are to be exported, in µs since 1970."""
-        first = -math.inf if self.from_s is None else take.start_utime + self.from_s * 1e6
-        stop = math.inf if self.to_s is None else take.start_utime + self.to_s * 1e6
-        return first, stop
 
     def note_malformed(self, take: "Take") -> None:
         """Report messages that could not be read."""

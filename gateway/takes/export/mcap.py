@@ -46,7 +46,7 @@ class _FoxgloveExport(SourceExport):
         if component is ComponentType.FORCE:
             interval = max(1, round((run.measured_rate_hz or _ARROWS_HZ) / _ARROWS_HZ))
             if interval > 1:
-                self.notes[f"arrows of forces drawn for one of {interval} frames only"] = None
+                self.notes[f"arrows of forces drawn for one in {interval} frames"] = None
         entries = run.content.entries
         for part in np.split(rows, np.flatnonzero(np.diff(entries[rows])) + 1):
             utimes = run.capture_utime[part].tolist()

@@ -25,7 +25,7 @@ _SAME_CLOCK_S: Final = 0.2
 """Two time stamps are of the same measurement if they differ from the times of capture equally, within
 this."""
 
-MAX_FILES: Final = 1000
+_MAX_FILES: Final = 1000
 """The most measurements in one export: each becomes a file."""
 
 _COMPARED: Final = 9
@@ -192,16 +192,13 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     """
     by_source = {
         source.name: found
-        for source in job.open_take().sources.values()
+        for source in job.open_take({*keys, *job.chosen_format.components}).sources.values()
         if (found := next(measurements_by_component(source, keys), []))
     }
     total = sum(map(len, by_source.values()))
     if not total:
         raise nothing_to_export(job, what)
-    if total > MAX_FILES:
-        raise TakeError(
-            f"{job.take} has {total} measurements, and each becomes a file; choose a part by --from and --to"
-        )
+    check_number(job, total)
     if total > 1:
         job.note("several measurements, each with files of its own", amount=total)
     named = []
@@ -211,6 +208,15 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
             parts = (name if len(by_source) > 1 else "", str(number) if len(found) > 1 else "")
             named.append((measurement, job.file_name(*parts)))
     return named
+
+
+def check_number(job: ExportJob, num_measurements: int) -> None:
+    """Raise TakeError if there are so many measurements that they would fill a folder with files."""
+    if num_measurements > _MAX_FILES:
+        raise TakeError(
+            f"{job.take} has {num_measurements} measurements, and each becomes a file; "
+            "choose a part by --from and --to"
+        )
 
 
 def note_grid(job: ExportJob, measurement: Measurement) -> None:

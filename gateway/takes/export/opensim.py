@@ -333,7 +333,7 @@ def _bodies(job: ExportJob, mot: Path, plans: list[PlatePlan]) -> tuple[str, ...
     if not bodies:
         bodies = tuple(islice(cycle(_FEET), len(plans)))
         job.note(
-            f"which foot is on which plate is a guess: {', '.join(bodies)}; --bodies says it",
+            f"which foot is on which plate is a guess: {', '.join(bodies)}; choose with --bodies",
             mot.with_suffix(".xml").name,
             len(bodies),
         )

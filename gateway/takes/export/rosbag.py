@@ -83,7 +83,6 @@ class _RosExport(SourceExport):
                 return [self._messages(ANALOG, FLOAT_ARRAY, run.capture_utime[rows], encoded)]
             case "force":
                 return self._forces(run, rows)
-        self.count("events", rows >= 0)
         return ()
 
     def _markers(self, run: Series, rows: Array) -> list[TopicMessages]:

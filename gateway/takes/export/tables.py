@@ -16,7 +16,7 @@ from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series, SeriesBuilder
 from gateway.takes.files.tables import Column, value_columns
-from gateway.takes.files.take import Take, TakeSource
+from gateway.takes.files.take import Take, TakeSource, utime_range
 
 _MAX_TABLES: Final = 200
 
@@ -76,15 +76,14 @@ def _note_columns(job: ExportJob, source: str, run: Series, columns: tuple[Colum
 def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
     """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
     reader = TakeReader(job.take)
-    first, stop = job.utimes(take)
-    for batches in reader.batches():
+    first_utime, end_utime = utime_range(take.start_utime, job.from_s, job.to_s)
+    for batches in reader.batches(end_utime):
         for batch in batches:
             source = take.sources.get(batch.source)
             if source is None or batch.key not in COMPONENTS_BY_KEY:
                 continue
             component = COMPONENTS_BY_KEY[batch.key]
-            events = zip(batch.utimes, batch.messages, strict=True)
-            messages = [message for utime, message in events if first <= utime < stop]
+            messages = batch.messages_between(first_utime, end_utime)
             if not messages:
                 continue
             rows = decode_rows(component, messages)
@@ -95,3 +94,4 @@ def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
             if series is not None:
                 yield source.name, batch.key, series
         job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)
+    job.progress(f"writing {job.out.name}", reader.num_bytes, reader.num_bytes)

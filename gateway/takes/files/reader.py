@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -79,6 +80,8 @@ SUFFIX: Final = ".lcmlog"
 _BATCH_BYTES: Final = 4 * 1024 * 1024
 """A batch ends after about this many bytes of the files."""
 
+_MAX_LATE_US: Final = 10_000_000
+
 _MAX_ROUTES: Final = 10_000
 
 _MAX_SHOWN: Final = 5
@@ -131,6 +134,13 @@ class MessageBatch:
     key: str
     utimes: list[int] = field(default_factory=list)
     messages: list[bytes] = field(default_factory=list)
+
+    def messages_between(self, first_utime: float, end_utime: float) -> list[bytes]:
+        """Return the messages from a time on and before another one."""
+        if first_utime <= min(self.utimes) <= max(self.utimes) < end_utime:
+            return self.messages
+        events = zip(self.utimes, self.messages, strict=True)
+        return [message for utime, message in events if first_utime <= utime < end_utime]
 
 
 class TakeReader:
@@ -227,12 +237,20 @@ class TakeReader:
                 yield new_message(TakeMessage, (utime, *route, message))
         self._check_is_take()
 
-    def batches(self) -> Iterator[list[MessageBatch]]:
+    def batches(self, end_utime: float = math.inf) -> Iterator[list[MessageBatch]]:
         """Yield the messages of a gateway in batches of some MB, each with one entry per source and key.
 
         This is the fast way to read everything. A batch ends before parameters that differ from those
-        before. Raises TakeError, also if there are no such messages.
+        before. What comes more than 10 s after ``end_utime`` is not read: nothing before it arrives so late.
+        Raises TakeError, also if there are no such messages.
         """
+        for batches in self._batches():
+            if min((min(batch.utimes) for batch in batches), default=0) > end_utime + _MAX_LATE_US:
+                return
+            yield batches
+
+    def _batches(self) -> Iterator[list[MessageBatch]]:
+        """Yield all that ``batches`` does."""
         self.unknown.clear()
         batches: dict[tuple[str, bytes], MessageBatch] = {}  # by channel and fingerprint
         columns: dict[bytes, EventColumns] = {}  # of the same, except parameters

@@ -27,7 +27,8 @@ class TakeSource:
     ``server`` is HOST:PORT and ``gateway_version`` the version of the gateway that published the messages,
     both "" if the take does not say. ``details`` has ``subject``, ``session`` and ``note``, each "" if nobody
     said it. ``parameters`` has the server's parameters at the beginning and at each change, in order.
-    ``malformed`` is how many messages could not be read, by component.
+    ``malformed`` is how many messages could not be read, by component. ``recorded`` has the keys of
+    all components in the range of time, also of those that were not loaded.
     """
 
     name: str
@@ -41,6 +42,7 @@ class TakeSource:
     events: Series | None = None
     parameters: list[ParametersEntry] = field(default_factory=list)
     malformed: Counter[str] = field(default_factory=Counter)
+    recorded: set[str] = field(default_factory=set)
 
     @property
     def series(self) -> dict[str, Series]:
@@ -53,9 +55,6 @@ class TakeSource:
         found = self.series.get(key)
         return [] if found is None else found.runs()
 
-
-_MAX_LATE_US: Final = 10_000_000
-"""This long after the end of a range, no more messages belong to it."""
 
 _FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "forces", "event": "events"}
 """The fields of TakeSource by the keys of components."""
@@ -125,7 +124,7 @@ def open_take(
     ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
     much memory as their part of the file, unless there is a ``spool_folder``: then large ones are in
     temporary files there, and cannot be changed. Damage is skipped and counted. Raises TakeError if there is
-    no take, and SelectionError, a TakeError, if a source or component is not in it.
+    no take, and SelectionError, a TakeError, if a source is not in it or a component does not exist.
 
     Of several takes, ``open_take([first, second])``, sources of the same name are joined in the order of
     their times, and others are side by side; seconds count from the earliest take. A message that several
@@ -141,17 +140,14 @@ def open_take(
         raise TakeError("there is no take to open; name at least one")
     takes: list[Take] = []
     start_utime = readers[0].start_utime
-    limits_s = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
-    first_utime, end_utime = (start_utime + limit_s * 1e6 for limit_s in limits_s)
+    first_utime, end_utime = utime_range(start_utime, from_s, to_s)
     total = sum(reader.num_bytes for reader in readers)
     chosen = COMPONENTS_BY_KEY.keys() if components is None else components
     for reader in readers:
         loader = TakeLoader(sources, chosen, spool_folder)
-        for batches in reader.batches():
+        for batches in reader.batches(end_utime):
             for batch in batches:
                 loader.add(batch, first_utime, end_utime)
-            if min((min(batch.utimes) for batch in batches), default=-math.inf) > end_utime + _MAX_LATE_US:
-                break
             if progress is not None:
                 progress(sum(each.read_bytes for each in readers), total)
         take = Take(reader.path, start_utime, loader.finish(start_utime))
@@ -167,6 +163,13 @@ def open_take(
         opened = ", ".join(str(reader.path) for reader in readers)
         raise SelectionError(f"{opened} has no source {min(missing)!r}; its sources are: {names}")
     return takes[0] if len(takes) == 1 else _join_takes(takes)
+
+
+def utime_range(start_utime: int, from_s: float | None, to_s: float | None) -> tuple[float, float]:
+    """Return the times of a part of a take in µs since 1970: from which on, and before which."""
+    first = -math.inf if from_s is None else start_utime + round(from_s * 1e6, 0)
+    end = math.inf if to_s is None else start_utime + round(to_s * 1e6, 0)
+    return first, end
 
 
 def _join_takes(takes: Sequence[Take]) -> Take:
@@ -195,10 +198,9 @@ def _join_sources(parts: Sequence[TakeSource]) -> TakeSource:
         gateway_version=next((part.gateway_version for part in parts if part.gateway_version), ""),
         details=next((part.details for part in parts if any(part.details)), parts[0].details),
         parameters=[entry for part in parts for entry in part.parameters],
-        malformed=Counter[str](),
+        malformed=sum((part.malformed for part in parts), Counter()),
+        recorded=set().union(*(part.recorded for part in parts)),
     )
-    for part in parts:
-        joined.malformed.update(part.malformed)
     for key, name in _FIELDS.items():
         found = [part.series[key] for part in parts if key in part.series]
         setattr(joined, name, join_series(found) if found else None)
@@ -224,11 +226,13 @@ class TakeLoader:
         if self._wanted is not None and batch.source not in self._wanted:
             return
         source = self._sources.setdefault(batch.source, TakeSource(batch.source))
-        if batch.key in self._components:
-            messages = batch.messages
-            if not first_utime <= min(batch.utimes) <= max(batch.utimes) < end_utime:
-                times = zip(batch.utimes, messages, strict=True)
-                messages = [message for utime, message in times if first_utime <= utime < end_utime]
+        if batch.key in COMPONENTS_BY_KEY:
+            messages = batch.messages_between(first_utime, end_utime)
+            if not messages:
+                return
+            source.recorded.add(batch.key)
+            if batch.key not in self._components:
+                return
             rows = decode_rows(COMPONENTS_BY_KEY[batch.key], messages)
             if rows.malformed:
                 source.malformed[batch.key] += rows.malformed

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from gateway.cli.take_report import size_text
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.simulator.synthetic import SyntheticScene
@@ -35,8 +36,8 @@ def names(folder: Path) -> list[str]:
 
 def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -> None:
     done = run_in_process("export", take, tmp_path / "walk.c3d")
-    size = (tmp_path / "walk.c3d").stat().st_size
-    assert done[:2] == (0, f"{tmp_path}/walk.c3d ({size / 1e6:.1f} MB)\n")
+    size = size_text((tmp_path / "walk.c3d").stat().st_size)
+    assert done[:2] == (0, f"{tmp_path}/walk.c3d ({size})\n")
     assert "walk.c3d\tforces became analog channels, six of each plate\t1\n" in done.stderr
     content = bytearray(take.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 3000] = bytes(3000)
@@ -54,10 +55,10 @@ def test_a_bids_data_set_is_a_folder_that_grows(tmp_path: Path) -> None:
     study = tmp_path / "study"
     done = run_in_process("export", WALK, study, *BIDS)
     assert done.returncode == 0
-    assert f"{study}/sub-01/sub-01_scans.tsv (0.4 kB)\n" in done.stdout
+    assert f"{study}/sub-01/sub-01_scans.tsv (" in done.stdout
     assert "positions converted from mm to m" in done.stderr
     done = run_in_process("export", WALK, study, *BIDS, "--session", "2", "--run", "3")
-    assert f"{study}/sub-01/ses-2/sub-01_ses-2_scans.tsv (0.4 kB)\n" in done.stdout
+    assert f"{study}/sub-01/ses-2/sub-01_ses-2_scans.tsv (" in done.stdout
     assert len(list(study.rglob("*_run-3_motion.tsv"))) == 4
 
 
@@ -83,7 +84,7 @@ EXISTS = "exists already, and nothing is overwritten"
             "walk.xyz has no known extension; choose .c3d, .trc, .mot, .sto, .csv, .parquet or .mcap",
             2,
         ),
-        ("walk", (), "walk has no known extension", 2),
+        ("walk", (), ".csv, .parquet or .mcap, or --opensim or --bids for a folder", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
         ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
         ("a.trc", ("--source", "studio"), "has no source 'studio'; its sources are: lab", 2),
@@ -97,13 +98,14 @@ EXISTS = "exists already, and nothing is overwritten"
             "--bodies must have a name for each plate in walk.mot: 1, not 2",
             2,
         ),
-        ("walk.c3d", ("--opensim",), EXISTS, 1),
+        ("walk", ("--opensim",), EXISTS, 1),
+        ("a.mot", ("--opensim",), "a.mot is the name of a file; omit .mot", 2),
     ],
 )
 def test_what_cannot_be_exported_leaves_no_file(
     take: Path, tmp_path: Path, name: str, options: tuple[str, ...], problem: str, status: int
 ) -> None:
-    existing = [f"walk{extension}" for extension in ("-analog.csv", ".c3d", ".mcap", ".trc")]
+    existing = [f"walk{extension}" for extension in ("", "-analog.csv", ".c3d", ".mcap", ".trc")]
     for each in existing:
         (tmp_path / each).write_text("mine")
     done = run_in_process("export", take, tmp_path / name, *options)

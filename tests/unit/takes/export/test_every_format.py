@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import rtc3d
 
+from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, export_take
 from tests.support.takes import (
@@ -19,6 +20,7 @@ from tests.support.takes import (
     Message,
     description,
     details,
+    frame,
     markers,
     parameters,
     scene_messages,
@@ -186,6 +188,41 @@ def test_who_and_what_a_take_is_about_is_kept_or_reported_and_can_be_replaced(
     assert ("subject, note" in "".join(notes_of(job, usual=True))) != is_kept
 
 
+def some(scene: SyntheticScene) -> list[Message]:
+    return [parameters(scene.parameters), *scene_messages(scene, 20)]
+
+
+ANALOG_ONLY = SyntheticScene(markers=0, tools=0, analog=2, plates=0, rate_hz=100, analog_rate_hz=200)
+MARKERS_ONLY = SyntheticScene(markers=2, tools=0, analog=0, plates=0, rate_hz=100, analog_rate_hz=200)
+
+
+@pytest.mark.parametrize(
+    ("name", "messages", "expected"),
+    [
+        (".trc", some(LEFT), "tools (6D), analog channels, forces, reliabilities of markers"),
+        (".trc", some(MARKERS_ONLY), "reliabilities of markers"),
+        ("opensim", some(ANALOG_ONLY), ""),
+        (".csv", some(LEFT), "parameters except labels and units"),
+        (".csv", [markers(2)], ""),
+        (".mcap", some(LEFT), "errors of tools, frame numbers, server's time stamps"),
+        (".mcap", some(MARKERS_ONLY), "frame numbers, server's time stamps"),
+        (
+            "ros2",
+            [*some(MARKERS_ONLY), frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])],
+            "events, frame numbers, server's time stamps",
+        ),
+        ("bids", [details("Ada"), *some(LEFT)], ""),
+    ],
+)
+def test_what_a_format_has_no_place_for_is_reported_if_the_take_has_it(
+    tmp_path: Path, name: str, messages: list[Message], expected: str
+) -> None:
+    job = job_for(name, write_take(tmp_path / "plain.lcmlog", messages), tmp_path / "new")
+    export_take(job)
+    found = [note.what for note in job.notes if note.what.startswith("left out of ")]
+    assert found == ([f"left out of lab: {expected}"] if expected else [])
+
+
 Call = tuple[str, int, int]
 
 
@@ -216,6 +253,17 @@ def test_progress_grows_up_to_the_end_of_each_step(long_take: Path, tmp_path: Pa
         done = [each for _, each, _ in found]
         assert done == sorted(done), what
         assert {total for _, _, total in found} == {done[-1]}, what
+
+
+@pytest.mark.parametrize("name", [".csv", ".mcap"])
+def test_what_is_written_while_it_is_read_is_read_to_the_end_of_the_range(
+    long_take: Path, tmp_path: Path, name: str
+) -> None:
+    """The first seconds of an hour take seconds, not minutes."""
+    calls: list[Call] = []
+    export_take(job_for(name, long_take, tmp_path, progress=lambda *call: calls.append(call), to_s=5.5))
+    [done] = ([each for _, each, _ in found] for what, found in stages(calls) if what.startswith("writing"))
+    assert done[-2] < done[-1]
 
 
 class Interruption:

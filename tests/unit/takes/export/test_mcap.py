@@ -64,7 +64,7 @@ NO_TOOL = (MISSING,) * 8
 
 
 def one_of(interval: int) -> str:
-    return f"arrows of forces drawn for one of {interval} frames only"
+    return f"arrows of forces drawn for one in {interval} frames"
 
 
 def export(

@@ -334,7 +334,7 @@ def test_external_loads_refer_to_the_columns_and_bodies(tmp_path: Path) -> None:
 
 def test_bodies_are_guessed_and_reported_or_as_many_as_the_plates(tmp_path: Path) -> None:
     job = export_messages(tmp_path, scene(10), "out", format="opensim")
-    guess = "take.xml | which foot is on which plate is a guess: calcn_r, calcn_l; --bodies says it"
+    guess = "take.xml | which foot is on which plate is a guess: calcn_r, calcn_l; choose with --bodies"
     assert f"{guess} | 2" in notes_of(job)
     with pytest.raises(SelectionError, match=r"each plate in take\.mot: 2, not 1"):
         export_messages(tmp_path, scene(10), "b", format="opensim", opensim=OpenSimOptions(bodies=("a",)))

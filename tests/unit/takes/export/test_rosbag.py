@@ -107,7 +107,6 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     assert np.array_equal(points[:, 0], np.array([1e-3, NAN], np.float32), equal_nan=True)
     assert notes_of(job) == [
         "forces with NaN of lab left out | 1",
-        "events of lab left out | 1",
         "messages from before 1970 or after 2106 in analog of lab left out | 1",
     ]
 
