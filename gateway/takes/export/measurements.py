@@ -116,12 +116,12 @@ class Measurement(NamedTuple):
 
     def runs_of(self, key: str) -> list[Series]:
         """Return the runs of a component that were captured at the time of this measurement."""
-        first, last = self.captures.min() - _MARGIN_US, self.captures.max() + _MARGIN_US
+        first, last = _limits(self.captures)
         found = []
         for run in self.runs.get(key, []):
-            if run.capture_utime.max() >= first and run.capture_utime.min() <= last:
+            first_of_run, last_of_run = _limits(run.capture_utime)
+            if last_of_run >= first - _MARGIN_US and first_of_run <= last + _MARGIN_US:
                 found.append(run)
-            release_pages()
         return found
 
     def parts(self, run: Series, rows_per_row: int) -> list[Part]:
@@ -315,6 +315,12 @@ def note_samples_left_out(
                     f"samples of {key} of {source.name} that fit no frame left out",
                     amount=f"{total - count} of {total}",
                 )
+
+
+def _limits(times: Array) -> tuple[int, int]:
+    """Return the first and the last of times that need not be in order."""
+    limits = [(times[start:stop].min(), times[start:stop].max()) for start, stop in pieces(len(times))]
+    return int(min(first for first, _ in limits)), int(max(last for _, last in limits))
 
 
 def _nearest(times: Array, wanted: Array) -> Array:
