@@ -21,8 +21,7 @@ def number_rows(values: Array, missing: bytes = b"", separator: bytes = b",") ->
     text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
     if not np.isfinite(values).all():
         text = text.replace(b"null", missing)
-    rows = text[2:-2].replace(b"],[", b"\n")
-    return (rows if separator == b"," else rows.replace(b",", separator)).split(b"\n")
+    return text[2:-2].translate(bytes.maketrans(b",", separator)).split(b"]%b[" % separator)
 
 
 def rounded(values: Array) -> Array:

@@ -44,7 +44,7 @@ from gateway.takes.export.trc import write_trc
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.reader import SUFFIX
 
-_BLOCK_ROWS: Final = 500
+_BLOCK_ROWS: Final = 4000
 
 
 def export_opensim(job: ExportJob) -> None:
