@@ -164,6 +164,10 @@ class NewFiles:
         path = error.filename2 or (self.paths[-1] if self.paths else error.filename)
         if isinstance(error, FileExistsError):
             return _exists(path)
+        if isinstance(error, FileNotFoundError):
+            return TakeError(
+                f"{path} cannot be written: there is no folder {Path(path).parent}; create it first"
+            )
         return TakeError(f"{path} cannot be written: {error.strerror or error}; nothing was written")
 
 

@@ -10,6 +10,9 @@ from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array
 from gateway.takes.files.series import MAX_PADDING, MIN_LIMIT_BYTES, Series, regular_step
 
+_MAX_RATE_HZ: Final = 1_000_000
+"""Times are in whole µs."""
+
 _BLOCK_ROWS: Final = 20_000
 """How many rows are computed at a time, in 64 bits."""
 
@@ -34,8 +37,11 @@ def resample(
     """Return a series at another rate: see ``Series.resample``."""
     if series.component is ComponentType.EVENT:
         raise TakeError("events have no rate and cannot be resampled; each has a time of its own")
-    if not (rate_hz > 0 and math.isfinite(rate_hz) and max_gap_s >= 0):
-        raise TakeError(f"cannot resample to {rate_hz:g} Hz across gaps of {max_gap_s:g} s")
+    if not (0 < rate_hz <= _MAX_RATE_HZ and max_gap_s >= 0):
+        raise TakeError(
+            f"cannot resample to {rate_hz:g} Hz across gaps of {max_gap_s:g} s; the rate must be above 0 and "
+            f"at most {_MAX_RATE_HZ} Hz, and gaps at least 0 s"
+        )
     times = _grid(series, rate_hz, from_s, to_s)
     runs = sorted(series.without_empty_frames().runs(), key=lambda run: int(run.capture_utime.min()))
     bounds = np.searchsorted(times, [run.capture_utime.min() for run in runs]).tolist()

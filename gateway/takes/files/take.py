@@ -119,18 +119,21 @@ def open_take(
         head = markers["head"]  # x, y, z, shape (frames, 3), NaN where it is missing
         plt.plot(markers.seconds, head)
 
-    ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
-    and ``to_s`` the time of the events, in seconds from the first event of the take; what comes after
-    ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
-    much memory as their part of the file, unless there is a ``spool_folder``: then large ones are in
-    temporary files there, and cannot be changed. Damage is skipped and counted. Raises TakeError if there is
-    no take, and SelectionError, a TakeError, if a source is not in it or a component does not exist.
+    ``sources`` and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, each by a name or
+    several; ``from_s`` and ``to_s`` limit the time of the events, in seconds from the first event of the
+    take. What comes after ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all.
+    The arrays take as much memory as their part of the file, unless there is a ``spool_folder``: then large
+    ones are in temporary files there, and cannot be changed. Damage is skipped and counted. Raises TakeError
+    if there is no take, and SelectionError, a TakeError, if a source is not in it or a component does not
+    exist.
 
     Of several takes, ``open_take([first, second])``, sources of the same name are joined in the order of
     their times, and others are side by side; seconds count from the earliest take. A message that several
     takes have, because they overlap, occurs once. What describes a source, such as its subject, is that of
     the earliest take that has it. Joining needs twice the memory for a moment.
     """
+    sources = [sources] if isinstance(sources, str) else sources
+    components = [components] if isinstance(components, str) else components
     unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
     if unknown:
         raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")

@@ -86,7 +86,7 @@ EXISTS = "exists already, and nothing is overwritten"
         ),
         ("walk", (), ".csv, .parquet or .mcap, or --opensim or --bids for a folder", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
-        ("missing/a.csv", (), "cannot be written: No such file or directory; nothing was written", 1),
+        ("missing/a.csv", (), "missing; create it first", 1),
         ("a.trc", ("--source", "studio"), "has no source 'studio'; its sources are: lab", 2),
         ("a.trc", ("--from", "3000"), "has no markers", 2),
         ("a.csv", ("--forward", "-x"), "--forward is for .trc, .mot or --opensim only", 2),

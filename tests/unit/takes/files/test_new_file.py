@@ -76,7 +76,9 @@ def test_a_file_that_appears_meanwhile_is_not_replaced_and_none_of_the_others_re
 
 
 def test_a_folder_that_is_missing_is_a_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(TakeError, match=r"nowhere/walk-1.c3d cannot be written: No such file"):
+    with pytest.raises(
+        TakeError, match=r"nowhere/walk-1.c3d cannot be written: there is no folder .*nowhere; create it"
+    ):
         create(tmp_path / "nowhere")
 
 

@@ -184,6 +184,6 @@ def test_what_cannot_be_resampled_is_an_error_that_says_why(series: Open) -> Non
     for limits in ({"from_s": NAN}, {"to_s": math.inf}):
         with pytest.raises(TakeError, match="give numbers, or None for all"):
             far.resample(1000, **limits)
-    for rate_hz, max_gap_s in ((0, 0.1), (-1, 0.1), (NAN, 0.1), (math.inf, 0.1), (100, -1)):
+    for rate_hz, max_gap_s in ((0, 0.1), (-1, 0.1), (NAN, 0.1), (1e9, 0.1), (100, -1)):
         with pytest.raises(TakeError, match="cannot resample to"):
             far.resample(rate_hz, max_gap_s=max_gap_s)

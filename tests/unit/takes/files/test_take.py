@@ -168,14 +168,14 @@ def test_parameters_that_cannot_be_read_are_counted_and_describe_nothing(tmp_pat
 def test_limits_of_time_sources_and_components(tmp_path: Path) -> None:
     messages = [markers(1, number, source=source) for number in range(10) for source in ("lab", "b")]
     path = write_take(tmp_path / "a.lcmlog", messages)
-    take = open_take(path, sources=["b"], from_s=0.02, to_s=0.05)
+    take = open_take(path, sources="b", components="3d", from_s=0.02, to_s=0.05)
     assert list(take.sources) == ["b"]
     assert markers_in(take.sources["b"]).sequence.tolist() == [2, 3, 4]
     assert open_take(path, components=["6d"]).sources["lab"].markers is None
     with pytest.raises(TakeError, match="no source 'c'; its sources are: lab, b"):
         open_take(path, sources=["c"])
     with pytest.raises(TakeError, match="'3D' is no component"):
-        open_take(path, components=["3D"])
+        open_take(path, components="3D")
 
 
 def test_messages_whose_size_contradicts_their_count_are_counted(tmp_path: Path) -> None:
