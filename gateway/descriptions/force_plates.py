@@ -233,8 +233,7 @@ _FIRST_MOMENT: Final = 3
 
 
 def _unit(plate: Plate, channel: int) -> str:
-    units = [found.unit.strip() for found in plate.channels[channel:][:1]]
-    return units[0] if units else ""
+    return plate.channels[channel].unit.strip() if channel < len(plate.channels) else ""
 
 
 def _newtons(plate: Plate) -> float | None:

@@ -81,7 +81,7 @@ def export_c3d(job: ExportJob) -> None:
         written[source, "analog"] += content.num_samples(content.analog)
         written[source, "force"] += content.num_samples(content.forces)
         belongs[source] = belongs.get(source, False) | _is_near(content, _event_seconds(content))
-    note_samples_left_out(job, {found.source.name: found.source for found, _ in named}.values(), written)
+    note_samples_left_out(job, (measurement for measurement, _ in named), written)
     for source, is_in_file in belongs.items():
         if not is_in_file.all():
             job.note(f"events of {source} far from all frames left out", amount=int((~is_in_file).sum()))

@@ -300,13 +300,13 @@ def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: in
 
 
 def note_samples_left_out(
-    job: ExportJob, sources: Iterable[TakeSource], written: Mapping[tuple[str, str], int]
+    job: ExportJob, measurements: Iterable[Measurement], written: Mapping[tuple[str, str], int]
 ) -> None:
-    """Report samples of analog channels and forces that are in no file.
+    """Report samples of analog channels and forces of the measurements' sources that are in no file.
 
     ``written`` is how many are, by the name of the source and the key of the component.
     """
-    for source in sources:
+    for source in {measurement.source.name: measurement.source for measurement in measurements}.values():
         for key in ("analog", "force"):
             total = len(source.series[key].without_empty_frames()) if key in source.series else 0
             count = written.get((source.name, key), 0)

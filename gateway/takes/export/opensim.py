@@ -75,7 +75,7 @@ def export_opensim(job: ExportJob) -> None:
             _write_sto(job, path.with_suffix(".sto"), analog)
         for key, samples in (("analog", analog), ("force", forces)):
             written[measurement.source.name, key] += 0 if samples is None else samples.num_placed
-    note_samples_left_out(job, {found.source.name: found.source for found, _ in named}.values(), written)
+    note_samples_left_out(job, (measurement for measurement, _ in named), written)
 
 
 def export_mot(job: ExportJob) -> None:
