@@ -21,7 +21,10 @@ show only that they were late.
 5. If a time stamp or frame number goes back, the server has a new time base, and a new line starts at that
    frame. A time stamp that goes back by almost 2^32 µs has wrapped around, and the line continues (field
    note 11). Time stamps that do not change, or whose rate no crystal has, are not a clock.
-6. A time stamp that means "no time" (field note 25) says nothing about the clock. Such a frame has the time
+6. A new connection may be to a server that has restarted, with any time stamps. It therefore begins a new
+   line, too, and the former line is kept aside. The first frame that is neither early nor late by the former
+   line proves that it still holds; a frame that is early disproves it.
+7. A time stamp that means "no time" (field note 25) says nothing about the clock. Such a frame has the time
    of its arrival.
 
 The least delay itself cannot be measured from one side: every time computed here includes it.
@@ -62,6 +65,10 @@ _STEP_US: Final = 2_000
 _STEP_WINDOWS: Final = 4
 """The number of windows that must be equally late to prove that a clock was set."""
 
+_RESTART_US: Final = 1_000_000
+"""Time stamps that continue differ by less from the former line, except for its drift. Delays of more than a
+second are rare in a new connection, and would count a restart too many at worst."""
+
 _ROUNDING_US: Final = 2.0  # time stamps and arrivals are whole µs
 _FROZEN_US: Final = 500_000  # a time stamp that is repeated for longer is not that of a clock
 _WRAP_US: Final = 1 << 32  # 32-bit time stamps start again at 0
@@ -77,6 +84,21 @@ class Sample(NamedTuple):
 
     timestamp_us: int
     offset_us: int
+
+
+class FormerLine(NamedTuple):
+    """What was known of the clock when the previous connection ended: its line and its samples."""
+
+    timestamp_us: int
+    host_us: int
+    drift: float
+    scatter_us: float
+    samples: deque[Sample]
+
+    def lag_us(self, server_us: int, arrival_us: int) -> int:
+        """Return how late a frame is by this line; less than 0 disproves the line."""
+        elapsed_us = server_us - self.timestamp_us
+        return arrival_us - self.host_us - elapsed_us - int(self.drift * elapsed_us)
 
 
 class ServerClock:
@@ -101,6 +123,9 @@ class ServerClock:
         # The total, in µs, that 32-bit time stamps have lost by wrapping around. Line and samples include it.
         self._wrapped_us = 0
         self._is_interrupted = False  # by a frame without a time; before it, there was a clock
+        self._is_connection_new = False  # no frame of it with a time has arrived
+        self._former: FormerLine | None = None  # while it is neither proven nor disproved
+        self._former_end_us = 0  # when it is given up, on the host's clock
         # The time stamp that was repeated last, and when it first arrived.
         self._repeated_us = _NO_TIMESTAMP_US
         self._repeated_since_us = 0
@@ -137,6 +162,10 @@ class ServerClock:
         """The number of samples that determine the line, at most 60."""
         return len(self._samples)
 
+    def begin_connection(self) -> None:
+        """Expect the first frame of a new connection, maybe to a server that has restarted."""
+        self._is_connection_new = True
+
     def observe(self, timestamp_us: int, frame_number: int, arrival_us: int) -> tuple[int, float, bool]:
         """Learn from one frame; return its (capture_us, lag_s, restarted).
 
@@ -148,9 +177,15 @@ class ServerClock:
         ``capture_us`` is when the frame was captured, on the same clock, never after its arrival.
         ``lag_s`` is how much later it arrived than a frame with the least delay would have; it is 0 without a
         clock. ``restarted`` is True if the server's time or frame numbers started again with this frame.
+
+        After ``begin_connection``, ``restarted`` is also True if they went forward, but not as the former
+        clock would have. Whatever they do, ``capture_us`` then comes from the time of arrival of the frames
+        of this connection, or from the former line if they prove that it still holds.
         """
         restarted = False
-        is_irregular = timestamp_us <= self._timestamp_us or frame_number < self._frame_number
+        is_irregular = (
+            timestamp_us <= self._timestamp_us or frame_number < self._frame_number or self._is_connection_new
+        )
         if is_irregular and self._is_without_time(timestamp_us, frame_number):
             self._is_interrupted = self._is_interrupted or self.has_clock
             self.has_clock = False
@@ -173,15 +208,8 @@ class ServerClock:
         capture_us = self._line_host_us + elapsed_us + int(self._drift * elapsed_us)
         lag_us = arrival_us - capture_us
         if lag_us < self._least_lag_us:
-            if lag_us < 0:
-                if lag_us < -_STEP_US:
-                    self._clear_samples(arrival_us)
-                self._line_timestamp_us, self._line_host_us = server_us, arrival_us
-                capture_us = arrival_us
-                lag_us = 0
-            self._least_lag_us = float(lag_us)
-            self._least_timestamp_us, self._least_offset_us = server_us, arrival_us - server_us
-
+            lag_us = self._learn_from(server_us, arrival_us, lag_us)
+            capture_us = arrival_us - lag_us
         if not self.has_clock:
             self._capture_us = arrival_us
             return arrival_us, 0.0, restarted
@@ -190,6 +218,19 @@ class ServerClock:
             capture_us = min(self._capture_us, arrival_us)
         self._capture_us = capture_us
         return capture_us, lag_us * 1e-6, restarted
+
+    def _learn_from(self, server_us: int, arrival_us: int, lag_us: int) -> int:
+        """Learn from the frame with the least delay in its window so far; return its lag thereafter."""
+        if self._former is not None:
+            lag_us = self._compare_with_former(self._former, server_us, arrival_us, lag_us)
+        if lag_us < 0:
+            if lag_us < -_STEP_US:
+                self._clear_samples(arrival_us)
+            self._line_timestamp_us, self._line_host_us = server_us, arrival_us
+            lag_us = 0
+        self._least_lag_us = float(lag_us)
+        self._least_timestamp_us, self._least_offset_us = server_us, arrival_us - server_us
+        return lag_us
 
     def _is_without_time(self, timestamp_us: int, frame_number: int) -> bool:
         """Return whether a frame that does not follow the last has a time stamp that means "no time".
@@ -201,6 +242,8 @@ class ServerClock:
 
     def _handle_irregular(self, timestamp_us: int, frame_number: int, arrival_us: int) -> bool:
         """Handle the first frame, or one that does not follow the last; return whether it is a restart."""
+        if self._is_connection_new:
+            return self._handle_first_of_connection(timestamp_us, frame_number, arrival_us)
         if self._timestamp_us == _NO_TIMESTAMP_US:
             self._start(timestamp_us, arrival_us, has_clock=False)
             return False
@@ -212,20 +255,73 @@ class ServerClock:
                 if arrival_us - self._repeated_since_us > _FROZEN_US:
                     self._start(timestamp_us, arrival_us, has_clock=False)
                 return False
-            advance_us = timestamp_us + _WRAP_US - self._timestamp_us
-            elapsed_us = arrival_us - self._arrival_us
-            if advance_us > 0 and abs(advance_us - elapsed_us) < _WRAP_TOLERANCE_US:
+            if self._has_wrapped(timestamp_us, arrival_us):
                 self._wrapped_us += _WRAP_US
                 return False
-        # A server that had a clock probably still has one, unless it restarts again within its first window.
-        self._start(timestamp_us, arrival_us, has_clock=self.has_clock and len(self._samples) > 0)
+        self._start(timestamp_us, arrival_us, has_clock=self._probably_has_clock)
         return True
 
-    def _start(self, timestamp_us: int, arrival_us: int, *, has_clock: bool) -> None:
+    def _handle_first_of_connection(self, timestamp_us: int, frame_number: int, arrival_us: int) -> bool:
+        """Handle the first frame of a new connection; return whether the server has restarted."""
+        self._is_connection_new = False
+        if self._timestamp_us == _NO_TIMESTAMP_US:
+            self._start(timestamp_us, arrival_us, has_clock=False)
+            return False
+        has_clock, wrapped_us, former = self._probably_has_clock, self._wrapped_us, self._former
+        if has_clock:
+            line = (self._line_timestamp_us, self._line_host_us, self._drift)
+            former = FormerLine(*line, self._scatter_us, self._samples.copy())
+        goes_back = timestamp_us < self._timestamp_us
+        if goes_back and self._has_wrapped(timestamp_us, arrival_us):
+            goes_back = False
+            wrapped_us += _WRAP_US
+        if goes_back:
+            self._start(timestamp_us, arrival_us, has_clock=has_clock)
+            return True
+        self._start(timestamp_us, arrival_us, has_clock=has_clock, wrapped_us=wrapped_us)
+        if former is None:
+            return frame_number < self._frame_number
+        self._former = former
+        self._former_end_us = arrival_us + _KEPT_WINDOWS * _WINDOW_US
+        # Some servers number the frames of each connection, so here only the time decides.
+        lag_us = former.lag_us(timestamp_us + wrapped_us, arrival_us)
+        return abs(lag_us) > _RESTART_US + MAX_DRIFT * (arrival_us - self._arrival_us)
+
+    def _compare_with_former(self, former: FormerLine, server_us: int, arrival_us: int, lag_us: int) -> int:
+        """Continue the former line if this frame proves it; forget it if it is disproved or too old.
+
+        ``lag_us`` is the frame's lag by the present line. Return its lag by the line that holds.
+        """
+        former_lag_us = former.lag_us(server_us, arrival_us)
+        scatter_us = former.scatter_us if former.scatter_us < math.inf else 0.0
+        if -_STEP_US <= former_lag_us <= _STEP_US + scatter_us:
+            self._clear_samples(arrival_us)
+            self.has_clock = True
+            self._line_timestamp_us, self._line_host_us = former.timestamp_us, former.host_us
+            self._drift, self._scatter_us, self._samples = former.drift, former.scatter_us, former.samples
+            self._former = None
+            return former_lag_us
+        if former_lag_us < 0 or arrival_us > self._former_end_us:
+            self._former = None
+        return lag_us
+
+    @property
+    def _probably_has_clock(self) -> bool:
+        """Whether a server that had a clock still has one: unless it restarts in its first window."""
+        return self.has_clock and len(self._samples) > 0
+
+    def _has_wrapped(self, timestamp_us: int, arrival_us: int) -> bool:
+        """Return whether a time stamp that goes back has wrapped around."""
+        advance_us = timestamp_us + _WRAP_US - self._timestamp_us
+        elapsed_us = arrival_us - self._arrival_us
+        return advance_us > 0 and abs(advance_us - elapsed_us) < _WRAP_TOLERANCE_US
+
+    def _start(self, timestamp_us: int, arrival_us: int, *, has_clock: bool, wrapped_us: int = 0) -> None:
         """Start a new line through this frame."""
         self.has_clock = has_clock
-        self._wrapped_us = 0
-        self._line_timestamp_us, self._line_host_us = timestamp_us, arrival_us
+        self._wrapped_us = wrapped_us
+        self._former = None
+        self._line_timestamp_us, self._line_host_us = timestamp_us + wrapped_us, arrival_us
         self._clear_samples(arrival_us)
 
     def _clear_samples(self, arrival_us: int) -> None:

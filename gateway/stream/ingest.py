@@ -58,7 +58,8 @@ class Ingest:
         self._skip = skip
         self._on_lateness = on_lateness
         self._on_restart = on_restart
-        self._clock = status.clock  # outlives the session: it detects a restart of the server by itself
+        self._clock = status.clock  # outlives the session
+        self._clock.begin_connection()
         self._followed_type: ComponentType | None = None
         self._frame_number = 0  # the newest of a component of _followed_type, like the time stamp
         self._timestamp_us = 0
@@ -68,6 +69,7 @@ class Ingest:
         self._numbers = MissingFrames()
         self._num_state_changes = status.num_state_changes
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
+        self._num_restarts = 0  # how often time stamps or frame numbers started again in this session
         self._began_us: int | None = None  # when the first frame of this session arrived, on the steady clock
         self._num_skippable = 0  # how many components of the newest frame are wanted and no events
         self._unwanted = ""  # the components of the newest frame, if none of them is wanted
@@ -91,6 +93,7 @@ class Ingest:
             self._num_followed,
             self._timestamp_us,
             frozenset([component.type for component in components]),
+            self._num_restarts,
         )
 
     def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
@@ -187,9 +190,12 @@ class Ingest:
                 status.frames_unsent(num_missing, num_missing * self._num_skippable, held_up_s)
         if restarted:
             numbers.interrupt()
-            status.restarts += 1
             self._lag.restart()
-            if self._began_us is not None:  # otherwise the handshake has just been done
+            self._num_restarts += 1
+            # A server that restarts loses its connections. Within one, a file starts again, or a measurement.
+            if self._began_us is None:
+                status.restarts += 1  # the handshake has just been done
+            else:
                 self._on_restart()
         elif clock.has_clock:
             status.lag_s = lag_s

@@ -33,7 +33,8 @@ class Arrivals(NamedTuple):
 
     ``followed`` is the component type whose time stamps are used, because servers may count the time of each
     type separately. ``num_followed`` is the number of frames that begin with this type, ``timestamp_us`` the
-    newest time stamp of these frames. ``components`` are those of the newest frame.
+    newest time stamp of these frames. ``components`` are those of the newest frame. ``num_restarts`` counts
+    how often the time stamps or frame numbers started again.
     """
 
     num_frames: int
@@ -41,6 +42,7 @@ class Arrivals(NamedTuple):
     num_followed: int
     timestamp_us: int
     components: frozenset[ComponentType]
+    num_restarts: int
 
 
 class _Kind(Enum):
@@ -110,7 +112,7 @@ class RateWatch:
         is_streaming = status.state is StreamState.STREAMING and followed not in {None, ComponentType.EVENT}
         # These must not change during a measurement.
         conditions = (
-            *(status.session, has_clock, status.restarts),
+            *(status.session, has_clock, arrivals.num_restarts),
             *(stream.components, dict(announced_hz), followed),
         )
         self._start = _Start(now_s, arrivals, conditions) if is_streaming and is_full_rate else None

@@ -136,7 +136,7 @@ class StreamStatus:
     reconnects: int = 0
     """All attempts to connect except the first."""
     restarts: int = 0
-    """How often the server's time or frame numbers started again within a connection."""
+    """How often a new connection showed that the server had restarted: its time stamps do not continue."""
     lag_s: float = 0.0
     """How late the newest frame was; see ServerClock.observe."""
     clock: ServerClock = field(default_factory=ServerClock)

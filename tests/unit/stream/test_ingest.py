@@ -53,9 +53,19 @@ class Lab:
         stream = StreamSettings.model_validate(
             {"components": components or ["all"], "backlog": backlog, "adapt_rate": adapt_rate}
         )
-        source = SourceSettings(name="lab", host="127.0.0.1")
+        self._stream = stream
+        self.connect()
+
+    def connect(self) -> None:
+        """Begin a session."""
         self.ingest = Ingest(
-            source, stream, self.status, self._publish, self._skip, self.halvings.append, self._on_restart
+            SourceSettings(name="lab", host="127.0.0.1"),
+            self._stream,
+            self.status,
+            self._publish,
+            self._skip,
+            self.halvings.append,
+            self._on_restart,
         )
 
     def _on_restart(self) -> None:
@@ -213,6 +223,33 @@ def test_lateness_before_a_restart_does_not_count_after_it(lab: Lab) -> None:
     for number in range(2, 2 + RATE_HZ * 9 // 10):
         lab.receive_at(restart_utime + number * PERIOD_US + 200_000, frame(number))
     assert lab.halvings == []
+
+
+def test_a_file_in_a_loop_is_no_restart_of_the_server(lab: Lab) -> None:
+    """Numbers and time stamps go back within a connection, which a restart of the server would end."""
+    utime = BOOT_UTIME + 600 * PERIOD_US
+    for loop in range(8):
+        for number in range(100):
+            lab.receive_at(utime + (100 * loop + number) * PERIOD_US, frame(number))
+    assert (lab.status.restarts, lab.restarts, lab.ingest.arrivals.num_restarts) == (0, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("number", "after_s", "restarts"),
+    [(0, 10, 1), (700, 10, 1), (600, 10, 1), (600 + 10 * RATE_HZ, 10, 0), (600 + 20 * RATE_HZ, 10, 1)],
+)
+def test_a_restart_of_the_server_shows_in_the_first_frame_of_a_connection(
+    lab: Lab, number: int, after_s: int, restarts: int
+) -> None:
+    """Its numbers and time stamps may go back or forward, but not by the time that has passed."""
+    lab.connect()
+    utime = BOOT_UTIME + 600 * PERIOD_US + after_s * 1_000_000
+    for index in range(200):
+        lab.receive_at(utime + index * PERIOD_US, frame(number + index))
+        [*_, stamp] = lab.stamps
+        assert stamp.capture_utime == pytest.approx(stamp.utime, abs=500)
+        assert lab.status.lag_s < 0.001
+    assert (lab.status.restarts, lab.restarts) == (restarts, 0), "the handshake has read the parameters"
 
 
 def test_frame_numbers_are_followed_for_one_component_type_only(lab: Lab) -> None:
