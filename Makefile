@@ -26,7 +26,7 @@ BARE := build/bare-debian-12/complete
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-install test-compiled check bytecode lint types contracts generated docs site lcm-types examples \
+.PHONY: demo lock test test-slow test-all test-install test-anywhere test-compiled check bytecode lint types contracts generated docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
     clone-url clean
@@ -39,12 +39,22 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
-# What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
-# commands in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
+# What is slow by nature. These mostly wait: for systemd, browsers, installations, compilers, and commands in the documents.
+WAITING_TESTS := $(addprefix tests/,docs systemd release view languages site packaging bids)
+# Attacks and outages load the machine themselves.
+ATTACKS := $(addprefix tests/,hostile outages benchmarks)
+SLOW_NEEDS := .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
+RUN_SLOW := MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup
 
-test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
+test-slow: $(SLOW_NEEDS)
+	$(RUN_SLOW) $(or $(ARGS),$(WAITING_TESTS) $(ATTACKS))
+
+# The tests of `make test` (testpaths in pyproject.toml) compute while others wait. Attacks come after them, alone.
+FAST_TESTS := $(addprefix tests/,compatibility contract integration property unit)
+
+test-all: $(SLOW_NEEDS)
+	$(RUN_SLOW) --workers 8 $(WAITING_TESTS) $(FAST_TESTS)
+	$(RUN_SLOW) $(ATTACKS)
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
 # second build; the wheels and the sdist on a Debian without a compiler; the container image. It takes a quarter of an
@@ -65,13 +75,21 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/logs/test_failures
     $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
 
 test-compiled: build/compiled/complete
-	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
+	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-# The tests use both cores, and wait often enough for the compiler, mypy and downloads to run beside them.
+# The tests in other surroundings: a machine that has just booted or has been up for 400 days, other time zones, locales,
+# users, host names and Pythons, one core, random order. It needs root, and takes two hours; SURROUNDINGS="fresh user"
+# selects some, and SLOW= leaves the slow tests out. A release needs it; it is not part of the check.
+SURROUNDINGS ?=
+SLOW ?= --slow
+
+test-anywhere: .venv/installed
+	$(BIN)/python -B -m tests.anywhere $(SLOW) $(SURROUNDINGS)
+
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
-	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types wheelhouse
-	$(MAKE) --no-print-directory test-slow
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 compiled wheelhouse lint workflows contracts generated \
+	    docs types bytecode
+	$(MAKE) --no-print-directory test-all
 	$(MAKE) --no-print-directory test-compiled
 
 # Write the bytecode of the tests: six workers that start together would each compile all of them, in 10 s.
@@ -113,7 +131,7 @@ lcm-types: .venv/installed
 
 # Build the programs in examples/ whose tools are installed, and say which were left out and why.
 examples: .venv/installed
-	$(MAKE) --no-print-directory -C examples PYTHON=$(CURDIR)/$(BIN)/python
+	$(MAKE) --no-print-directory -C examples PYTHON='$(CURDIR)/$(BIN)/python'
 
 # Record the sample take and the sample C3D file again.
 samples: .venv/installed
@@ -158,7 +176,7 @@ reproducible:
 	$(PYTHON) -B -m release.reproducible
 
 # The compiled gateway, for tests and measurements. Programs run with $(COMPILED) import it instead of the sources.
-COMPILED := PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/compiled
+COMPILED := PYTHONSAFEPATH=1 PYTHONPATH='$(CURDIR)/build/compiled'
 
 compiled: build/compiled/complete
 
@@ -251,7 +269,7 @@ workflows: build/bin/actionlint
 	@if [ -x $< ]; then $<; fi
 
 build/bin/actionlint:
-	@if command -v go >/dev/null; then GOBIN=$(CURDIR)/build/bin go install $(ACTIONLINT); \
+	@if command -v go >/dev/null; then GOBIN='$(CURDIR)/build/bin' go install $(ACTIONLINT); \
 	else echo 'The workflows are not checked: go is missing (Debian: golang-go)'; fi
 
 # Download the packages that an installation needs: its tests have no network.
@@ -289,18 +307,24 @@ build/release-packages/complete: requirements-view.txt $(RELEASE_TOOLS)
 	    --require-hashes --requirement requirements-view.txt)
 	@touch $@
 
+# Python 3.11 cannot start with LC_ALL=C if a path has letters that ASCII lacks. So the paths of the sources are relative.
+define install_sources
+$(BIN)/pip install --quiet --editable . $(1); \
+    printf '../../../..\n../../../../lcm_types\n' | tee .venv/lib/python3.*/site-packages/_rtc3d_gateway.pth >/dev/null
+endef
+
 # What running needs, with the live view, in the versions of requirements-view.txt; .venv/installed adds the
 # development tools.
 .venv/runtime: pyproject.toml requirements-view.txt
 	$(call timed,Installing the gateway into .venv,40 s,$(PYTHON) -m venv .venv; \
 	    $(BIN)/pip install --quiet --require-hashes --requirement requirements-view.txt; \
-	    $(BIN)/pip install --quiet --no-deps --editable .)
+	    $(call install_sources,--no-deps))
 	@$(BIN)/python -c 'import lcm' || { echo 'LCM cannot be used here. Install GLib: apt-get install libglib2.0-0'; exit 1; }
 	@touch $@
 
 .venv/installed: .venv/runtime
 	$(call timed,Installing the development tools into .venv,1 min,$(BIN)/pip install --quiet --upgrade 'pip>=25.1'; \
-	    $(BIN)/pip install --quiet --editable . --group dev)
+	    $(call install_sources,--group dev))
 	@touch $@
 
 # Renew the versions of all dependencies for every supported Python and platform: requirements-view.txt has those of all

@@ -7,6 +7,7 @@ import asyncio
 import gc
 import itertools
 import os
+import random
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -98,6 +99,15 @@ class _Scheduler(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:
     return _Scheduler(config, log) if config.getvalue("dist") == "loadgroup" else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Shuffle the modules, and the tests in each, if RTC3D_TEST_ORDER is set to a seed."""
+    if seed := os.environ.get("RTC3D_TEST_ORDER"):
+        order = random.Random(seed)
+        modules = sorted({item.path for item in items})
+        rank = dict(zip(modules, order.sample(range(len(modules)), len(modules)), strict=True))
+        items.sort(key=lambda item: (rank[item.path], order.random()))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

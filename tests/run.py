@@ -1,13 +1,18 @@
 """Run pytest in several workers, each in a network namespace of its own, and leave no process behind.
 
-    python tests/run.py [ARGUMENT_OF_PYTEST ...]
+    python tests/run.py [--workers N] [ARGUMENT_OF_PYTEST ...]
 
 Ctrl-C or SIGTERM ends the run with pytest's summary. Whatever the tests have started and not ended is killed.
+
+For the tests, the machine has just booted: what holds while its clocks are near zero holds later, too.
+RTC3D_UPTIME_S sets another uptime.
 """
 
+import argparse
 import contextlib
 import ctypes
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,6 +28,9 @@ WORKERS_PER_CORE: Final = 3
 WORKERS_S: Final = 1.0
 """When the workers are killed after Ctrl-C. By then, pytest no longer counts what they run as failed."""
 
+UPTIME_S: Final = "5"
+"""How long the machine seems to have been up when the workers start."""
+
 SUMMARY_S: Final = 4.0
 """When pytest is killed after Ctrl-C, with or without its summary."""
 
@@ -32,15 +40,18 @@ _WITH_NETNS: Final = Path(__file__).with_name("with-netns")
 
 def main() -> int:
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
-    workers = WORKERS_PER_CORE * len(os.sched_getaffinity(0))
+    parser = argparse.ArgumentParser(allow_abbrev=False, add_help=False)
+    parser.add_argument("--workers", type=int, default=WORKERS_PER_CORE * len(os.sched_getaffinity(0)))
+    options, rest = parser.parse_known_args()
     arguments = [
-        *("--tx", f"{workers}*popen//python={_WITH_NETNS} {sys.executable}"),
-        *("--dist", "worksteal", "--durations", "10", *sys.argv[1:]),
+        *("--tx", f"{options.workers}*popen//python={shlex.join([str(_WITH_NETNS), sys.executable])}"),
+        *("--dist", "worksteal", "--durations", "10", *rest),
     ]
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)  # `&` and nohup ignore them, and the tests would inherit that
     # Otherwise, each worker and each program that a test starts would compile all that it imports.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ.setdefault("RTC3D_UPTIME_S", UPTIME_S)
     # In a session of its own, pytest receives one signal for each Ctrl-C: that of ``stop``.
     pytest = subprocess.Popen([sys.executable, "-m", "pytest", *arguments], start_new_session=True)
 

@@ -1,6 +1,7 @@
 """``rtc3d-gateway view``: a live 3D view in the browser."""
 
 import os
+import shlex
 import sys
 import threading
 import webbrowser
@@ -107,7 +108,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
             raise
         raise ViewError(
             f"the view needs viser, which is not installed; install it: {_INSTALL}, "
-            f"or only viser for this program: {sys.executable} -m pip install '{VISER}'"
+            f"or only viser for this program: {shlex.quote(sys.executable)} -m pip install '{VISER}'"
         ) from error
     return open_server(host, port)
 

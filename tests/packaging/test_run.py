@@ -1,11 +1,14 @@
-"""`make test` reports a worker that crashes, whatever the worker leaves behind."""
+"""`make test` reports a worker that crashes, and gives the tests an uptime of their own."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
+PLUGINS = ("-p", "tests.conftest", "-p", "no:cacheprovider")
 CRASH = """
 import os, time
 
@@ -19,18 +22,39 @@ def test_that_passes():
 """
 
 
-def test_a_worker_that_crashes_while_its_child_lives_is_reported(tmp_path: Path) -> None:
-    """A test that exceeds its time-out ends its worker, and the processes that it started often live on."""
-    (tmp_path / "test_crash.py").write_text(CRASH)
-    run = subprocess.run(
-        [sys.executable, "tests/run.py", "-p", "tests.conftest", "-p", "no:cacheprovider", str(tmp_path)],
+UPTIME = """
+import subprocess, sys, time
+
+def test_of_a_machine_that_has_been_up_for_400_days():
+    assert time.clock_gettime(time.CLOCK_BOOTTIME) > 34_560_000
+    child = "import time; print(time.monotonic())"
+    assert float(subprocess.check_output([sys.executable, "-c", child])) > 34_560_000
+"""
+
+
+def run_tests(folder: Path, content: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    (folder / "test_one.py").write_text(content)
+    return subprocess.run(
+        [sys.executable, "tests/run.py", "--workers", "3", *PLUGINS, str(folder)],
         cwd=ROOT,
-        preexec_fn=lambda: os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}),  # half the workers
+        env={**os.environ, **environment},
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
+
+
+def test_a_worker_that_crashes_while_its_child_lives_is_reported(tmp_path: Path) -> None:
+    """A test that exceeds its time-out ends its worker, and the processes that it started often live on."""
+    run = run_tests(tmp_path, CRASH)
     assert run.returncode == 1
     assert "crashed while running" in run.stdout
     assert "1 failed, 1 passed" in run.stdout
+
+
+@pytest.mark.netns
+def test_the_tests_and_their_processes_have_the_uptime_asked_for(tmp_path: Path) -> None:
+    """Otherwise `make test` would say nothing about a machine that has just booted."""
+    run = run_tests(tmp_path, UPTIME, RTC3D_UPTIME_S="34560001")
+    assert run.returncode == 0, run.stdout

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import shlex
 import signal
 from asyncio.subprocess import DEVNULL, PIPE
 from pathlib import Path
@@ -48,11 +49,9 @@ async def run(*arguments: str, environ: dict[str, str] | None = None, **options:
 
 
 async def run_shell(script: str) -> Ended:
-    """Run a shell script, in which $PROGRAM is the program."""
-    environ = {**os.environ, "PROGRAM": " ".join(PROGRAM)}
-    process = await asyncio.create_subprocess_exec(
-        *("bash", "-c", script), env=environ, stdin=DEVNULL, stdout=PIPE, stderr=PIPE
-    )
+    """Run a shell script, in which PROGRAM is the program."""
+    command = ("bash", "-c", script.replace("PROGRAM", shlex.join(PROGRAM)))
+    process = await asyncio.create_subprocess_exec(*command, stdin=DEVNULL, stdout=PIPE, stderr=PIPE)
     return await end_of(process)
 
 
@@ -66,10 +65,10 @@ async def test_text_that_is_not_utf8_is_a_mistake(command: str) -> None:
     assert (await run(*command.split(), "--nope\udcff\x1b[31m", environ=_ASCII)).status == 2
 
 
-@pytest.mark.parametrize("arguments", ["config schema", f"check {CONFIG}"])
+@pytest.mark.parametrize("arguments", ["config schema", f"check {shlex.quote(CONFIG)}"])
 async def test_output_goes_nowhere(arguments: str) -> None:
     """A reader that leaves, a full device, and a closed stream."""
-    command = f"$PROGRAM {arguments}"
+    command = f"PROGRAM {arguments}"
     full = await run_shell(f"{command} >/dev/full")
     assert full == (1, "", "cannot write the output: No space left on device\n")
     assert (await run_shell(f"{command} 2>/dev/full")).status == 0

@@ -1,11 +1,13 @@
 """Completion by shells: what they offer, from where, and that nothing else is printed."""
 
 import os
+import shlex
 import subprocess
 from pathlib import Path
 
 import pytest
 import typer
+from click.shell_completion import split_arg_string
 from typer.testing import CliRunner
 
 from gateway.cli import options
@@ -25,7 +27,7 @@ def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def offered(line: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return what is offered in bash for the last word of a line, which may be empty."""
-    words = line.split(" ")
+    words = split_arg_string(line) + [""] * line.endswith(" ")
     monkeypatch.setenv(COMPLETION_VARIABLE, "complete_bash")
     monkeypatch.setenv("COMP_WORDS", line)
     monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
@@ -85,7 +87,7 @@ def test_sources_of_the_take_on_the_command_line_are_offered(
 ) -> None:
     default_config.write_text("sources: [{name: lab, host: a}]")
     take = write_take(tmp_path / "take.lcmlog", [description("hall"), description("attic")])
-    line = f"rtc3d-gateway {command.format(take)} --source "
+    line = f"rtc3d-gateway {command.format(shlex.quote(str(take)))} --source "
     assert sorted(offered(line, monkeypatch)) == ["attic", "hall"]
 
 
@@ -106,9 +108,10 @@ def test_a_bad_configuration_offers_nothing(
 
 @pytest.mark.parametrize("content", [b"", b"no take", b"\0" * 1000])
 def test_a_bad_take_offers_nothing(content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "take.lcmlog").write_bytes(content)
-    assert offered(f"rtc3d-gateway replay {tmp_path / 'take.lcmlog'} --source ", monkeypatch) == []
-    assert offered(f"rtc3d-gateway replay {tmp_path} --source ", monkeypatch) == []
+    take = tmp_path / "take.lcmlog"
+    take.write_bytes(content)
+    for path in (take, tmp_path):
+        assert offered(f"rtc3d-gateway replay {shlex.quote(str(path))} --source ", monkeypatch) == []
 
 
 def test_source_names_need_no_take_and_no_configuration() -> None:
@@ -135,7 +138,7 @@ echo "${COMPREPLY[@]}"
 
 def test_bash_completes_with_the_script_that_the_program_prints(tmp_path: Path) -> None:
     program = tmp_path / "rtc3d-gateway"
-    program.write_text(f'#!/bin/sh\nexec {" ".join(PROGRAM)} "$@"\n')
+    program.write_text(f'#!/bin/sh\nexec {shlex.join(PROGRAM)} "$@"\n')
     program.chmod(0o755)
     environ = {**os.environ, "COMP_TYPE": "9"}
     command = ("bash", "-c", SCRIPT, "bash", str(tmp_path))

@@ -1,5 +1,6 @@
 """``rtc3d-gateway view`` before it serves a page: what it says if it cannot."""
 
+import shlex
 import socket
 import subprocess
 import sys
@@ -25,7 +26,7 @@ def test_without_viser_one_sentence_has_the_commands_that_install_it() -> None:
     assert (run.returncode, run.stdout) == (1, "")
     [line] = run.stderr.splitlines()
     assert "pip install 'rtc3d-gateway[view]'" in line
-    assert f"{sys.executable} -m pip install '{VISER}'" in line
+    assert f"{shlex.quote(sys.executable)} -m pip install '{VISER}'" in line
 
 
 def test_the_command_installs_what_the_extra_has() -> None:
