@@ -26,7 +26,7 @@ BARE := build/bare-debian-12/complete
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-all test-install test-anywhere test-compiled check bytecode lint types contracts generated docs site lcm-types examples \
+.PHONY: demo lock test test-slow test-all test-install test-anywhere test-compiled check bytecode lint types contracts generated messages docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
     clone-url clean
@@ -111,6 +111,11 @@ generated: .venv/installed
 	rm -rf build/lcm_types && mkdir -p build/lcm_types
 	$(BIN)/lcm-gen --python --ppath build/lcm_types lcm_types/rtc3d/*.lcm
 	diff -r --exclude='*.lcm' --exclude=__pycache__ --exclude=vectors build/lcm_types lcm_types
+
+# Write the messages of level WARNING and above from the source code into the tables of docs/operations.md. A changed
+# sentence keeps its advice; messages without advice are named. `make test` checks that the page is up to date.
+messages: .venv/installed
+	$(BIN)/python -m tests.support.operations_page
 
 # Build the site in build/site; a broken link is an error. (With --quiet, --strict would not count mkdocs' warnings.)
 docs: .venv/installed

@@ -244,8 +244,8 @@ def single(defect: BaseException) -> BaseException:
 
 def defect_text(defect: BaseException) -> str:
     """Return what happened, for messages about a defect: "defect in the gateway: KeyError: 'lab'"."""
-    first = single(defect)
-    return safe_text(f"defect in the gateway: {type(first).__name__}: {first}")
+    error = single(defect)
+    return safe_text(f"defect in the gateway: {type(error).__name__}: {error}")
 
 
 def _place(error: BaseException) -> tuple[str, str, int]:

@@ -206,8 +206,8 @@ class Session:
             self._protocol.state is ProtocolState.NO_MEASUREMENT and self.rejection
         )
         if is_measuring and not self._only_events and not is_stopping:
-            text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
-            reason = f"{text} although a measurement runs"
+            text = silence = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
+            reason = f"{silence} although a measurement runs"
             if self.rejection:
                 text = reason = f"all frames from {self.server} are rejected: {self.rejection}"
             self._status.enter(Phase.SILENT, "silence", text)

@@ -308,11 +308,11 @@ class StreamStatus:
             # The server determines how many types there are, so up to MAX_UNKNOWN_TYPES are listed.
             num_listed = MAX_UNKNOWN_TYPES - len(self._unknown_types)
             self._unknown_types.update(new[:num_listed])
-            others = " and others" if len(new) > num_listed else ""
+            further = " and others" if len(new) > num_listed else ""
             if self._unknown_text in self.limitations:
                 self.limitations.remove(self._unknown_text)
             self._unknown_text = (
-                f"components of unknown type {sorted(self._unknown_types)}{others} are skipped"
+                f"components of unknown type {sorted(self._unknown_types)}{further} are skipped"
             )
             self._list_limitation(self._unknown_text)
         self.losses.lost("unknown component", self._unknown_text, messages=len(types))

@@ -72,8 +72,8 @@ class FoxgloveOutput(ServerOutput):
         try:
             await self._server.open()
         except OSError as error:
-            known = _BIND_PROBLEMS.get(error.errno or 0)
-            reason = known or f"{system_reason(error)}; correct foxglove.host and foxglove.port"
+            other = f"{system_reason(error)}; correct foxglove.host and foxglove.port"
+            reason = _BIND_PROBLEMS.get(error.errno or 0, other)
             raise PortError(f"cannot listen on {self._address}: {reason}") from error
 
     def frame_publisher(self, source: str) -> FramePublisher:
