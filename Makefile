@@ -44,7 +44,7 @@ WAITING_TESTS := $(addprefix tests/,docs systemd release view languages site pac
 # Attacks and outages load the machine themselves.
 ATTACKS := $(addprefix tests/,hostile outages benchmarks)
 SLOW_NEEDS := .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
-RUN_SLOW := MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup
+RUN_SLOW := MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup -m 'not installation'
 
 test-slow: $(SLOW_NEEDS)
 	$(RUN_SLOW) $(or $(ARGS),$(WAITING_TESTS) $(ATTACKS))
@@ -61,7 +61,7 @@ test-all: $(SLOW_NEEDS)
 # hour, and is not part of the check.
 test-install: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 	$(BIN)/python -B -m tests.support.bare_debian --python
-	MAKEFLAGS= FULL_INSTALLATION=1 exec $(BIN)/python tests/run.py --dist loadgroup tests/systemd/test_debian_package.py \
+	MAKEFLAGS= FULL_INSTALLATION=1 exec $(BIN)/python tests/run.py --dist loadgroup tests/systemd tests/release tests/site \
 	    tests/systemd/full_package.py tests/systemd/full_wheels.py tests/release/full_image.py
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.

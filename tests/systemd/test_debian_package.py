@@ -103,6 +103,7 @@ async def test_a_bare_machine_runs_the_service_at_once(bare_machine: Machine, pa
     assert (await run("bash", "-c", f"{source}; {completion}")).text == "doctor\n"
 
 
+@pytest.mark.installation
 async def test_an_upgrade_keeps_configuration_and_takes(
     bare_machine: Machine, package: Path, tmp_path: Path
 ) -> None:
@@ -161,6 +162,7 @@ async def test_removing_keeps_what_is_yours_and_purging_leaves_nothing(
     assert now == users
 
 
+@pytest.mark.installation
 async def test_the_package_refuses_to_replace_an_installation_from_source(
     bare_machine: Machine, package: Path
 ) -> None:
