@@ -75,7 +75,7 @@ class stream_status_t(object):
         """ LCM Type: int64_t """
         self.restarts = 0
         """
-        How often frame numbers or time stamps restarted within a connection.
+        How often a new connection showed that the server had restarted.
         LCM Type: int64_t
         """
 
