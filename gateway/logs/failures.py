@@ -8,6 +8,7 @@ defect once, by its place in the source code. LogLimit (``log_format``) is for w
 
 import logging
 import math
+import re
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -28,6 +29,12 @@ MAX_HOLD_S: Final = 60.0
 If the next one begins soon after that, the wait doubles, up to MAX_HOLD_S. So failures that come and go do
 not fill the log.
 """
+
+REMINDER_S: Final = 3600.0
+"""How often a failure that goes on is logged again. In this time, its reason is logged MAX_REPEATS times."""
+
+_NUMBERS: Final = re.compile(r"\d+")
+"""Durations, sizes and counts in a text vary while the reason is the same."""
 
 FIELDS: Final = ("source", "stream", "peer")
 """The context that a record can have besides its text: fields in the journal and in JSON."""
@@ -123,6 +130,9 @@ class EventLog:
 class FailureLog:
     """Logs the first of several failures in a row as WARNING, repeats as DEBUG, and recovery as INFO.
 
+    A failure with another reason than the last one logged, and one failure per hour, are WARNING as well:
+    what somebody reads in the morning must be what is wrong now.
+
     ``subject`` begins every message, for example "lab" or "lcm". It can be any object; its str may change.
     Successes within ``hold_s`` (see Hold) after a failure do not count as recovery, so intermittent failures
     are logged as one. If failures come and go nevertheless, these messages are limited as by EventLog.
@@ -135,21 +145,29 @@ class FailureLog:
         self._failures = 0
         self._first_s = self._last_s = 0.0
         self._repeats = Repeats()
-        self._is_hidden = False  # the first failure, because there were too many before
+        self._is_hidden = False  # this period of failure, because there were too many before
+        self._changes = Repeats(MAX_REPEATS, REMINDER_S)
+        self._reason = ""  # of the newest failure that was logged as WARNING, and when that was
+        self._logged_s = -math.inf
 
     @property
     def failing(self) -> bool:
         """Whether there was a failure, and it is not over yet."""
         return self._failures > 0
 
-    def failed(self, text: str) -> None:
-        """Log a failure; ``text`` says what happened and what to do."""
+    def failed(self, text: str, reason: str = "") -> None:
+        """Log a failure; ``text`` says what happened and what to do.
+
+        ``reason`` is what stays the same in it, if more than numbers varies.
+        """
         self._failures += 1
         self._last_s = monotonic()
+        reason = _NUMBERS.sub("0", reason or text)
         if self._failures > 1:
-            self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
+            self._failed_again(text, reason)
             return
-        self._first_s = self._last_s
+        self._first_s = self._logged_s = self._last_s
+        self._reason = reason
         self._hold.begin(self._first_s)
         addition = self._repeats.count(self._first_s)
         self._is_hidden = addition is None
@@ -158,6 +176,22 @@ class FailureLog:
             "%s: %s%s",
             *(self._subject, text, addition or ""),
         )
+
+    def _failed_again(self, text: str, reason: str) -> None:
+        """Log a further failure: as WARNING once an hour, and if the reason has changed a few times only."""
+        now_s = self._last_s
+        addition: str | None = None
+        if now_s - self._logged_s >= REMINDER_S:
+            addition = ""
+        elif reason != self._reason:
+            addition = self._changes.count(now_s)
+        if addition is None:
+            self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
+            return
+        self._reason, self._logged_s = reason, now_s
+        self._is_hidden = False
+        since = f"failure {self._failures} in a row, since {now_s - self._first_s:.0f} s"
+        self._logger.warning("%s: %s (%s)%s", self._subject, text, since, addition)
 
     def recovered(self, text: str) -> None:
         """After a failure, log the recovery with its duration, unless ``hold_s`` is not over yet.

@@ -68,7 +68,7 @@ class SystemdNotifier:
                 "pip install 'rtc3d-gateway[systemd]', or set Type=exec and no WatchdogSec in the unit"
             )
         except (OSError, RuntimeError, ValueError) as error:  # the last two come from cysystemd
-            self._failures.failed(f"cannot send {name}: {error}")
+            self._failures.failed(f"cannot send {name}: {error}", reason=str(error))
 
 
 async def serve(load: Callable[[], Settings], every_second: Callable[[], None] = lambda: None) -> None:

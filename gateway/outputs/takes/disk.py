@@ -33,7 +33,7 @@ class Disk:
     def failed(self, path: Path, error: OSError) -> None:
         """Note that ``path`` could not be written."""
         self.problem = disk_problem(path, error)
-        self._failures.failed(self.problem)
+        self._failures.failed(self.problem, reason=error.strerror or "")
 
     def ended(self) -> None:
         """Forget the problem, because a file has ended; the next one shows whether it persists."""

@@ -109,6 +109,71 @@ def test_the_hold_time_doubles_while_failures_come_back_soon(
         clock.now_s += pause_s
 
 
+def test_a_changed_reason_is_loud(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """Whoever reads the log of an outage must find what is wrong now, not only what was wrong first."""
+    failures = FailureLog(LOGGER, "lab")
+    texts = ["no reply", "no reply", "refused after 1.5 s", "refused after 2.5 s", "unreachable", "no reply"]
+    for text in texts:
+        failures.failed(text)
+        clock.now_s += 1.0
+    assert levels(caplog) == ["WARNING", "DEBUG", "WARNING", "DEBUG", "WARNING", "WARNING"]
+
+
+def test_a_failure_that_lasts_is_loud_every_hour(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """The hour counts from the newest loud message, so a change postpones the reminder."""
+    failures = FailureLog(LOGGER, "lab")
+    begin_s = clock.now_s
+    loud_s = []
+    for second in range(0, 4 * 3600, 10):
+        clock.now_s = begin_s + second
+        failures.failed("refused" if second < 1800 else "unreachable")
+        if caplog.records[-1].levelno == logging.WARNING:
+            loud_s.append(second)
+    assert loud_s == [0, 1800, 1800 + 3600, 1800 + 2 * 3600, 1800 + 3 * 3600]
+
+
+@pytest.mark.parametrize("num_reasons", [2, 1000])
+def test_reasons_that_change_all_the_time_do_not_fill_the_log(
+    clock: Clock, caplog: pytest.LogCaptureFixture, num_reasons: int
+) -> None:
+    """A server chooses its texts: an hour has at most five changes and one reminder."""
+    failures = FailureLog(LOGGER, "lab")
+    for number in range(10 * 3600):
+        failures.failed(f"refused: {chr(0x4E00 + number % num_reasons)}")
+        clock.now_s += 1.0
+    num_loud = levels(caplog).count("WARNING")
+    assert 10 <= num_loud <= 1 + 10 * (MAX_REPEATS + 1)
+
+
+def test_a_new_period_of_failure_has_a_reminder_of_its_own(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its first failure is loud, so an hour passes before it is repeated."""
+    failures = FailureLog(LOGGER, "lab")
+    failures.failed("refused")
+    failures.recovered("connected")
+    clock.now_s += 3599.0
+    for _ in range(3):
+        failures.failed("refused")
+        clock.now_s += 1.0
+    assert levels(caplog) == ["WARNING", "INFO", "WARNING", "DEBUG", "DEBUG"]
+
+
+def test_the_recovery_of_a_failure_that_became_loud_is_loud(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The begin of the period was hidden, because many came and went before."""
+    failures = FailureLog(LOGGER, "lab")
+    for _ in range(MAX_REPEATS + 1):
+        failures.failed("no router")
+        failures.recovered("connected")
+    failures.failed("no router")
+    clock.now_s += 3600.0
+    failures.failed("no router")
+    failures.recovered("connected")
+    assert levels(caplog)[-4:] == ["DEBUG", "DEBUG", "WARNING", "INFO"]
+
+
 def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptureFixture) -> None:
     """The recovery of a hidden failure is hidden, too."""
     failures = FailureLog(LOGGER, "lab")

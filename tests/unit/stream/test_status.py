@@ -100,6 +100,22 @@ def test_a_new_connection_counts_and_forgets_what_was_agreed() -> None:
     assert status.tries == 0
 
 
+def test_an_outage_is_a_warning_for_each_reason(caplog: pytest.LogCaptureFixture) -> None:
+    """A server that froze and was then ended no longer lacks a reply: it refuses connections."""
+    status = StreamStatus("3d", name="lab (3d)")
+    for error in [
+        "no reply to StreamFrames",
+        "no reply within 2 s",
+        "no reply within 4 s",
+        "refused",
+        "refused",
+    ]:
+        status.connecting(SERVER)
+        status.disconnected(LinkError(error))
+    warnings = [each for each in caplog.records if each.levelno == logging.WARNING]
+    assert len(warnings) == 3
+
+
 def test_a_limitation_is_a_warning_once_over_all_connections(caplog: pytest.LogCaptureFixture) -> None:
     status = StreamStatus("3d", name="lab (3d)")
     status.connected(SERVER)
