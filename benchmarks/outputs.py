@@ -29,6 +29,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import Declared, RosTopic
+from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
@@ -290,7 +291,7 @@ def main() -> None:
     network: Any = _SilentNetwork()
     tf = RosTopic("/tf", TF_MESSAGE, lambda: None)
     tf.declare(network)
-    source = RosSource("lab", "/mocap/lab", tf, network, network)
+    source = RosSource("lab", "/mocap/lab", tf, network, network, SentMessages())
     tools = Parameters6D(tools=tuple(Tool(str(number), f"Tool {number}") for number in range(_TOOLS)))
     frame = CoordinateFrame("lab", 1e-3, (0.0, 0.0, 0.6, 0.8), (1.0, 2.0, 3.0))
     source.set_parameters(ServerParameters(b"", 1, 1, parsed=Parameters(tools=tools), frame=frame))

@@ -23,6 +23,7 @@ from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.outputs.zenoh.config import zenoh_config
+from gateway.outputs.zenoh.confirmation import LINK_LOST, SILENT_S, RouterConfirmation
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from gateway.workers import WorkerThread
 
@@ -35,6 +36,14 @@ Until then, only the sending thread waits, and what finds no place in its queue 
 than the 60 s without a sign of life after which Zenoh gives a connection to rmw_zenohd up.
 """
 
+_LEASE_MS: Final = 60_000
+_KEEP_ALIVES: Final = 2
+"""As in rmw_zenoh's own configuration of sessions: after a pause, a router reads what waits for it.
+
+The router gives a connection up on which it has read nothing for this long. With Zenoh's own 10 s, a router
+that was paused for longer did so before it read the messages, and all of them were lost.
+"""
+
 
 def client_config(endpoint: str) -> zenoh.Config:
     """Return the configuration of a client of one router, which it does not search by multicast."""
@@ -44,12 +53,14 @@ def client_config(endpoint: str) -> zenoh.Config:
             "mode": "client",
             "connect": {"endpoints": [endpoint]},
             "scouting": {"multicast": {"enabled": False}},
-            "transport": {"link": {"tx": {"queue": queue}}},
+            "transport": {"link": {"tx": {"lease": _LEASE_MS, "keep_alive": _KEEP_ALIVES, "queue": queue}}},
         }
     )
 
 
-def router_session(endpoint: str, declare: Callable[[zenoh.Session], None]) -> SessionHolder:
+def router_session(
+    endpoint: str, declare: Callable[[zenoh.Session], None], on_link_lost: Callable[[], None]
+) -> SessionHolder:
     """Return the holder of a session with the router at ``endpoint``."""
     texts = SessionTexts(
         "ros2",
@@ -59,7 +70,7 @@ def router_session(endpoint: str, declare: Callable[[zenoh.Session], None]) -> S
         no_router=f"the Zenoh router at {endpoint} is not connected any more; {REMEDY}",
         opened=f"connected to the router at {endpoint}",
     )
-    return SessionHolder(texts, client_config(endpoint), declare)
+    return SessionHolder(texts, client_config(endpoint), declare, on_link_lost=on_link_lost)
 
 
 _STATUS: Final = ("status",)
@@ -74,11 +85,12 @@ class Ros2Output(FrameOutput):
     """Publishes for ROS 2 in the wire format of rmw_zenoh."""
 
     name = "ros2"
-    drop_causes = ("not open", "no router", "queue full", "put failed", "unknown unit")
+    drop_causes = ("not open", "no router", LINK_LOST, "queue full", "put failed", "unknown unit")
 
     def __init__(self, settings: Ros2Settings) -> None:
         self.settings: Ros2Settings = settings
-        self._router = router_session(settings.connect, self._declare_in_thread)
+        self._router = router_session(settings.connect, self._declare_in_thread, self._lose_link)
+        self._confirmation = RouterConfirmation(self._router)
         self._sender: WorkerThread | None = None  # from start to close
         self._tf = RosTopic(TF, TF_MESSAGE, self._on_tf_wanted)
         self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
@@ -114,6 +126,9 @@ class Ros2Output(FrameOutput):
             self._tf.undeclare()
         self._on_tf_wanted()
 
+    def _lose_link(self) -> None:
+        self._confirmation.lose_link()
+
     # The sending thread.
 
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
@@ -125,8 +140,9 @@ class Ros2Output(FrameOutput):
         if self._sender is not None:
             self._sender.submit(call)
 
-    def _check_subscribers(self) -> None:
+    def _check_router(self) -> None:
         self._is_checking = False
+        self._confirmation.check()
         for topic in (self._tf, self._diagnostics):
             topic.check_subscribers()
         for source in list(self._sources.values()):
@@ -141,7 +157,9 @@ class Ros2Output(FrameOutput):
             self._names[source] = name
         name = self._names[source]
         base = f"/{self.settings.namespace}/{name}" if self.settings.namespace else f"/{name}"
-        self._sources[source] = publisher = RosSource(source, base, self._tf, self._router, self)
+        self._sources[source] = publisher = RosSource(
+            *(source, base, self._tf, self._router, self), self._confirmation.of(source)
+        )
         self.submit(lambda: None if self._node is None else publisher.declare(self._node))
         return publisher
 
@@ -195,18 +213,22 @@ class Ros2Output(FrameOutput):
 
     def health(self) -> OutputHealth:
         """Return whether the router is connected, and reads."""
-        silent_s = 0.0 if self._sender is None else self._sender.call_age_s
-        if silent_s < _HUNG_S:
-            return self._router.health
+        call_age_s = 0.0 if self._sender is None else self._sender.call_age_s
+        health = self._router.health
+        silent_s = max(call_age_s, self._confirmation.silent_s)
+        if (call_age_s < _HUNG_S and silent_s < SILENT_S) or not health.connected:
+            return health
         router = f"the Zenoh router at {self.settings.connect}"
         return OutputHealth(False, f"{router} has read nothing for {silent_s:.0f} s; restart it")
 
     def maintain(self) -> None:
-        """Log whether the router is connected, and check for subscribers."""
+        """Log whether the router is connected and what was lost with it, and check for subscribers."""
         self._router.maintain()
+        losses = {name: source.losses for name, source in self._sources.items()}
+        self._confirmation.count_unconfirmed(losses, f"the Zenoh router at {self.settings.connect}")
         if not self._is_checking and not self._router.is_cut_off:
             self._is_checking = True
-            self.submit(self._check_subscribers)
+            self.submit(self._check_router)
 
     def close(self) -> None:
         """Close the session. The node and its topics disappear from ROS."""

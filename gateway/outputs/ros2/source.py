@@ -46,6 +46,7 @@ from gateway.messages.ros2_names import (
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.outputs.zenoh.session import SessionHolder
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -88,10 +89,18 @@ class RosSource:
 
     ``name`` is the source's name in the configuration, ``base`` the beginning of its topics: /mocap/lab.
     ``tf`` is the topic /tf, which all sources share. There the frames of tools begin with the source's name,
-    so that they differ even if sources have the same frame: lab/wand.
+    so that they differ even if sources have the same frame: lab/wand. ``sent`` counts what Zenoh has taken.
     """
 
-    def __init__(self, name: str, base: str, tf: RosTopic, router: SessionHolder, sender: Sender) -> None:
+    def __init__(
+        self,
+        name: str,
+        base: str,
+        tf: RosTopic,
+        router: SessionHolder,
+        sender: Sender,
+        sent: SentMessages,
+    ) -> None:
         self.name = name
         self.on_wanted_changed: Callable[[], None] = lambda: None
         """Called in any thread."""
@@ -105,6 +114,7 @@ class RosSource:
         self._tf = tf
         self._router = router
         self._sender = sender
+        self._sent = sent
         self._defects = DefectLog(logger, f"{name} to ros2")
         self._is_closed = False
         self._lock = threading.Lock()  # of ``_wanted``
@@ -372,16 +382,17 @@ class RosSource:
             content = pack_pose(*pose[:7])
             transforms.append((names, content))
             if topic.wanted:
-                topic.put(encode(stamp, content), now_ns)
+                self._put(topic, encode(stamp, content), now_ns)
         if is_tf_wanted and transforms:
-            self._tf.put(tf_message(stamp, transforms), now_ns)
+            self._put(self._tf, tf_message(stamp, transforms), now_ns)
 
     def _send_markers(self, topic: RosTopic, component: Component, stamp: bytes, now_ns: int) -> None:
         if self._cloud.num_markers != component.num_items:
             self._cloud = CloudEncoder(self._frame.frame_id, component.num_items)
         items = component.items()
         values = items.view(items.dtype["x"]).reshape(-1, 4)
-        topic.put(self._cloud.encode(stamp, self._frame.points(values[:, :3]), values[:, 3]), now_ns)
+        cloud = self._cloud.encode(stamp, self._frame.points(values[:, :3]), values[:, 3])
+        self._put(topic, cloud, now_ns)
 
     def _send_forces(self, component: Component, stamp: bytes, now_ns: int) -> None:
         if not any(plate.topic.wanted for plate in self._plates):
@@ -393,13 +404,17 @@ class RosSource:
             if topic.wanted and not any(map(math.isnan, load)):
                 fx, fy, fz, mx, my, mz = load
                 wrench = pack_wrench(fx * n, fy * n, fz * n, mx * nm, my * nm, mz * nm)
-                topic.put(self._stamped.encode(stamp, wrench), now_ns)
+                self._put(topic, self._stamped.encode(stamp, wrench), now_ns)
 
     def _send_analog(self, topic: RosTopic, component: Component, now_ns: int) -> None:
         if self._channels.num_channels != component.num_items:
             labels = describe(ComponentType.ANALOG, self._described_by.parsed, component.num_items).labels
             self._channels = AnalogEncoder(labels)
-        topic.put(self._channels.encode(component.items()), now_ns)
+        self._put(topic, self._channels.encode(component.items()), now_ns)
+
+    def _put(self, topic: RosTopic, cdr: bytes, now_ns: int) -> None:
+        topic.put(cdr, now_ns)
+        self._sent.count += 1
 
     def _count_unknown_unit(self, kind: ComponentType) -> None:
         num_messages = sum(topic.wanted for topic in self._by_component.get(kind, ()))

@@ -19,6 +19,7 @@ from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Answer, Output, OutputHealth, QueryService, ServerFile, ServerParameters
 from gateway.outputs.zenoh.answers import ZenohAnswers
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.confirmation import LINK_LOST, SILENT_S, RouterConfirmation
 from gateway.outputs.zenoh.json_publishing import JsonConverter
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts, declare_publisher, in_zenoh_thread
@@ -69,14 +70,17 @@ class ZenohOutput(Output):
     """
 
     name = "zenoh"
-    drop_causes = ("not open", "no router", "put failed")
+    drop_causes = ("not open", "no router", LINK_LOST, "put failed")
 
     def __init__(self, settings: ZenohSettings, config: zenoh.Config | None = None) -> None:
         self.settings = settings
         self.max_rate_hz = settings.max_rate_hz
         self.has_tool_poses = settings.tool_poses
         self.config = zenoh_config(settings.config) if config is None else config
-        self._holder = SessionHolder(_TEXTS, self.config, self._declare_all, self._update_link)
+        self._holder = SessionHolder(
+            *(_TEXTS, self.config, self._declare_all, self._update_link), on_link_lost=self._lose_link
+        )
+        self._confirmation = RouterConfirmation(self._holder)
         self._link = ZenohLink(lambda: self._holder.refusal)
         self._json = JsonConverter(settings.json_max_rate_hz)
         self._losses = self._json.losses
@@ -121,6 +125,10 @@ class ZenohOutput(Output):
     def _update_link(self) -> None:
         self._link.is_cut_off = self._holder.is_cut_off
 
+    def _lose_link(self) -> None:
+        if self._holder.is_client:
+            self._confirmation.lose_link()
+
     def _token(self, session: zenoh.Session, source: str, name: str) -> zenoh.LivelinessToken:
         return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
 
@@ -132,7 +140,10 @@ class ZenohOutput(Output):
         """
         is_of_item = len(topic.path) > 1
         key = zenoh_key(self.settings.prefix, topic.source, *topic.path)
-        publisher = ZenohPublisher(self._link, key, topic.type_name, self.settings.express, self._forget)
+        publisher = ZenohPublisher(
+            *(self._link, key, topic.type_name, self.settings.express, self._forget),
+            self._confirmation.of(topic.source),
+        )
         publisher.json = self._json.publisher(topic, key, publisher.update_wanted)
         with self._lock:
             self._publishers.append(publisher)
@@ -157,12 +168,19 @@ class ZenohOutput(Output):
                 self._publishers.remove(publisher)
 
     def health(self) -> OutputHealth:
-        """Return whether messages can be sent."""
-        return self._holder.health
+        """Return whether messages can be sent, and whether the router of a client reads them."""
+        health, silent_s = self._holder.health, self._confirmation.silent_s
+        if silent_s < SILENT_S or not health.connected:
+            return health
+        return OutputHealth(
+            False, f"the Zenoh router has read nothing for {silent_s:.0f} s: check it and the network to it"
+        )
 
     def maintain(self) -> None:
         """Log whether a client has its router, and check for subscribers. Zenoh itself reconnects."""
         self._holder.maintain()
+        self._confirmation.check()
+        self._confirmation.count_unconfirmed(self._losses, "the Zenoh router")
         if self.session is not None:
             with self._lock:
                 for publisher in self._publishers:

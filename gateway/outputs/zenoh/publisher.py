@@ -9,6 +9,7 @@ import zenoh
 from gateway.errors import OutputError
 from gateway.messages.decode import LCM
 from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.outputs.zenoh.json_publishing import JsonPublisher
 from gateway.outputs.zenoh.session import declare_publisher, has_subscribers, undeclare
 
@@ -50,11 +51,18 @@ class ZenohPublisher:
     """Sends the messages of one key.
 
     If a subscriber does not read, Zenoh's queue for it becomes full. Then Zenoh drops messages for this
-    subscriber only, almost without waiting (config.py), until it reads again.
+    subscriber only, almost without waiting (config.py), until it reads again. ``sent`` counts what Zenoh has
+    taken for subscribers.
     """
 
     def __init__(
-        self, link: ZenohLink, key: str, type_name: str, express: bool, forget: Callable[[Any], None]
+        self,
+        link: ZenohLink,
+        key: str,
+        type_name: str,
+        express: bool,
+        forget: Callable[[Any], None],
+        sent: SentMessages,
     ) -> None:
         self.wanted = False
         """Whether a subscriber matches the key now, or that of the JSON."""
@@ -65,6 +73,7 @@ class ZenohPublisher:
         self._type_name = type_name
         self._express = express
         self._forget = forget
+        self._sent = sent
         self._publisher: zenoh.Publisher | None = None
         self._is_matched = False
         self._is_closed = False
@@ -116,6 +125,8 @@ class ZenohPublisher:
                 self.json.offer(message)
         try:
             self._publisher.put(message)
+            if self.wanted:
+                self._sent.count += 1
         except zenoh.ZError as error:
             text = f"Zenoh did not take a message for {self._key}: {zenoh_reason(error)}"
             raise OutputError(text, cause="put failed") from error

@@ -58,7 +58,7 @@ class SessionHolder:
 
     ``declare`` declares everything on the new session, in the thread that opens it and with ``lock`` held. If
     it raises, the session is closed, and the next one gets everything. ``on_link`` is called in any thread
-    when ``is_cut_off`` may have changed.
+    when ``is_cut_off`` may have changed, and before that ``on_link_lost`` when a connection has ended.
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class SessionHolder:
         config: zenoh.Config,
         declare: Callable[[zenoh.Session], None],
         on_link: Callable[[], None] = lambda: None,
+        on_link_lost: Callable[[], None] = lambda: None,
     ) -> None:
         self.session: zenoh.Session | None = None
         """The open session, with everything declared on it; None before that, and after ``close``."""
@@ -76,9 +77,11 @@ class SessionHolder:
         """Protects ``session`` and what the owner declares on it."""
         self._texts = texts
         self._config = config
-        self._is_client = json.loads(config.get_json("mode") or "null") == "client"
+        self.is_client: Final = json.loads(config.get_json("mode") or "null") == "client"
+        """Whether the session sends everything to one router."""
         self._declare = declare
         self._on_link = on_link
+        self._on_link_lost = on_link_lost
         self._num_transports = 0
         self._counting = threading.Lock()  # of _num_transports, which several threads of Zenoh change
         self._problem = texts.not_open
@@ -139,6 +142,8 @@ class SessionHolder:
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
         with self._counting:
             self._num_transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._on_link_lost()
         self._update()
 
     def _update(self) -> None:
@@ -148,7 +153,7 @@ class SessionHolder:
     @property
     def lacks_router(self) -> bool:
         """Whether the session is that of a client, which needs a router, and none is connected."""
-        return self._is_client and not self._num_transports
+        return self.is_client and not self._num_transports
 
     @property
     def health(self) -> OutputHealth:

@@ -14,6 +14,7 @@ from gateway.messages.ros2 import TF_MESSAGE
 from gateway.outputs.contract import OutputHealth, ServerParameters
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosTopic
+from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from tests.support import ros_messages as ros
@@ -80,6 +81,8 @@ class Router:
 
     def __init__(self, *_: Any) -> None:
         self.is_cut_off = False
+        self.is_client = True
+        self.session = None
         self.events: list[str] = []
 
     @property
@@ -135,7 +138,10 @@ class Source:
     def __init__(self, given: ServerParameters | None = None, *, is_declared: bool = True) -> None:
         self.node, self.router, self.sender = Node(), Router(), Sender()
         self.tf = RosTopic("/tf", TF_MESSAGE, self._update_wanted)
-        self.publisher = RosSource("lab", "/mocap/lab", self.tf, self.router, self.sender)  # type: ignore[arg-type]
+        self.messages_sent = SentMessages()
+        router: Any = self.router
+        sender: Any = self.sender
+        self.publisher = RosSource("lab", "/mocap/lab", self.tf, router, sender, self.messages_sent)
         self.publisher.losses = Losses(logging.getLogger("tests"), "lab to ros2")
         self.num_changes = 0
         self.publisher.on_wanted_changed = self._note_change

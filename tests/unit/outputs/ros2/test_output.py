@@ -1,12 +1,15 @@
 """The output for ROS 2: sources, subscribers and life cycle, and what a real router shows of it."""
 
 import asyncio
+import logging
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import zenoh
 import zenoh.ext
 
+from gateway.logs.losses import Losses
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2 import output as output_module
 from gateway.outputs.ros2.output import Ros2Output
@@ -15,6 +18,7 @@ from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import gid_of
 from gateway.rtc3d.components import ComponentType
 from tests.support.ros_lab import ALL, parameters, ros_lab, stamp, tools_frame
+from tests.support.statuses import amounts
 from tests.support.waiting import wait_until
 from tests.unit.outputs.ros2.scripted_ros import Node, Router, Sender
 
@@ -103,6 +107,29 @@ def test_maintenance_finds_subscribers_that_were_missed(monkeypatch: pytest.Monk
     lab.output.maintain()
     assert lab.sender.calls == []
     assert lab.router.events.count("maintain") == 7
+
+
+def test_messages_that_a_lost_router_has_not_confirmed_count_as_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A router that was stopped loses what Zenoh has accepted for it: here a pose and its transform."""
+    lab = Output(monkeypatch)
+    publisher = lab.source("lab", "wand")
+    losses = Losses(logging.getLogger("tests"), "lab to ros2")
+    lab.output.count_losses("lab", losses)
+    lab.match("/tf", "/mocap/lab/wand/pose")
+    publisher.publish(tools_frame((1, 2, 3)), stamp(), ALL)
+    lab.sender.run()
+    lab.output._lose_link()
+    lab.output.maintain()
+    assert amounts(losses.report()) == {"link lost": (2, 0)}
+
+
+def test_a_router_that_reads_nothing_is_a_problem_before_the_buffers_are_full(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lab = Output(monkeypatch)
+    assert lab.output.health().connected
+    monkeypatch.setattr(lab.output, "_confirmation", Mock(silent_s=7.0))
+    assert not lab.output.health().connected
 
 
 async def test_subscribers_of_shared_topics_concern_every_source(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,6 +25,13 @@ def test_a_client_of_the_router_searches_for_no_others_and_waits_for_it() -> Non
     assert json.loads(config.get_json(key)) > 60_000_000  # the lease of rmw_zenohd
 
 
+def test_a_router_that_pauses_reads_afterwards_what_waits_for_it() -> None:
+    """With Zenoh's lease of 10 s, a router paused for 15 s gave the connection up, and all was lost."""
+    config = client_config(ENDPOINT)
+    link = "transport/link/tx"
+    assert [json.loads(config.get_json(f"{link}/{key}")) for key in ("lease", "keep_alive")] == [60_000, 2]
+
+
 @pytest.mark.parametrize(
     ("reliability", "zenoh_reliability"),
     [("best_effort", zenoh.Reliability.BEST_EFFORT), ("reliable", zenoh.Reliability.RELIABLE)],
