@@ -122,9 +122,9 @@ class EventLog:
         """
         addition = self._repeats.setdefault(kind, Repeats(most)).count(monotonic())
         if addition is None:
-            self._logger.debug("%s: %s", self._subject, text)
+            self._logger.debug("%s: %s", self._subject, text, extra={"kind": kind})
         else:
-            self._logger.log(level, "%s: %s%s", self._subject, text, addition)
+            self._logger.log(level, "%s: %s%s", self._subject, text, addition, extra={"kind": kind})
 
 
 class FailureLog:

@@ -104,7 +104,8 @@ class Losses:
             self._newest_by_cause_s[cause] = now_s
         if is_news:
             is_repeat = is_known and level == logging.WARNING
-            self._logger.log(logging.DEBUG if is_repeat else level, "%s: %s", self._subject, text)
+            level = logging.DEBUG if is_repeat else level
+            self._logger.log(level, "%s: %s", self._subject, text, extra={"kind": cause})
 
     def message_lost(
         self, cause: str, text: str, frame: object | None, *, level: int = logging.WARNING

@@ -12,7 +12,9 @@ from gateway.queries.parameter_cache import ParameterCache
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.replies import LONG_XML_BYTES, XmlThread
+from tests.support.errors import names
 from tests.support.parameters import in_root
+from tests.support.records import kinds, logged
 from tests.unit.queries.fake_source import CM, MM, FakeSource, parameters_xml
 
 SILENCE = ReplyTimeoutError("192.0.2.1:3020 did not answer SendParameters within 2 s")
@@ -50,8 +52,7 @@ async def test_a_server_without_parameters_makes_the_former_ones_void(
     with pytest.raises((ServerError, ReplyTimeoutError, ParametersError)):
         await source.connect(reply)
     assert source.announced == [(MM, 1), (None, 2)]
-    [warning] = warnings_of(caplog)
-    assert warning.startswith("lab: the server gives no parameters any more: ")
+    assert kinds(caplog) == [("WARNING", "void")]
     with pytest.raises((ServerError, ReplyTimeoutError, ParametersError)):
         await source.connect(reply)
     assert len(source.announced) == 2
@@ -68,21 +69,21 @@ async def test_a_lost_connection_keeps_the_parameters(source: FakeSource) -> Non
 
 
 @pytest.mark.parametrize(
-    ("reply", "code", "text"),
+    ("reply", "code", "value"),
     [
-        (ServerError("err-what?"), "refused", "or refuses it: err-what?; the parameters of its earlier"),
-        (SILENCE, "timeout", "did not answer SendParameters within 2 s; the parameters of its earlier"),
+        (ServerError("err-what?"), "refused", "err-what?"),
+        (SILENCE, "timeout", "SendParameters"),
     ],
 )
 async def test_peers_are_told_that_the_parameters_are_void(
-    source: FakeSource, reply: Exception, code: str, text: str
+    source: FakeSource, reply: Exception, code: str, value: str
 ) -> None:
     with pytest.raises(type(reply)):
         await source.connect(reply)
     for sections in ((), ("3d",)):
         error = await source.parameters_error(*sections)
         assert error.code == code
-        assert text in str(error)
+        assert names(str(error), "lab", value)
 
 
 async def test_xml_that_cannot_be_read_is_given_to_peers_as_it_is() -> None:
@@ -243,8 +244,8 @@ async def test_a_refusal_later_on_keeps_the_parameters_and_ends_the_reading(
     assert source.server.commands == ["SendParameters"]
     assert (await source.parameters()).xml == MM
     assert source.announced == [(MM, 1)]
-    [warning] = warnings_of(caplog)
-    assert warning.startswith("lab: the parameters cannot be read again: ")
+    [warning] = logged(caplog)
+    assert (warning.level, warning.args[0]) == ("WARNING", "lab")
     source.server.replies["SendParameters"] = CM
     assert (await source.parameters(fresh=True)).xml == CM  # a peer may ask nevertheless
     await source.refresh()
@@ -276,22 +277,22 @@ async def test_an_answer_to_a_peer_is_read_again_later() -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "level", "text"),
+    ("before", "after", "level", "kind", "values"),
     [
-        ("A B", "A C", logging.WARNING, "lab: markers or tools were renamed on the server: 3d 'B' to 'C';"),
-        ("A B", "A B C", logging.INFO, "lab: the server's parameters changed: 3d (parameters_version 2)"),
+        ("A B", "A C", "WARNING", "renamed", ["3d", "'B'", "'C'", 2]),
+        ("A B", "A B C", "INFO", "changed", ["3d", 2]),
     ],
 )
 async def test_changes_are_logged(
-    before: str, after: str, level: int, text: str, caplog: pytest.LogCaptureFixture
+    before: str, after: str, level: str, kind: str, values: list[object], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     source = FakeSource()
     await source.store_parameters(labelled(before))
     await source.refresh(labelled(after))
     [record] = [record for record in caplog.records if record.name == "gateway.queries.answers"]
-    assert record.levelno == level
-    assert record.message.startswith(text)
+    assert kinds(caplog, logging.INFO) == [(level, kind)]
+    assert names(record.message, "lab", *values)
 
 
 def labelled(labels: str) -> bytes:
@@ -405,8 +406,9 @@ async def test_a_refusal_is_cached_for_the_connection_unless_the_query_is_fresh(
     with pytest.raises(ServerError):
         await source.connect(ServerError("err-what?"))
     assert source.announced == []
-    texts = {str(await source.parameters_error(*sections)) for sections in ((), (), ("3d",))}
-    assert texts == {"source 'lab': the server does not know SendParameters, or refuses it: err-what?"}
+    errors = [await source.parameters_error(*sections) for sections in ((), (), ("3d",))]
+    assert [error.code for error in errors] == ["refused"] * 3
+    assert all(names(str(error), "lab", "SendParameters", "err-what?") for error in errors)
     assert source.server.commands == ["SendParameters"]
     assert (await source.parameters_error(fresh=True)).code == "refused"
     assert source.server.commands == ["SendParameters", *requests]
