@@ -9,6 +9,7 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
@@ -274,6 +275,13 @@ class Output(ABC):
     @abstractmethod
     def publisher(self, topic: Topic) -> Publisher:
         """Return a new publisher of ``topic``. The output need not be open yet."""
+
+    def until_declared(self) -> Future[None] | None:
+        """Return what is done when all publishers so far can send; None if they can, or if it is not open.
+
+        Only who must not lose the first message of a topic waits for it, in another thread than the loop's.
+        """
+        return None
 
     @abstractmethod
     def health(self) -> OutputHealth:

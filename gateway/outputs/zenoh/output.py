@@ -136,7 +136,7 @@ class ZenohOutput(Output):
         """Return a new publisher of ``topic``. It can send when the session is open.
 
         A server may have hundreds of tools. Their keys are declared in a thread, because each takes 1 ms;
-        until then, they have no subscribers.
+        until then (``until_declared``), they have no subscribers.
         """
         is_of_item = len(topic.path) > 1
         key = zenoh_key(self.settings.prefix, topic.source, *topic.path)
@@ -154,6 +154,10 @@ class ZenohOutput(Output):
             declare = functools.partial(self._declare_late, publisher, session)
             self._declarer.submit(functools.partial(self._defects.attempt, declare, None))
         return publisher
+
+    def until_declared(self) -> Future[None] | None:
+        """Return what is done when the keys of tools are declared that were asked for so far."""
+        return None if self.session is None else self._declarer.submit(lambda: None)
 
     def _declare_late(self, publisher: ZenohPublisher, session: zenoh.Session) -> None:
         try:

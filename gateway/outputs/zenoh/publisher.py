@@ -116,6 +116,8 @@ class ZenohPublisher:
             if self._is_closed:
                 text = f"Zenoh key {self._key} is closed; ask for a new publisher"
                 raise OutputError(text, cause="closed")
+            if not link.is_cut_off:
+                raise OutputError(f"Zenoh key {self._key} is not declared yet", cause="not declared")
             raise link.refusal()
         if self.wanted:
             link.burst_bytes_left -= len(message)

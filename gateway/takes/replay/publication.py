@@ -5,6 +5,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from concurrent.futures import wait
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -33,6 +34,8 @@ from gateway.takes.files.parameters_history import recorded_parameters
 _PARAMETERS_S: Final = 1.0
 """How long messages wait at most until the outputs have sent the parameters that describe them."""
 
+_DECLARED_S: Final = 1.0
+"""How long the first message of a key waits at most until the outputs can send it."""
 
 MAX_TOPICS: Final = 4096
 MAX_SOURCES: Final = 256
@@ -129,6 +132,8 @@ class Publication:
         path = (name, _recorded_label(label, source.parameters)) if label else (name,)
         topic = Topic(source.name, path, lcm_type_name(message_type(message)))
         publishers = [(output.name, output.publisher(topic).publish) for output in self._outputs]
+        declared = [future for output in self._outputs if (future := output.until_declared()) is not None]
+        wait(declared, timeout=_DECLARED_S)  # or the first message would be refused
         route = _Route(source.newest, f"{name}/tool" if label else name, publishers)
         self._routes[recorded_source, key] = route
         return route

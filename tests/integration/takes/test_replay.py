@@ -12,13 +12,14 @@ from typing import Any
 
 import lcm
 import pytest
+import rtc3d
 import zenoh
 
 from gateway.messages.decode import decode
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, Tool
 from gateway.rtc3d.parameters_xml import encode_parameters
 from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.support.commands import run_in_process
@@ -255,6 +256,45 @@ async def test_a_folder_is_replayed_as_fast_as_possible(tmp_path: Path, subscrib
         for key in RECORDED:
             payloads = expected[lcm_channel("REPLAY", source, key)]
             await subscribers.wait_for(f"replay/{source}/{key}", payloads)
+
+
+def with_tools(*, late: int) -> list[Message]:
+    """Return poses of two tools and events; the second tool appears after ``late`` poses of the first."""
+    tools = Parameters6D(100.0, tuple(Tool(str(number), f"Tool {number}") for number in (1, 2)))
+    messages = [description(), parameters(Parameters(tools=tools))]
+    for number in range(2 * late):
+        utime = START_UTIME + 5000 * number
+        pose = rtc3d.tool_pose_t()
+        pose.utime = pose.capture_utime = utime
+        for tool in (1, 2)[: 1 + (number >= late)]:
+            pose.sequence = number - late * (tool - 1)
+            messages.append((f"MOCAP_LAB_6D_TOOL_{tool}", pose.encode()))
+        messages.append(frame(ComponentType.EVENT, [(1, number, -1, -1, -1)], number, utime=utime))
+    return messages
+
+
+@pytest.mark.parametrize("options", [("--rate", "max"), ("--rate", "1")])
+async def test_the_first_message_of_each_key_arrives(
+    tmp_path: Path, subscribers: Subscribers, options: tuple[str, ...]
+) -> None:
+    """Each tool has a key of its own, which is declared with its first pose, also in the middle of a take.
+
+    An event may be the only message of its key, also as JSON.
+    """
+    messages = with_tools(late=10)
+    path = write_take(tmp_path / "take.lcmlog", messages)
+    ended = await replay(path, "--zenoh", "--connect", subscribers.endpoint, *options)
+    assert ended.status == 0, ended.stderr
+    expected = by_channel(messages)
+    for channel, key in (
+        ("REPLAY_LAB_6D_TOOL_1", "replay/lab/6d/Tool%201"),
+        ("REPLAY_LAB_6D_TOOL_2", "replay/lab/6d/Tool%202"),
+        ("REPLAY_LAB_EVENT", "replay/lab/event"),
+    ):
+        assert len(expected[channel]) in {10, 20}
+        await subscribers.wait_for(key, expected[channel])
+    as_json = [json.loads(payload)["sequence"] for payload, _ in subscribers.samples["replay/lab/event/json"]]
+    assert as_json == list(range(20))
 
 
 async def test_lcm_logplayer_plays_a_take(tmp_path: Path, subscribers: Subscribers) -> None:

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,26 @@ def test_a_topic_is_wanted_while_somebody_subscribes_to_its_key(lab: Lab) -> Non
         wait_until(lambda: early.wanted)
         early.close()
         assert not early.wanted
+
+
+def test_the_keys_of_tools_are_declared_in_a_thread_that_can_be_waited_for(lab: Lab) -> None:
+    """Until then, a message is refused with its key: the session is open."""
+    assert lab.output.until_declared() is None
+    lab.open()
+    held = threading.Event()
+    declarer = lab.output._declarer  # held where a slow peer would hold it
+    declarer.submit(held.wait)
+    publisher = lab.output.publisher(Topic("lab", ("6d", "Probe"), "rtc3d.tool_pose_t"))
+    with pytest.raises(OutputError) as caught:
+        publisher.publish(b"message")
+    assert caught.value.cause == "not declared"
+    assert "mocap/lab/6d/Probe" in str(caught.value)
+    declared = lab.output.until_declared()
+    assert declared is not None
+    assert not declared.done()
+    held.set()
+    declared.result()
+    publisher.publish(b"message")
 
 
 def test_a_message_for_a_closed_publisher_is_refused_with_its_key(lab: Lab) -> None:

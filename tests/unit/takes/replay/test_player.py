@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,29 @@ async def test_poses_are_published_under_the_labels_of_the_tools(replayed: Repla
     await replayed.play([parameters(content), *poses])
     assert [topic.path for topic in replayed.output.declared] == [("6d", "Left/hand 1"), ("6d", "OTHER")]
     assert replayed.publication.num_messages == {"parameters": 1, "6d/tool": 2}
+
+
+async def test_the_first_message_of_a_key_waits_until_the_output_can_send_it(replayed: Replayed) -> None:
+    """Otherwise the first pose of each tool is refused: Zenoh declares their keys in a thread."""
+    output = replayed.output
+    waiting: list[Future[None]] = []
+    num_messages: list[int] = []
+
+    def until_declared() -> Future[None]:
+        num_messages.append(len(output.keys))
+        waiting.append(Future())
+        asyncio.run_coroutine_threadsafe(declare(waiting[-1]), loop)
+        return waiting[-1]
+
+    async def declare(future: Future[None]) -> None:
+        num_messages.append(len(output.keys))
+        future.set_result(None)
+
+    loop = asyncio.get_running_loop()
+    output.until_declared = until_declared  # type: ignore[method-assign]  # an output that declares late
+    await replayed.play([markers(1, 0), markers(1, 1), frame(ComponentType.ANALOG, [1], 0)])
+    assert num_messages == [0, 0, 2, 2]
+    assert len(output.keys) == 3
 
 
 async def test_outputs_get_what_the_recorded_parameters_say(replayed: Replayed) -> None:
