@@ -10,6 +10,7 @@ A message says what happened, to which server or file, and what to do.
 
 import errno
 import os
+from enum import StrEnum
 from typing import Final
 
 
@@ -110,8 +111,25 @@ class PeerError(GatewayError):
     """A client of an output violates its protocol, or speaks another one; the connection must end."""
 
 
+class FileLoss(StrEnum):
+    """Why a C3D file from a server was not stored."""
+
+    NO_C3D_FILE = "no-c3d-file"
+    TOO_LARGE = "too-large"  # spool.max_bytes
+    BROKEN_OFF = "broken-off"  # by the end of the connection
+    NOT_WRITTEN = "not-written"  # the system says why
+    NO_MEMORY = "no-memory"  # for what waits for the disk
+    DISK_BUSY = "disk-busy"  # with earlier files
+    DISK_SILENT = "disk-silent"
+    TOO_OFTEN = "too-often"
+
+
 class SpoolError(GatewayError):
-    """A C3D file from a server could not be stored."""
+    """A C3D file from a server could not be stored, because of ``cause``."""
+
+    def __init__(self, message: str, *, cause: FileLoss) -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 class ViewError(GatewayError):

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final
 
 from gateway.c3d_files.spool import Spool, StoredFile, UnfinishedFile
-from gateway.errors import SpoolError
+from gateway.errors import FileLoss, SpoolError
 from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.packets import FilePiece
 from gateway.token_bucket import TokenBucket
@@ -146,7 +146,8 @@ class IncomingFile:
             self.end(
                 SpoolError(
                     f"{self.name} is dropped: {held_mib} MiB of C3D files are waiting to be written; "
-                    "is the disk slow, or the server faulty?"
+                    "is the disk slow, or the server faulty?",
+                    cause=FileLoss.NO_MEMORY,
                 )
             )
             return
@@ -160,7 +161,11 @@ class IncomingFile:
 
     def interrupt(self, reason: str) -> None:
         """Give up the file, because no further piece of it will come."""
-        self.end(SpoolError(f"{self.name} broke off after {self._num_bytes} bytes: {reason}"))
+        self.end(
+            SpoolError(
+                f"{self.name} broke off after {self._num_bytes} bytes: {reason}", cause=FileLoss.BROKEN_OFF
+            )
+        )
 
     def end(self, result: StoredFile | SpoolError) -> None:
         """Report the end of the file, once. If it is lost, free its memory and have it deleted."""
@@ -212,7 +217,8 @@ class IncomingFile:
         self._report(
             SpoolError(
                 f"{self.name} cannot be stored in {self.directory}: {error.strerror}; "
-                "check spool.directory and the space on it"
+                "check spool.directory and the space on it",
+                cause=FileLoss.NOT_WRITTEN,
             )
         )
 
@@ -259,23 +265,29 @@ class SourceFiles:
         name = f"a C3D file of {file_bytes} bytes"
         problem = problem_of_c3d(head, file_bytes)
         if problem:
-            raise SpoolError(f"{name} is refused: {problem}")
+            raise SpoolError(f"{name} is refused: {problem}", cause=FileLoss.NO_C3D_FILE)
         spool = self._spool()
         if file_bytes > spool.max_bytes:
             raise SpoolError(
-                f"{name} from {self._source} is not stored: spool.max_bytes is {spool.max_bytes}"
+                f"{name} from {self._source} is not stored: spool.max_bytes is {spool.max_bytes}",
+                cause=FileLoss.TOO_LARGE,
             )
         if self._is_disk_silent:
-            raise SpoolError(f"{name} is dropped: the disk of {spool.directory} does not respond")
+            raise SpoolError(
+                f"{name} is dropped: the disk of {spool.directory} does not respond",
+                cause=FileLoss.DISK_SILENT,
+            )
         if len(self._unstored) >= _MAX_UNSTORED_FILES:
             raise SpoolError(
                 f"{name} is dropped: {len(self._unstored)} earlier files are still being written; "
-                "is the disk slow, or the server faulty?"
+                "is the disk slow, or the server faulty?",
+                cause=FileLoss.DISK_BUSY,
             )
         if self._allowed.left < 1:
             raise SpoolError(
                 f"{name} is dropped: {self._source} sends more than one file in {_FILE_PERIOD_S:g} s; "
-                "is the server faulty?"
+                "is the server faulty?",
+                cause=FileLoss.TOO_OFTEN,
             )
         self._allowed.take()
         file = IncomingFile(self._source, file_bytes, spool, self._thread, self._end)
@@ -290,7 +302,8 @@ class SourceFiles:
                 file.end(
                     SpoolError(
                         f"{file.name} is dropped: the disk of {file.directory} does not respond; "
-                        "check it, and whether it is mounted"
+                        "check it, and whether it is mounted",
+                        cause=FileLoss.DISK_SILENT,
                     )
                 )
 

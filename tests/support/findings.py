@@ -5,7 +5,7 @@ import math
 import re
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
@@ -15,6 +15,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.support import servers
 from tests.support.configurations import make_settings
+from tests.support.errors import names
 from tests.support.servers import Client, ScriptedServer, ok, packet
 
 SECONDS = 0.3
@@ -145,3 +146,12 @@ def tools_frame(number: int, *xs: float) -> bytes:
     items = b"".join(struct.pack(">8f", 1, 0, 0, 0, x, 0, 0, 0.1) for x in xs)
     component = struct.pack(">IIiqI", 24 + len(items), 4, number, 1000 * number, len(xs)) + items
     return packet(3, struct.pack(">I", 1) + component)
+
+
+def is_finding(
+    finding: Finding, subject: str, name: str, result: Result, *values: object, remedy: Sequence[object] = ()
+) -> bool:
+    """Whether a finding has these fields, names these values, and has a remedy only if it needs one."""
+    is_right = (finding.subject, finding.check, finding.result) == (subject, name, result)
+    is_right &= bool(finding.remedy) == bool(remedy)
+    return is_right and names(finding.found, *values) and names(finding.remedy, *remedy)

@@ -10,7 +10,9 @@ import pytest
 from gateway.c3d_files import receiving
 from gateway.c3d_files.receiving import FileReceiver, SourceFiles
 from gateway.c3d_files.spool import QueueMemory, Spool, StoredFile
+from gateway.errors import FileLoss, SpoolError
 from gateway.rtc3d.packets import FilePiece
+from tests.support.errors import names
 from tests.support.servers import c3d_file
 from tests.support.waiting import wait_until_async
 
@@ -23,12 +25,12 @@ class Lab:
     def __init__(self, folder: Path, *, max_bytes: int = 10_000, max_queued_bytes: int = 1_000_000) -> None:
         self.spool = Spool(folder, 100, max_bytes, max_queued_bytes)
         self.stored: list[StoredFile] = []
-        self.lost: list[str] = []
+        self.lost: list[SpoolError] = []
         self.files = SourceFiles("lab", lambda: self.spool, self.stored.append)
         self.receiver = self.new_receiver()
 
     def new_receiver(self) -> FileReceiver:
-        return FileReceiver(self.files, lambda error: self.lost.append(str(error)))
+        return FileReceiver(self.files, self.lost.append)
 
     def send(self, content: bytes, receiver: FileReceiver | None = None, piece_bytes: int = 300) -> None:
         """Send a whole file in pieces."""
@@ -49,6 +51,10 @@ class Lab:
     async def ended(self, count: int) -> None:
         await wait_until_async(lambda: len(self.stored) + len(self.lost) == count)
         await self.files._thread.run(lambda: None)  # lost files are deleted
+
+    @property
+    def causes(self) -> list[FileLoss]:
+        return [error.cause for error in self.lost]
 
     @property
     def contents(self) -> list[bytes]:
@@ -97,19 +103,22 @@ async def test_files_of_two_streams_may_arrive_at_the_same_time(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("content", "text"),
+    ("content", "cause", "values"),
     [
-        (b"", "a C3D file of 0 bytes is refused: it is empty"),
-        (b"P", "a C3D file of 1 bytes is refused: it has 1 bytes, and the header of a C3D file has 512"),
-        (bytes(5000), "a C3D file of 5000 bytes is refused: its first bytes are not those of a C3D file"),
-        (c3d_file(b"", 10_001), "a C3D file of 10001 bytes from lab is not stored: spool.max_bytes is 10000"),
+        (b"", FileLoss.NO_C3D_FILE, [0]),
+        (b"P", FileLoss.NO_C3D_FILE, [1, 512]),
+        (bytes(5000), FileLoss.NO_C3D_FILE, [5000]),
+        (c3d_file(b"", 10_001), FileLoss.TOO_LARGE, ["lab", 10_001, "spool.max_bytes", 10_000]),
     ],
 )
-async def test_other_files_are_refused_and_skipped(tmp_path: Path, content: bytes, text: str) -> None:
+async def test_other_files_are_refused_and_skipped(
+    tmp_path: Path, content: bytes, cause: FileLoss, values: list[object]
+) -> None:
     lab = Lab(tmp_path)
     for piece_bytes in (1, 5000):
         lab.send(content, piece_bytes=piece_bytes)
-    assert lab.lost == [text, text]
+    assert lab.causes == [cause, cause]
+    assert names(str(lab.lost[0]), *values)
     await lab.store()
     assert lab.contents == [FILE]
 
@@ -126,7 +135,8 @@ async def test_a_file_that_breaks_off_is_deleted_and_its_rest_is_no_other_file(t
     await lab.ended(2)
     assert lab.contents == [FILE]
     await lab.store()  # of the next connection
-    assert lab.lost == ["a C3D file of 2000 bytes from lab broke off after 1000 bytes: the connection broke"]
+    assert lab.causes == [FileLoss.BROKEN_OFF]
+    assert names(str(lab.lost[0]), "lab", 2000, 1000, "the connection broke")
     assert lab.contents == [FILE, FILE]
 
 
@@ -140,10 +150,8 @@ async def test_a_file_on_a_full_disk_is_lost_once(tmp_path: Path, monkeypatch: p
         full.setattr(os, "write", fail)
         lab.send(FILE)
         await lab.ended(1)
-    assert lab.lost == [
-        f"a C3D file of 2000 bytes from lab cannot be stored in {tmp_path}: No space left on device; "
-        "check spool.directory and the space on it"
-    ]
+    assert lab.causes == [FileLoss.NOT_WRITTEN]
+    assert names(str(lab.lost[0]), "lab", 2000, tmp_path, os.strerror(28), "spool.directory")
     assert lab.spool.memory.held_bytes == 0
     await lab.store()
     assert lab.contents == [FILE]
@@ -153,8 +161,8 @@ async def test_a_disk_that_hangs_takes_no_more_memory_than_its_share(tmp_path: P
     lab = Lab(tmp_path, max_queued_bytes=10_000)
     disk.hang()
     lab.send(c3d_file(b"", 9000), piece_bytes=500)
-    [lost] = lab.lost
-    assert lost.startswith("a C3D file of 9000 bytes from lab is dropped: 0 MiB of C3D files are waiting")
+    assert lab.causes == [FileLoss.NO_MEMORY]
+    assert names(str(lab.lost[0]), "lab", 9000, "0 MiB")
     assert lab.spool.memory.held_bytes <= 700  # the piece that is being written
     disk.respond()
     await lab.ended(1)
@@ -168,10 +176,8 @@ async def test_at_most_four_files_wait_for_the_disk(tmp_path: Path, disk: Disk) 
     disk.hang()
     for _ in range(6):
         lab.send(FILE)
-    assert lab.lost == 2 * [
-        "a C3D file of 2000 bytes is dropped: 4 earlier files are still being written; "
-        "is the disk slow, or the server faulty?"
-    ]
+    assert lab.causes == 2 * [FileLoss.DISK_BUSY]
+    assert names(str(lab.lost[0]), 2000, 4)
     disk.respond()
     await lab.ended(6)
     assert lab.contents == 4 * [FILE]
@@ -188,13 +194,12 @@ async def test_the_files_that_wait_for_a_disk_that_does_not_respond_are_given_up
     lab.begin(FILE, 1000)
     await wait_until_async(lambda: lab.files._thread.call_age_s > 0)
     lab.files.check()
-    silent = f"the disk of {tmp_path} does not respond"
-    assert lab.lost == 2 * [
-        f"a C3D file of 2000 bytes from lab is dropped: {silent}; check it, and whether it is mounted"
-    ]
+    assert lab.causes == 2 * [FileLoss.DISK_SILENT]
+    assert names(str(lab.lost[0]), "lab", 2000, tmp_path)
     lab.receiver.receive(FilePiece(FILE[1000:], 1000, len(FILE)))
     lab.send(FILE)
-    assert lab.lost[2:] == [f"a C3D file of 2000 bytes is dropped: {silent}"]
+    assert lab.causes == 3 * [FileLoss.DISK_SILENT]
+    assert names(str(lab.lost[2]), 2000, tmp_path)
     assert lab.spool.memory.held_bytes <= 500
     disk.respond()
     await lab.ended(3)
@@ -211,9 +216,8 @@ async def test_a_flood_of_files_is_limited(tmp_path: Path) -> None:
         lab.send(FILE)
         await lab.ended(number + 1)
     assert len(lab.stored) == receiving._MAX_FILES_AT_ONCE
-    assert lab.lost == 2 * [
-        "a C3D file of 2000 bytes is dropped: lab sends more than one file in 3 s; is the server faulty?"
-    ]
+    assert lab.causes == 2 * [FileLoss.TOO_OFTEN]
+    assert names(str(lab.lost[0]), "lab", 2000, "3 s")
     lab.files._allowed._updated_s -= 3.0
     for _ in range(2):
         lab.send(FILE)

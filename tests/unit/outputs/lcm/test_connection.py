@@ -13,6 +13,7 @@ from gateway.errors import OutputError
 from gateway.outputs.lcm import connection
 from gateway.outputs.lcm.connection import Waiting, open_lcm, receiving_url
 from gateway.outputs.lcm.receiver import joined_socket, split_datagram
+from tests.support.errors import raises
 from tests.support.lcm_relay import LcmRelay
 from tests.support.networks import lcm_url
 from tests.support.waiting import wait_until
@@ -55,7 +56,7 @@ def test_a_relay_is_found_by_its_name(host: str) -> None:
 def test_a_name_that_is_not_known_does_not_mean_this_computer() -> None:
     relay = LcmRelay()
     url = relay.url.replace("127.0.0.1", "nowhere.invalid")
-    with pytest.raises(OutputError, match=f"the host name 'nowhere.invalid' of {url} cannot be resolved: "):
+    with raises(OutputError, "'nowhere.invalid'", url, "DNS", cause="not open"):
         open_lcm(url)
     relay.close()
 
@@ -148,14 +149,7 @@ def test_the_wait_for_messages_ends_when_one_arrives_when_woken_and_when_the_con
 
 
 @pytest.mark.netns
-@pytest.mark.parametrize(
-    ("url", "problem"),
-    [
-        ("udpm://not-an-address:7721", "udpm://not-an-address:7721 has no multicast address"),
-        ("udpm://127.0.0.1:7721", "LCM does not open udpm://127.0.0.1:7721: "),
-    ],
-)
-def test_a_group_that_cannot_be_joined_is_reported_with_the_url(url: str, problem: str) -> None:
-    with pytest.raises(OutputError, match=problem) as caught:
+@pytest.mark.parametrize("url", ["udpm://not-an-address:7721", "udpm://127.0.0.1:7721"])
+def test_a_group_that_cannot_be_joined_is_reported_with_the_url(url: str) -> None:
+    with raises(OutputError, url, "lcm.url", cause="not open"):
         joined_socket(url)
-    assert caught.value.cause == "not open"

@@ -22,7 +22,9 @@ from gateway.outputs.lcm.sender import (
     new_sender,
 )
 from tests.support.clocks import Clock
+from tests.support.errors import names
 from tests.support.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
+from tests.support.records import logged
 from tests.support.waiting import wait_until
 
 BAD_URL = "udpm://not-an-address:7667"
@@ -85,8 +87,8 @@ def test_opening_is_tried_again_after_a_second_and_logged_once(
     caplog.set_level(logging.DEBUG, "gateway.outputs")
     sender = LcmSender(BAD_URL, None, lambda: None)
     sender.open()
-    problem = f"LCM does not open {BAD_URL}: Couldn't create LCM; check lcm.url"
-    assert sender.problem == problem
+    problem = sender.problem
+    assert names(problem, BAD_URL, "lcm.url")
     assert refusal(lambda: send(sender)) == (problem, "not open")
     clock.now_s += RETRY_S - 0.001
     sender.maintain()
@@ -94,9 +96,9 @@ def test_opening_is_tried_again_after_a_second_and_logged_once(
     clock.now_s += 0.001
     sender.maintain()
     sender.maintain()
-    assert [(record.levelname, record.message) for record in caplog.records] == [
-        ("WARNING", f"lcm: {problem}"),
-        ("DEBUG", f"lcm: {problem} (failure 2 in a row)"),
+    assert [(each.level, each.args) for each in logged(caplog, logging.DEBUG)] == [
+        ("WARNING", ("lcm", problem, "")),
+        ("DEBUG", ("lcm", problem, 2)),
     ]
 
 
@@ -225,10 +227,9 @@ def test_a_closed_publisher_says_so_and_frees_its_channel_once(shared: lcm.LCM) 
     channels.add("MOCAP_LAB_3D")  # another publisher has it now
     publisher.close()
     assert channels == {"MOCAP_LAB_3D"}
-    assert refusal(lambda: publisher.publish(b"late")) == (
-        "LCM channel MOCAP_LAB_3D is closed; ask for a new publisher",
-        "closed",
-    )
+    text, cause = refusal(lambda: publisher.publish(b"late"))
+    assert cause == "closed"
+    assert names(text, "MOCAP_LAB_3D")
     while shared.handle_timeout(0):
         pass
     assert received == [("MOCAP_LAB_3D", b"message")]
@@ -249,6 +250,7 @@ def test_a_slow_interface_loses_messages_and_delays_nobody(monkeypatch: pytest.M
             for _ in range(30):
                 sender.send("CHANNEL", bytes(1400))
 
-        text = f"the network interface does not take messages to {url} fast enough; use a faster one, "
-        assert refusal(send_many) == (text + "or set lcm.max_rate_hz", "send failed")
+        text, cause = refusal(send_many)
+        assert cause == "send failed"
+        assert names(text, url, "lcm.max_rate_hz")
         sender.close()
