@@ -39,7 +39,7 @@ class NoThread(WorkerThread):
 
 def still_host(monotonic: Callable[[], float]) -> Host:
     """Return a host without threads, on this clock: whoever waits for the disk has its answer at once."""
-    return Host(monotonic, NoThread, partial(WriterThread, has_thread=False))
+    return Host(monotonic, thread=NoThread, writer=partial(WriterThread, has_thread=False))
 
 
 class RecordingLab:

@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import logging
+import math
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -10,11 +12,12 @@ from collections.abc import Set as AbstractSet
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.outputs.takes.folder import FileId, TakeEntry, TakesFolder, disk_problem
+from gateway.outputs.takes.folder_clock import STEP_S, FolderClock
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.takes.files.writer_thread import WriterThread
 from gateway.workers import WorkerThread, result_of
@@ -53,9 +56,10 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Host:
-    """The clock and the threads that takes use; tests replace them."""
+    """The clocks and the threads that takes use; tests replace them."""
 
     monotonic: Callable[[], float] = time.monotonic
+    wall: Callable[[], float] = time.time
     thread: Callable[[str], WorkerThread] = WorkerThread
     writer: Callable[[str, int], WriterThread] = WriterThread
 
@@ -103,6 +107,20 @@ MAX_HISTORY_READS: Final = 8
 _FRESH_S: Final = 5.0
 """A take that was written so recently is not deleted: it may have been started a moment ago."""
 
+_EARLIEST_S: Final = 1_577_836_800.0
+"""2020, before this program existed: an older take was written while the clock was not set, so its age is not
+known."""
+
+
+class _Noticed(NamedTuple):
+    """When a take was written last: as its files say, and as the clock said then."""
+
+    end_s: float
+    written_s: float
+    noticed_s: float | None
+    """When that was noticed, on the monotonic clock; None if it was so before the first check."""
+    noticed_wall_s: float
+
 
 class FolderWatch:
     """Checks the folder of ``settings`` in a thread of its own, because its disk may not respond.
@@ -112,7 +130,9 @@ class FolderWatch:
 
     def __init__(self, settings: TakesSettings, host: Host) -> None:
         self._monotonic = host.monotonic
+        self._wall = host.wall
         self.folder = TakesFolder(settings.effective_directory)
+        self._clock = FolderClock(settings.effective_directory)
         self.is_checked = False
         """Whether it has been checked once."""
         self.excess_bytes = 0
@@ -121,8 +141,7 @@ class FolderWatch:
         self._thread = host.thread("takes-folder")
         self._check: Future[None] | None = None
         self._next_check_s = 0.0
-        # Of each take: when it was written last, and when that was noticed; None if it was there before.
-        self._noticed: dict[Path, tuple[float, float | None]] | None = None
+        self._noticed: dict[Path, _Noticed] | None = None  # None before the first check
 
     @property
     def problem(self) -> str:
@@ -167,7 +186,10 @@ class FolderWatch:
         If there are none of those, the newest take of each source stays: it may be the one that has just
         ended because of this limit. Returns how many bytes are still too many. Raises OSError.
         """
-        entries = sorted(self.folder.entries(), key=lambda entry: entry.end_s)
+        entries = self.folder.entries()
+        now_s = None if max_age_s is None else self._checked_time_s(entries)
+        self._notice(entries)
+        entries.sort(key=self._order)
         newest = {} if protected else {entry.source: entry.path for entry in entries}
         users: Counter[FileId] = Counter()
         sizes = self.folder.rolling_sizes()
@@ -176,13 +198,11 @@ class FolderWatch:
             sizes |= entry.sizes
             users.update(entry.sizes.keys())
         total = sum(sizes.values())
-        ages_s = self._ages_s(entries)
         for entry in entries:
-            age_s = ages_s[entry.path]
-            if entry.path in protected or age_s < _FRESH_S:
+            if entry.path in protected or self._is_fresh(entry):
                 continue
-            if max_age_s is not None and age_s > max_age_s:
-                reason = f"it is older than takes.max_age_days ({max_age_s / 86_400:g})"
+            if max_age_s is not None and now_s is not None and self._age_s(entry, now_s) > max_age_s:
+                reason = f"it is older than takes.max_age_days ({max_age_s / _DAY_S:g})"
             elif total > max_bytes and entry.path not in newest.values():
                 reason = f"the folder has {total} bytes, and takes.max_bytes is {max_bytes}"
             else:
@@ -198,22 +218,63 @@ class FolderWatch:
                     total -= size
         return max(0, total - max_bytes)
 
-    def _ages_s(self, entries: Sequence[TakeEntry]) -> dict[Path, float]:
-        """Return how long ago each take was written last.
+    def _notice(self, entries: Sequence[TakeEntry]) -> None:
+        """Note when takes were written.
 
-        The clock of the computer may have been corrected by years since then, so it counts only for takes
-        from before the first call.
+        The clock of the computer may be corrected by years at any time, so it counts only for takes from
+        before the first check. If a clock that was behind is corrected, so are the times of the takes that
+        were written with it: another gateway, which does not know about it, would find them too old.
         """
-        now_s, monotonic_s = time.time(), self._monotonic()
         former, self._noticed = self._noticed, {}
-        ages_s = {}
+        wall_s, monotonic_s = self._wall(), self._monotonic()
         for entry in entries:
-            end_s, noticed_s = (former or {}).get(entry.path, (None, None))
-            if end_s != entry.end_s:
+            noticed = None if former is None else former.get(entry.path)
+            if noticed is None or noticed.end_s != entry.end_s:
                 noticed_s = None if former is None else monotonic_s
-            self._noticed[entry.path] = entry.end_s, noticed_s
-            ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
-        return ages_s
+                noticed = _Noticed(entry.end_s, entry.end_s, noticed_s, wall_s)
+            if noticed.noticed_s is not None:
+                age_s = monotonic_s - noticed.noticed_s
+                end_s = max(wall_s, self._clock.latest_s) - age_s
+                if abs(noticed.noticed_wall_s - noticed.written_s) < STEP_S <= abs(end_s - entry.end_s):
+                    noticed = noticed._replace(end_s=_correct(entry, max(end_s, noticed.written_s)))
+            self._noticed[entry.path] = noticed
+
+    def _noticed_s(self, entry: TakeEntry) -> float | None:
+        return None if self._noticed is None else self._noticed[entry.path].noticed_s
+
+    def _order(self, entry: TakeEntry) -> tuple[float, float]:
+        """Return the key that sorts takes, the oldest first.
+
+        What is written now is newer than what was there before, even if that seems to be from the future:
+        otherwise, each new take would be deleted before takes that are newer than the clock.
+        """
+        noticed_s = self._noticed_s(entry)
+        return (-math.inf if noticed_s is None else noticed_s), entry.end_s
+
+    def _is_fresh(self, entry: TakeEntry) -> bool:
+        noticed_s = self._noticed_s(entry)
+        if noticed_s is None:
+            return abs(self._wall() - entry.end_s) < _FRESH_S
+        return self._monotonic() - noticed_s < _FRESH_S
+
+    def _checked_time_s(self, entries: Sequence[TakeEntry]) -> float:
+        """Return the time from which the ages of takes count. Raises OSError."""
+        wall_s = self._wall()
+        newest_s = max((each.end_s for each in entries if each.end_s <= wall_s), default=wall_s)
+        return self._clock.check(wall_s, self._monotonic(), newest_s)
+
+    def _age_s(self, entry: TakeEntry, now_s: float) -> float:
+        noticed_s = self._noticed_s(entry)
+        if noticed_s is not None:
+            return self._monotonic() - noticed_s
+        return now_s - entry.end_s if entry.end_s >= _EARLIEST_S else 0.0
+
+
+def _correct(entry: TakeEntry, end_s: float) -> float:
+    """Set when a take was written last; return it as the file system rounds it. Raises OSError."""
+    newest = max(entry.logs, key=lambda log: log[1].st_mtime)[0]
+    os.utime(newest, (end_s, end_s))
+    return newest.stat().st_mtime
 
 
 class Storage:

@@ -4,13 +4,12 @@ import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from gateway.outputs.takes import disk
 from gateway.outputs.takes.disk import FolderWatch, Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
+from gateway.outputs.takes.folder_clock import FILE
 from tests.support.clocks import Clock
 from tests.support.recording_output import NoThread, settings_in
 from tests.unit.outputs.takes.test_folder import NOW_S, stored
@@ -19,13 +18,12 @@ DAY_S = 86_400.0
 
 
 @pytest.fixture
-def takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TakesFolder:
-    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: NOW_S))
+def takes(tmp_path: Path) -> TakesFolder:
     return TakesFolder(tmp_path)
 
 
-def watch_of(takes: TakesFolder, clock: Clock | None = None) -> FolderWatch:
-    return FolderWatch(settings_in(takes.directory), Host(clock or Clock()))
+def watch_of(takes: TakesFolder, clock: Clock | None = None, wall: Clock | None = None) -> FolderWatch:
+    return FolderWatch(settings_in(takes.directory), Host(clock or Clock(), wall or Clock(NOW_S)))
 
 
 def excess(takes: TakesFolder, max_bytes: int, *protected: str) -> int:
@@ -80,6 +78,7 @@ def test_a_take_that_was_just_written_is_not_deleted(takes: TakesFolder, age_s: 
 
 def test_takes_are_deleted_by_age_unless_they_are_running(takes: TakesFolder) -> None:
     """max_age_days holds for the newest take of a source, too, but never for one that is running."""
+    stored(takes.directory / FILE, 0, 0)
     for name, age_s in (("old", 2 * DAY_S + 1), ("running", 3 * DAY_S), ("new", 2 * DAY_S - 1)):
         stored(takes.directory / f"lab/{name}.lcmlog", 10, age_s)
     stored(takes.directory / "hall/old.lcmlog", 10, 5 * DAY_S)
@@ -137,20 +136,138 @@ def test_c3d_files_go_with_their_take_only(takes: TakesFolder, caplog: pytest.Lo
     assert {path.name for path in lab.iterdir()} == kept
 
 
-def test_a_corrected_clock_makes_no_take_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_corrected_clock_makes_no_take_old(tmp_path: Path) -> None:
     """A computer without a battery writes takes in 1970 until it has found a time server."""
-    now_s, clock = 1000.0, Clock()
-    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: now_s))
+    wall, clock = Clock(1000.0), Clock()
     takes = TakesFolder(tmp_path)
-    watch = watch_of(takes, clock)
+    watch = watch_of(takes, clock, wall)
     assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
-    stored(tmp_path / "lab/walk.lcmlog", 1, NOW_S - now_s)
+    stored(tmp_path / "lab/walk.lcmlog", 1, NOW_S - wall())
     assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == ["lab/walk"]
-    now_s = NOW_S
+    wall.now_s = NOW_S
     clock.now_s += DAY_S - 1
     assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == ["lab/walk"]
     clock.now_s += 2
     assert left(takes, 1000, max_age_s=DAY_S, watch=watch) == []
+
+
+def test_takes_of_a_clock_that_was_behind_are_not_old_after_a_restart(takes: TakesFolder) -> None:
+    """Without a battery, a computer goes on at the time of its last shutdown until it finds a time server."""
+    clock, wall = Clock(), Clock(NOW_S - 10 * DAY_S)
+    watch = watch_of(takes, clock, wall)
+    left(takes, 10**6, max_age_s=DAY_S, watch=watch)
+    take = stored(takes.directory / "lab/new.lcmlog", 1, 10 * DAY_S)
+    copied = stored(takes.directory / "lab/copied.lcmlog", 1, 20 * DAY_S)
+    left(takes, 10**6, max_age_s=DAY_S, watch=watch)
+    for step_s in (0, 10 * DAY_S, 3650 * DAY_S, -3650 * DAY_S, 0):  # the clock may also be wrong for a moment
+        clock.now_s += 100
+        wall.now_s += step_s + 100
+        assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == ["lab/copied", "lab/new"]
+    assert take.stat().st_mtime == NOW_S
+    assert copied.stat().st_mtime == NOW_S - 20 * DAY_S
+    for each in (clock, wall):
+        each.now_s += 4000
+    left(takes, 10**6, max_age_s=DAY_S, watch=watch)
+    assert left(takes, 10**6, max_age_s=DAY_S, watch=watch_of(takes, clock, wall)) == ["lab/new"]
+
+
+@pytest.mark.parametrize("ahead_s", [2 * DAY_S, 30 * DAY_S, 3650 * DAY_S])
+def test_a_clock_that_is_ahead_at_the_start_deletes_nothing(takes: TakesFolder, ahead_s: float) -> None:
+    """One start with a wrong date must not cost all takes, neither before nor after a correction."""
+    for age_s in (100, 200, 3 * DAY_S):
+        stored(takes.directory / f"lab/{age_s:g}.lcmlog", 1, age_s)
+    wall, clock = Clock(NOW_S + ahead_s), Clock()
+    watch = watch_of(takes, clock, wall)
+    young = ["lab/100", "lab/200"]
+    for after_s in (0, 1, 1800, 1700):
+        clock.now_s += after_s
+        wall.now_s += after_s
+        assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == young
+    stored(takes.directory / "lab/new.lcmlog", 1, -ahead_s)  # a take with the wrong date proves nothing
+    assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == [*young, "lab/new"]
+    assert left(takes, 10**6, max_age_s=DAY_S, watch=watch_of(takes, clock, wall)) == [*young, "lab/new"]
+    wall.now_s -= ahead_s
+    assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == [*young, "lab/new"]
+
+
+@pytest.mark.parametrize(("days", "is_kept"), [(30, False), (32, True)])
+def test_after_an_hour_the_clock_is_believed_unless_it_is_ahead_by_more_than_a_month(
+    takes: TakesFolder, caplog: pytest.LogCaptureFixture, days: float, is_kept: bool
+) -> None:
+    """After holidays, old takes are deleted; after years, a person has to say that the clock is right."""
+    stored(takes.directory / FILE, 0, days * DAY_S)
+    stored(takes.directory / "lab/old.lcmlog", 1, (days + 0.5) * DAY_S)
+    clock, wall = Clock(), Clock(NOW_S)
+    watch = watch_of(takes, clock, wall)
+    assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == ["lab/old"]
+    for each in (clock, wall):
+        each.now_s += 3601
+    for _ in range(2):
+        assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == ["lab/old"] * is_kept
+    assert len(caplog.records) == is_kept
+    os.utime(takes.directory / FILE, (NOW_S, NOW_S))
+    assert left(takes, 10**6, max_age_s=DAY_S, watch=watch) == []
+
+
+def test_a_restart_before_the_clock_is_corrected_makes_no_take_old(takes: TakesFolder) -> None:
+    """The folder knows that its clock is behind, and dates what is recorded meanwhile."""
+    stored(takes.directory / FILE, 0, 0)
+    clock, wall = Clock(), Clock(NOW_S - 30 * DAY_S)
+    watch = watch_of(takes, clock, wall)
+    left(takes, 10**6, max_age_s=DAY_S, watch=watch)
+    take = stored(takes.directory / "lab/new.lcmlog", 1, 30 * DAY_S)
+    for _ in range(4):
+        left(takes, 10**6, max_age_s=DAY_S, watch=watch)
+        for each in (clock, wall):
+            each.now_s += 1000
+    assert take.stat().st_mtime == NOW_S
+    assert left(takes, 10**6, max_age_s=DAY_S) == ["lab/new"]
+
+
+def test_nobody_knows_the_age_of_a_take_from_before_there_was_a_gateway(takes: TakesFolder) -> None:
+    """It was written while the clock was not set, and the gateway ended before that was corrected."""
+    stored(takes.directory / FILE, 0, 0)
+    stored(takes.directory / "lab/1970.lcmlog", 1, NOW_S - 1000)
+    stored(takes.directory / "lab/2020.lcmlog", 1, NOW_S - 1_577_836_801)
+    assert left(takes, 10**6, max_age_s=DAY_S) == ["lab/1970"]
+
+
+def test_a_time_of_the_folder_that_is_ahead_makes_no_take_old(takes: TakesFolder) -> None:
+    """A clock that is ahead by less than a month may have been believed before it was corrected."""
+    stored(takes.directory / FILE, 0, -20 * DAY_S)
+    stored(takes.directory / "lab/new.lcmlog", 1, 100)
+    assert left(takes, 10**6, max_age_s=DAY_S) == ["lab/new"]
+
+
+def test_what_is_recorded_now_is_newer_than_takes_from_the_future(takes: TakesFolder) -> None:
+    """Otherwise, each new take would be deleted before them."""
+    stored(takes.directory / "lab/future.lcmlog", 1000, -9e8)
+    clock = Clock()
+    watch = watch_of(takes, clock)
+    left(takes, 10**6, watch=watch)
+    stored(takes.directory / "lab/new.lcmlog", 1000, 0)
+    left(takes, 10**6, watch=watch)
+    clock.now_s += 10
+    assert left(takes, 1000, watch=watch) == ["lab/new"]
+
+
+def test_takes_from_the_future_make_room_for_new_ones(takes: TakesFolder) -> None:
+    """After an empty battery, all takes are newer than the clock; a new one must not end as "folder full"."""
+    for name, age_s in (("a", -9e8), ("b", -2.0), ("c", -1e6)):
+        stored(takes.directory / f"lab/{name}.lcmlog", 1000, age_s)
+    clock, wall = Clock(), Clock(NOW_S)
+    watch = watch_of(takes, clock, wall)
+    left(takes, 10**6, watch=watch)
+    running = stored(takes.directory / "lab/running.lcmlog", 1000, 0)
+    clock.now_s += 10
+    assert left(takes, 3000, "lab/running", watch=watch) == ["lab/a", "lab/b", "lab/running"]
+    stored(running, 2000, 0)
+    assert left(takes, 2000, "lab/running", watch=watch) == ["lab/b", "lab/running"]  # b may be new
+    stored(takes.directory / "lab/d.lcmlog", 1000, 0)
+    assert left(takes, 4000, "lab/running", watch=watch) == ["lab/b", "lab/d", "lab/running"]
+    for each in (clock, wall):
+        each.now_s += 10
+    assert left(takes, 3000, watch=watch) == ["lab/d", "lab/running"]
 
 
 # When the folder is checked ------------------------------------------------------------------
@@ -173,7 +290,7 @@ class Watched:
         self.clock = Clock()
         self.thread = SlowThread("slow")
         self.settings = settings_in(directory, **settings)
-        self.watch = FolderWatch(self.settings, Host(self.clock, lambda _name: self.thread))
+        self.watch = FolderWatch(self.settings, Host(self.clock, Clock(NOW_S), lambda _name: self.thread))
         self.num_checks = 0
         self._open = self.watch.folder.open
         self.watch.folder.open = self._open_slowly  # type: ignore[method-assign]
@@ -225,10 +342,10 @@ def test_a_disk_that_does_not_respond_is_a_problem(watched: Watched) -> None:
     assert "does not respond" in watched.watch.problem
 
 
-def test_the_limits_of_the_settings_are_applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_limits_of_the_settings_are_applied(tmp_path: Path) -> None:
     """Days and bytes mean what they say."""
     watched = Watched(tmp_path, max_age_days=2, max_bytes=1024 * 1024)
-    monkeypatch.setattr(disk, "time", SimpleNamespace(time=lambda: NOW_S))
+    stored(tmp_path / FILE, 0, 0)
     old = stored(tmp_path / "lab/a.lcmlog", 10, 2.1 * DAY_S)
     new = stored(tmp_path / "lab/b.lcmlog", 1024 * 1024 + 5, 1.9 * DAY_S)
     watched.check()

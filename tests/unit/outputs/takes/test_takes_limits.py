@@ -34,7 +34,7 @@ def host_with(folder_thread: FolderThread) -> Host:
         return folder_thread if name == "takes-folder" else NoThread(name)
 
     still = still_host(Clock())
-    return Host(still.monotonic, thread, still.writer)
+    return Host(still.monotonic, still.wall, thread, still.writer)
 
 
 async def test_a_take_ends_when_the_folder_is_full_and_nothing_can_be_deleted(tmp_path: Path) -> None:
