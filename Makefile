@@ -315,7 +315,8 @@ build/release-packages/complete: requirements-view.txt $(RELEASE_TOOLS)
 # Python 3.11 cannot start with LC_ALL=C if a path has letters that ASCII lacks. So the paths of the sources are relative.
 define install_sources
 $(BIN)/pip install --quiet --editable . $(1); \
-    printf '../../../..\n../../../../lcm_types\n' | tee .venv/lib/python3.*/site-packages/_rtc3d_gateway.pth >/dev/null
+    for packages in .venv/lib/python3.*/site-packages; do \
+        printf '../../../..\n../../../../lcm_types\n' >$$packages/_rtc3d_gateway.pth; done
 endef
 
 # What running needs, with the live view, in the versions of requirements-view.txt; .venv/installed adds the

@@ -19,7 +19,8 @@ def make(clone: Path, target: str, pip: str) -> subprocess.CompletedProcess[str]
     """Run make with a Python whose venv has this script as its pip."""
     python = clone / "python"
     python.write_text(
-        f"#!/bin/sh\nmkdir -p .venv/bin\nprintf '#!/bin/sh\\n{pip}\\n' >.venv/bin/pip\n"
+        "#!/bin/sh\nmkdir -p .venv/bin .venv/lib/python3.11/site-packages\n"
+        f"printf '#!/bin/sh\\n{pip}\\n' >.venv/bin/pip\n"
         "printf '#!/bin/sh\\n' >.venv/bin/python\nchmod +x .venv/bin/*"
     )
     python.chmod(0o755)
