@@ -164,3 +164,12 @@ def system_reason(error: OSError) -> str:
     if error.errno is not None and error.errno > 0:  # those of getaddrinfo are negative
         return os.strerror(error.errno)
     return error.strerror or str(error)
+
+
+def raise_unless_defect(error: BaseException) -> None:
+    """Raise ``error`` again if it ends the program or a task. A panic of a library in Rust does not.
+
+    Such a panic (PyO3's PanicException, one class for each library) is a BaseException, and no Exception.
+    """
+    if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+        raise error

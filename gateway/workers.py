@@ -136,7 +136,8 @@ class WorkerThread:
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
         """Queue ``call``, which holds ``num_bytes``; return False if there is no room, or after ``close``.
 
-        ``call`` must not raise. If no thread can be started, it waits for the next call to start one.
+        What ``call`` raises is reported as that of any thread, and the next call starts another one. If no
+        thread can be started, it waits for the next call to start one.
         """
         with self._changed:
             if self._is_closed or not self._room.take(num_bytes):
@@ -202,11 +203,19 @@ class WorkerThread:
     # In the thread.
 
     def _run(self) -> None:
-        while (call := self._next()) is not None:
-            self._began_s = time.monotonic()
-            call()
-            self._began_s = None
-            del call  # or what it holds would stay in memory until the next call
+        try:
+            while (call := self._next()) is not None:
+                self._began_s = time.monotonic()
+                call()
+                self._began_s = None
+                del call  # or what it holds would stay in memory until the next call
+        except BaseException:
+            # Without memory, anything may raise. The next call starts another thread.
+            with self._changed:
+                self._began_s = None
+                self._is_running = False
+                self._changed.notify_all()
+            raise
 
     def _next(self) -> Callable[[], None] | None:
         """Wait for the next call; None if there is none, so that the thread ends."""

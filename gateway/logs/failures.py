@@ -16,6 +16,7 @@ from contextvars import ContextVar
 from time import monotonic
 from typing import Final, TypeVar
 
+from gateway.errors import raise_unless_defect
 from gateway.logs.safe_text import safe_text
 
 MAX_REPEATS: Final = 5
@@ -252,7 +253,8 @@ class DefectLog:
         """Return what ``call`` returns. If it raises, log that and return ``otherwise``: others continue."""
         try:
             return call()
-        except Exception as defect:  # noqa: BLE001 - see above
+        except BaseException as defect:  # noqa: BLE001 - see above
+            raise_unless_defect(defect)
             self.log(defect)
             return otherwise
 

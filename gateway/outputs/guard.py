@@ -5,7 +5,7 @@ from functools import partial
 from logging import getLogger
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from gateway.errors import OutputError, QueryError
+from gateway.errors import OutputError, QueryError, raise_unless_defect
 from gateway.logs.failures import DefectLog, defect_text
 from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.topics import Topic
@@ -68,7 +68,8 @@ class GuardedOutput(Output):
         """Make a call that is not made again if it fails."""
         try:
             return call(*args, **kwargs)
-        except Exception as defect:  # noqa: BLE001 - other outputs continue
+        except BaseException as defect:  # noqa: BLE001 - other outputs continue
+            raise_unless_defect(defect)
             self.defects.log(defect)
             self._damage = self._damage or defect_text(defect)
             return otherwise
@@ -113,7 +114,8 @@ class GuardedOutput(Output):
             )
         try:
             return self.output.health()
-        except Exception as defect:  # noqa: BLE001 - other outputs continue
+        except BaseException as defect:  # noqa: BLE001 - other outputs continue
+            raise_unless_defect(defect)
             self.defects.log(defect)
             return OutputHealth(False, f"{defect_text(defect)}; report this with the log")
 
@@ -126,7 +128,8 @@ class GuardedOutput(Output):
         """See Output. After a defect, the recording starts nevertheless."""
         try:
             return await self.output.follow_recording(source, start=start, name=name)
-        except Exception as defect:  # noqa: BLE001 - other outputs continue
+        except BaseException as defect:  # noqa: BLE001 - other outputs continue
+            raise_unless_defect(defect)
             self.defects.log(defect)
             return {}
 
@@ -136,7 +139,8 @@ class GuardedOutput(Output):
             return await self.output.recorded_messages(source, key, wanted)
         except QueryError:
             raise
-        except Exception as defect:  # noqa: BLE001 - there are the messages in memory
+        except BaseException as defect:  # noqa: BLE001 - there are the messages in memory
+            raise_unless_defect(defect)
             self.defects.log(defect)
             return None
 
@@ -144,7 +148,8 @@ class GuardedOutput(Output):
         """See Output."""
         try:
             await self.output.stop_queries()
-        except Exception as defect:  # noqa: BLE001 - the output is closed nevertheless
+        except BaseException as defect:  # noqa: BLE001 - the output is closed nevertheless
+            raise_unless_defect(defect)
             self.defects.log(defect)
 
     @property
@@ -174,7 +179,8 @@ class _GuardedPublisher:
     def wanted(self) -> bool:
         try:
             return bool(self._publisher.wanted)
-        except Exception as defect:  # noqa: BLE001 - other outputs continue
+        except BaseException as defect:  # noqa: BLE001 - other outputs continue
+            raise_unless_defect(defect)
             self._defects.log(defect)
             return True
 

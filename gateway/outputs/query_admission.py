@@ -156,7 +156,7 @@ class QueryDefects:
         self._logger = logger
         self._logs: dict[str, DefectLog] = {}  # by source
 
-    def log(self, source: str, defect: Exception, query: str) -> QueryError:
+    def log(self, source: str, defect: BaseException, query: str) -> QueryError:
         """Log the defect that a query about ``source`` met; return the error for its peer."""
         self._logs.setdefault(source, DefectLog(self._logger, source)).log(defect, text=query)
         return QueryError(f"a defect in the gateway: {defect!r}", code="defect")

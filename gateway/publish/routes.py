@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import rtc3d
 
-from gateway.errors import OutputError
+from gateway.errors import OutputError, raise_unless_defect
 from gateway.logs.losses import Losses
 from gateway.messages.encode import MESSAGE_TYPES, Stamp, lcm_type_name, message_timestamp_us, with_sequence
 from gateway.messages.history import MessageHistory
@@ -93,7 +93,7 @@ class OutputRoute:
             takes_frames=self.frame_route is not None,
         )
 
-    def count_loss(self, error: Exception, stamp: Stamp | None) -> None:
+    def count_loss(self, error: BaseException, stamp: Stamp | None) -> None:
         """Count a message that the output did not accept, of the frame with ``stamp`` or of none."""
         cause = error.cause if isinstance(error, OutputError) else type(error).__name__
         text = str(error) if isinstance(error, OutputError) else f"{cause}: {error}"
@@ -159,7 +159,8 @@ class TopicRoute:
             message = self._number(message)
         try:
             self._publish(message)
-        except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
+        except BaseException as error:  # noqa: BLE001 - a defect in one output must not stop the others
+            raise_unless_defect(error)
             self._output_route.count_loss(error, stamp)
         else:
             self._sent.messages += 1
@@ -209,7 +210,8 @@ class FrameRoute:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""
         try:
             self.publisher.publish(frame, stamp, wanted)
-        except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
+        except BaseException as error:  # noqa: BLE001 - a defect in one output must not stop the others
+            raise_unless_defect(error)
             self._output_route.count_loss(error, stamp)
         else:
             self._sent.messages += 1

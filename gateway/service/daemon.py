@@ -153,10 +153,10 @@ class Daemon:
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Log what a callback or a forgotten task has raised, each defect once (see DefectLog)."""
         defect = context.get("exception")
-        if isinstance(defect, Exception):
-            self._defects.log(defect)
-        else:
+        if defect is None:
             loop.default_exception_handler(context)
+        else:
+            self._defects.log(defect)
 
     async def _notify_systemd(self) -> None:
         """Notify systemd of the start, then periodically of the status.

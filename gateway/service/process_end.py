@@ -83,10 +83,19 @@ class Signals:
 
     def _run(self) -> None:
         while self._next() == signal.SIGHUP:
-            self._hang_up()
-        self._request_stop()
+            with suppress(Exception):  # the next signal may come when there is memory again
+                self._hang_up()
+        try:
+            self._end()
+        finally:  # whatever a process without memory, or without threads, raises
+            os._exit(0)
+
+    def _end(self) -> None:
+        """Request the stop, and return when its time is over."""
         reason = f"it did not stop within {STOP_S:g} s"
         deadline_s = time.monotonic() + STOP_S
+        with suppress(RuntimeError, MemoryError):  # the event loop has ended, or cannot be told
+            self._request_stop()
         with suppress(TimeoutError):
             while self._next(max(0.001, deadline_s - time.monotonic())) == signal.SIGHUP:
                 pass
@@ -94,7 +103,6 @@ class Signals:
         message = threading.Thread(target=self._log, args=(reason,), name="stop-log", daemon=True)
         message.start()
         message.join(_LOG_S)
-        os._exit(0)
 
     def _next(self, timeout_s: float | None = None) -> int:
         """Return the number of the next signal; raise TimeoutError if there is none in time."""

@@ -11,7 +11,7 @@ import rtc3d
 from gateway.c3d_files.receiving import FileReceiver, SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import LinkError, QueryError
+from gateway.errors import LinkError, QueryError, raise_unless_defect
 from gateway.logs.failures import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.decode import C3D
 from gateway.messages.encode import NOT_PUBLISHED
@@ -185,7 +185,8 @@ class Source:
             ):
                 try:
                     work()
-                except Exception as defect:  # noqa: BLE001 - the next status may succeed
+                except BaseException as defect:  # noqa: BLE001 - the next status may succeed
+                    raise_unless_defect(defect)
                     self.history.defects.log(defect)
 
     def _check_logs(self) -> None:
@@ -312,7 +313,8 @@ class Source:
         for output, _ in self.fan_out.outputs:
             try:
                 output.announce_file(self.name, ServerFile(stored.path, stored.num_bytes))
-            except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
+            except BaseException as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
+                raise_unless_defect(defect)
                 self.history.defects.log(defect)
 
     async def _last_c3d(self) -> Answer:

@@ -47,6 +47,23 @@ async def test_the_exception_of_a_call_is_raised_and_later_calls_are_made() -> N
     assert await worker.run(lambda: "later") == "later"
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+async def test_a_thread_that_died_is_replaced_for_the_next_call() -> None:
+    """Without memory, an offered call raises MemoryError, and nothing was sent or answered after that."""
+    worker = WorkerThread("test")
+    made = threading.Event()
+
+    def fail() -> None:
+        made.set()
+        raise MemoryError
+
+    assert worker.offer(fail)
+    await asyncio.to_thread(made.wait)
+    await wait_until_async(lambda: not worker._is_running)
+    assert worker.call_age_s == 0
+    assert await worker.run(lambda: "later") == "later"
+
+
 async def test_the_age_of_a_call_is_that_of_the_one_in_progress() -> None:
     worker, begun, released = WorkerThread("test"), threading.Event(), threading.Event()
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import zenoh
 
-from gateway.errors import OutputError
+from gateway.errors import OutputError, raise_unless_defect
 from gateway.logs.failures import DefectLog
 from gateway.messages.decode import decode
 from gateway.messages.ros2 import DiagnosticStatus, diagnostic_array, ros_stamp
@@ -77,7 +77,8 @@ class DiagnosticsPublisher:
             self._topic.put(diagnostic_array(ros_stamp(self._previous.utime), statuses), time.time_ns())
         except zenoh.ZError as error:
             logger.debug("ros2: publishing diagnostics: %s", zenoh_reason(error))
-        except Exception as defect:  # noqa: BLE001 - the sending thread continues
+        except BaseException as defect:  # noqa: BLE001 - the sending thread continues
+            raise_unless_defect(defect)
             self._defects.log(defect)
 
     def close(self) -> None:

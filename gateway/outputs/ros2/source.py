@@ -16,7 +16,7 @@ import zenoh
 from gateway.descriptions.force_plates import units_of
 from gateway.descriptions.labels import describe
 from gateway.descriptions.source_frame import unknown_unit_text
-from gateway.errors import OutputError
+from gateway.errors import OutputError, raise_unless_defect
 from gateway.logs.failures import DefectLog
 from gateway.logs.losses import Losses
 from gateway.messages.encode import Stamp
@@ -205,7 +205,8 @@ class RosSource:
             if not self._router.is_cut_off:  # as it is when the gateway stops
                 text = f"Zenoh did not take a message for ROS 2: {zenoh_reason(error)}"
                 self.losses.lost("put failed", text)
-        except Exception as defect:  # noqa: BLE001 - the other sources continue
+        except BaseException as defect:  # noqa: BLE001 - the other sources continue
+            raise_unless_defect(defect)
             self._defects.log(defect)
             self.losses.lost(type(defect).__name__, f"a frame is not published for ROS 2: {defect}")
 

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 
 import zenoh
 
-from gateway.errors import QueryError
+from gateway.errors import QueryError, raise_unless_defect
 from gateway.logs.failures import log_fields
 from gateway.logs.losses import Losses
 from gateway.logs.safe_text import safe_text
@@ -198,7 +198,8 @@ class ZenohAnswers:
                 outcome = await self._answers(question)
         except QueryError as error:
             outcome = error
-        except Exception as defect:  # noqa: BLE001 - every query gets a reply
+        except BaseException as defect:  # noqa: BLE001 - every query gets a reply
+            raise_unless_defect(defect)
             outcome = self._defects.log(question.source, defect, f"query {safe_text(question.selector)}")
         finally:
             with self._lock:
@@ -291,7 +292,8 @@ class ZenohAnswers:
                 except QueryError as error:
                     result = error.code
                     _reply_error(query, error)
-        except Exception as problem:  # noqa: BLE001 - the thread continues
+        except BaseException as problem:  # noqa: BLE001 - the thread continues
+            raise_unless_defect(problem)
             result = "defect"
             self._defects.log(source, problem, f"query {safe_text(str(query.key_expr))}")
         finally:

@@ -17,6 +17,7 @@ from typing import Any, Final
 import zenoh
 
 from gateway.descriptions.labels import describe, event_labels
+from gateway.errors import raise_unless_defect
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, MAX_JSON_SOURCE_BYTES, decode, json_text
 from gateway.messages.history import utime_of
@@ -245,7 +246,8 @@ class JsonPublisher:
         except zenoh.ZError as error:
             if self._publisher is not None:
                 self._count_loss("put failed", f"Zenoh did not take {self._key}: {zenoh_reason(error)}")
-        except Exception as error:
+        except BaseException as error:
+            raise_unless_defect(error)
             self._count_loss("json failed", f"a message for {self._key} cannot be converted: {error!r}")
             logger.debug("zenoh: %s", self._key, exc_info=error)
 

@@ -12,7 +12,8 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
-from gateway.logs.failures import DefectLog
+from gateway.errors import raise_unless_defect
+from gateway.logs.failures import DefectLog, defect_text
 from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import Topic, zenoh_key
@@ -385,6 +386,11 @@ class ZenohOutput(Output):
             if not self._has_stopped:
                 text = f"Zenoh did not take parameters or an announcement: {zenoh_reason(error)}"
                 self._losses[source].lost("put failed", text, frames=0)
+        except BaseException as defect:  # noqa: BLE001 - the thread continues
+            raise_unless_defect(defect)
+            self._defects.log(defect)
+            text = f"Zenoh did not take parameters or an announcement: {defect_text(defect)}"
+            self._losses[source].lost("put failed", text, frames=0)
 
 
 def _facts(parameters: ServerParameters) -> dict[str, Any]:

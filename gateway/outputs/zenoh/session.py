@@ -6,12 +6,13 @@
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
 
-from gateway.errors import OutputError
+from gateway.errors import OutputError, raise_unless_defect
 from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.outputs.contract import OutputHealth
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_reason
@@ -30,6 +31,13 @@ _MAX_CLOSING: Final = 4
 
 After hundreds of routers had connected and vanished, closing took 100 s. Until then, a session holds 15 MiB.
 """
+
+_END_OF_TIME_S: Final = 2**32
+"""Zenoh's time stamps end here, on 2106-02-07: a put at a later time panics."""
+
+_WRONG_CLOCK: Final = (
+    "the clock of this computer is beyond 2106-02-07, which Zenoh cannot express: set the clock"
+)
 
 _closers: Final[set[threading.Thread]] = set()  # of all outputs
 
@@ -82,6 +90,7 @@ class SessionHolder:
         self._declare = declare
         self._on_link = on_link
         self._on_link_lost = on_link_lost
+        self._is_clock_wrong = False
         self._num_transports = 0
         self._counting = threading.Lock()  # of _num_transports, which several threads of Zenoh change
         self._problem = texts.not_open
@@ -107,7 +116,8 @@ class SessionHolder:
                 texts = self._texts
                 self._problem = f"{texts.cannot_open}: {zenoh_reason(error)}; {texts.remedy}"
                 self._failures.failed(self._problem)
-            except Exception as defect:  # noqa: BLE001 - the next try may succeed
+            except BaseException as defect:  # noqa: BLE001 - the next try may succeed
+                raise_unless_defect(defect)
                 self._problem = defect_text(defect)
                 self._defects.log(defect)
             else:
@@ -147,7 +157,8 @@ class SessionHolder:
         self._update()
 
     def _update(self) -> None:
-        self.is_cut_off = self.session is None or self.lacks_router
+        self._is_clock_wrong = time.time() >= _END_OF_TIME_S
+        self.is_cut_off = self.session is None or self.lacks_router or self._is_clock_wrong
         self._on_link()
 
     @property
@@ -160,11 +171,15 @@ class SessionHolder:
         """Whether messages can be sent, and if not, what to do."""
         if self.session is None:
             return OutputHealth(False, self._problem)
+        if self._is_clock_wrong:
+            return OutputHealth(False, _WRONG_CLOCK)
         return OutputHealth(False, self._texts.no_router) if self.lacks_router else _HEALTHY
 
     @property
     def refusal(self) -> OutputError:
         """The error for a message that cannot be sent."""
+        if self.session is not None and self._is_clock_wrong:
+            return OutputError(_WRONG_CLOCK, cause="put failed")
         if self.session is not None and self.lacks_router:
             return OutputError(self._texts.no_router, cause="no router")
         # The session may be there already, and what is declared on it not yet.

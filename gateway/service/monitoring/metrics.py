@@ -5,6 +5,7 @@ The data path does not know about them. Label values come from the configuration
 bounded.
 """
 
+import contextlib
 import platform
 import resource
 import time
@@ -86,6 +87,8 @@ _HELP: Final = {
 _STREAM_DROP_CAUSES: Final = (
     *("frame rejected", "unknown component", "skipped while behind", "not sent by the server", "C3D file"),
 )
+
+_STATM: Final = Path("/proc/self/statm")
 
 Labels = tuple[str, ...]
 Sample = tuple[Labels, float]
@@ -235,11 +238,12 @@ class GatewayMetrics(Collector):
         yield InfoMetricFamily(f"{METRIC_PREFIX}build", "Versions; always 1.", self._build)
         # prometheus_client's own collector reads /proc/stat, which the service's sandbox hides.
         cpu_s = time.process_time()
-        memory_bytes = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
         yield CounterMetricFamily("process_cpu_seconds", "CPU time of the gateway.", cpu_s)
-        yield GaugeMetricFamily(
-            "process_resident_memory_bytes", "Resident memory of the gateway.", memory_bytes
-        )
+        with contextlib.suppress(OSError):  # no file can be opened, which the health says
+            memory_bytes = int(_STATM.read_text().split()[1]) * resource.getpagesize()
+            yield GaugeMetricFamily(
+                "process_resident_memory_bytes", "Resident memory of the gateway.", memory_bytes
+            )
 
 
 def _loss_counters(

@@ -146,6 +146,25 @@ def test_a_stop_in_time_has_its_own_status() -> None:
         assert process.wait(30) == 5
 
 
+@pytest.mark.parametrize("error", ["MemoryError", "RuntimeError"])
+def test_a_process_that_can_neither_be_told_nor_start_a_thread_ends_nevertheless(error: str) -> None:
+    """With an address space that was full, SIGTERM killed only the thread that receives signals."""
+    code = f"""
+def fail(*_):
+    raise {error}
+Signals(fail, fail, list)
+threading.Thread.start = fail
+print(flush=True)
+time.sleep(60)
+"""
+    with running(code) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+
+
 def test_a_log_that_blocks_does_not_delay_the_deadline() -> None:
     code = """
 class Blocked(logging.Handler):

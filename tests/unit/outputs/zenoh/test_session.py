@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from unittest.mock import Mock
 
@@ -186,3 +187,18 @@ def test_a_peer_needs_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not lab.holder.is_cut_off
     lab.holder.maintain()
     assert lab.holder.health.connected
+
+
+def test_beyond_the_time_that_zenoh_can_express_nothing_is_sent_until_the_clock_is_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A put at a time after 2106-02-07 panics, and writes that to stderr each time."""
+    lab = Lab(monkeypatch, mode="peer")
+    lab.open()
+    for now_s, is_right in ((2**32 - 1, True), (2**32, False), (1.7e9, True)):
+        monkeypatch.setattr(time, "time", lambda now_s=now_s: now_s)
+        lab.holder.maintain()
+        assert lab.holder.health.connected is is_right
+        assert lab.holder.is_cut_off is not is_right
+        if not is_right:
+            assert lab.holder.refusal.cause == "put failed"

@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gateway.rtc3d.client_protocol import ProtocolState
 from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.service.gateway import Gateway
+from gateway.service.monitoring import metrics
 from gateway.service.monitoring.metrics import GatewayMetrics
 from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay
 from gateway.stream.state import StreamState
@@ -186,6 +188,17 @@ async def test_outputs_loop_delay_versions_and_the_process_are_reported(lab: Lab
     samples = {sample.name: sample.value for family in lab.families() for sample in family.samples}
     assert samples["process_cpu_seconds_total"] > 0
     assert samples["process_resident_memory_bytes"] > 1_000_000
+
+
+@pytest.mark.interpreted
+async def test_the_page_is_there_without_the_memory_if_no_file_can_be_opened(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """With 64 files at most, "defect in the gateway" was logged instead of what the health says."""
+    monkeypatch.setattr(metrics, "_STATM", tmp_path / "absent")
+    names = {sample.name for family in lab.families() for sample in family.samples}
+    assert "process_cpu_seconds_total" in names
+    assert "process_resident_memory_bytes" not in names
 
 
 async def test_texts_from_the_network_add_no_series(lab: Lab) -> None:
