@@ -121,6 +121,7 @@ class _Further:
         """Connect as soon as the earlier connection is closed."""
         self.opened_s = _now_s()
         self.failures = self.waiting = self.quiet = 0
+        self._bytes_in = self.stream.status.bytes_in
         self.task = tasks.create_task(self._run_after(self.task))
 
     def stop(self, reason: str) -> None:
@@ -201,6 +202,7 @@ class AutomaticStreams(Listener):
         if len(self._plan.groups) > 1 and not request.components:
             self._use_one_connection(_NO_NAMES, is_final=True)
         if stream is self._first:
+            self._waiting = 0
             self._start_further()
         elif stream.settings.components in self._further:
             self._further[stream.settings.components].opened_s = _now_s()
@@ -292,6 +294,8 @@ class AutomaticStreams(Listener):
             self._waiting += 1
             if self._waiting >= _MAX_QUIET_CHECKS:
                 self._use_one_connection("the server sends frames only on the second connection")
+        else:
+            self._waiting = 0
         if all(each.age_s > _SUSPICIOUS_S + self._stall_timeout_s for each in further):
             self._failures = 0
 

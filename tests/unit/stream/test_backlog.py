@@ -32,6 +32,7 @@ class Subscriber:
 
     def __init__(self, speed: float | None = 2.0) -> None:
         self.now_s = 100.0
+        self.arrived_us = 0
         self.costs_s = 0.0
         """How long it takes to publish one frame."""
         self.published: list[tuple[int, float]] = []
@@ -46,12 +47,13 @@ class Subscriber:
 
     def _publish(self, published: list[Frame], utime: int, steady_us: int) -> None:
         assert utime == UTIME
-        assert steady_us <= round(1e6 * self.now_s)
+        assert steady_us == self.arrived_us
         for each in published:
             self.published.append((each.number_and_timestamp[0], self.now_s - 100.0))
             self.now_s += self.costs_s
 
     def arrive(self, arrived: list[Frame]) -> None:
+        self.arrived_us = self.read_clocks()[1]
         self.backlog.receive(arrived, *self.read_clocks())
 
     def run(self, late_s: float = 0.0) -> None:
@@ -120,6 +122,20 @@ def test_a_pace_ends_after_half_a_second_without_a_backlog(pause_s: float, *, co
     subscriber.backlog._publish_due()
     late_ms = 15  # what a continued pace makes up for
     assert (len(subscriber.numbers) - 5 > late_ms) is continues
+
+
+def test_a_backlog_after_a_pause_does_not_wait_for_the_time_of_the_pause() -> None:
+    """The time stamps before the pause say nothing about when its second frame is due."""
+    subscriber = Subscriber(speed=1.0)
+    subscriber.arrive(frames(10))
+    subscriber.run()
+    subscriber.now_s = 200.0
+    subscriber.published.clear()
+    subscriber.arrive(frames(10, first_ms=100_000))
+    subscriber.run()
+    assert subscriber.times_ms == pytest.approx(
+        [100_000 + max(0, number - 1) for number in range(10)], abs=0.1
+    )
 
 
 def test_a_stream_as_fast_as_the_gateway_is_never_throttled() -> None:
