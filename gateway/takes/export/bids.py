@@ -162,7 +162,7 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
         rows = number_rows(rounded(values), NOT_AVAILABLE.encode(), b"\t")
         file.write(b"\n".join([*rows, b""]))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
-    note_grid(job, measurement)
+    note_grid(job, measurement, path.name)
     note_missing(job, path, measurement, 0, grid.num_rows)
     channels = _channels(job, measurement, conversions)
     write_table(job, data_set.path(recording.label, run, "channels.tsv"), _Channel._fields, channels)

@@ -177,10 +177,13 @@ class Measurement(NamedTuple):
             return None
         # The first frame within the measurement decides: differences of the clocks' rates cannot add up.
         anchor = next((index for index in range(first, last + 1) if times[index] >= base_times[0]), last)
-        near = int(_nearest(base_times, times[anchor : anchor + 1])[0])
+        # Several of them, because single ones are late.
+        anchors = slice(anchor, max(anchor + 1, min(anchor + _COMPARED * rows_per_row, last + 1)))
+        near = _nearest(base_times, times[anchors])
         period_us = _SECOND_US / (self.grid.rate_hz * rows_per_row)
-        distance = round(float(times[anchor] - base_times[near]) / period_us)
-        return int(self.grid.rows[near]) * rows_per_row + distance - int(grid.rows[anchor])
+        distances = (times[anchors] - base_times[near]) / period_us
+        first_rows = self.grid.rows[near].astype(np.int64) * rows_per_row + distances - grid.rows[anchors]
+        return round(float(np.median(first_rows)))
 
 
 def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list[tuple[Measurement, Path]]:
@@ -204,9 +207,10 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
     named = []
     for name, found in by_source.items():
         for number, measurement in enumerate(found, start=1):
-            note_grid(job, measurement)
             parts = (name if len(by_source) > 1 else "", str(number) if len(found) > 1 else "")
-            named.append((measurement, job.file_name(*parts)))
+            path = job.file_name(*parts)
+            note_grid(job, measurement, path.name)
+            named.append((measurement, path))
     return named
 
 
@@ -219,12 +223,45 @@ def check_number(job: ExportJob, num_measurements: int) -> None:
         )
 
 
-def note_grid(job: ExportJob, measurement: Measurement) -> None:
-    """Report that frames have the times of a grid."""
-    job.note(
-        "times of capture and frame numbers replaced by a regular grid",
-        amount=f"{measurement.grid.rate_hz:.6g} Hz",
-    )
+def note_grid(job: ExportJob, measurement: Measurement, file: str) -> None:
+    """Report that frames have the times of a grid, and by how much these are wrong."""
+    grid = measurement.grid
+    job.note("times of capture and frame numbers replaced by a regular grid", amount=f"{grid.rate_hz:.6g} Hz")
+    _note_repeated(job, measurement.base.key, grid, file)
+    error_us = grid.largest_error_us()
+    if error_us > 0.5 * _SECOND_US / grid.rate_hz:
+        job.note("the server's time stamps differ from the times of the grid", file, f"up to {_ms(error_us)}")
+    _note_last_row(job, measurement, measurement.frames, 1, file)
+
+
+def _note_repeated(job: ExportJob, key: str, grid: Grid, file: str = "") -> None:
+    if grid.num_repeated:
+        what = f"frames of {key} with the time stamp and the number of the one before left out"
+        job.note(what, file, grid.num_repeated)
+
+
+def _note_last_row(
+    job: ExportJob, measurement: Measurement, placed: "Placed", rows_per_row: int, file: str
+) -> None:
+    """Report if the last row of a component has another time than its frame.
+
+    All formats with a grid need this: what is wrong in the times adds up to the end.
+    """
+    part = max(placed.parts, key=lambda part: int(part.rows[-1]))
+    rate_hz = measurement.grid.rate_hz * rows_per_row
+    captured_s = float(part.series.seconds_of(part.series.capture_utime[part.frames][-1:])[0])
+    late_s = seconds_of_row(measurement, 0) + int(part.rows[-1]) / rate_hz - captured_s
+    if abs(late_s) >= 1 / measurement.grid.rate_hz:
+        word = "later" if late_s > 0 else "earlier"
+        job.note(
+            f"the last row of {placed.series.key} is {word} in the file than it was captured",
+            file,
+            _ms(abs(late_s) * _SECOND_US),
+        )
+
+
+def _ms(microseconds: float) -> str:
+    return f"{microseconds / 1000:.1f} ms"
 
 
 def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iterator[list[Measurement]]:
@@ -273,11 +310,14 @@ def sampled(
     for run in measurement.runs_of(key):
         # By the time stamps, because announced rates can be a little wrong. With a ratio that is not the true
         # one, samples would get further away from their frames with each frame.
-        ratio = place(run)[0].measured_hz / measurement.grid.measured_hz
+        own = place(run)[0]
+        ratio = own.measured_hz / measurement.grid.measured_hz
         count = round(ratio)
         tolerance = min(_RATIO_TOLERANCE * count, _MAX_RATIO_ERROR)
         fits = count >= 1 and abs(ratio - count) <= tolerance and count == (samples or count)
         parts = measurement.parts(run, max(count, 1))
+        if parts:
+            _note_repeated(job, key, own)
         if parts and fits:
             found.setdefault((count, run.labels), []).extend(parts)
         elif parts:
@@ -286,6 +326,7 @@ def sampled(
     if not found:
         return None, samples
     chosen = max(found, key=lambda identity: sum(len(part.rows) for part in found[identity]))
+    _note_last_row(job, measurement, Placed(found[chosen]), chosen[0], "")
     if len(found) > 1:
         job.note(f"a part of {key} with other labels or another rate left out; export to .csv has it")
     return Placed(found[chosen]), chosen[0]
@@ -294,9 +335,17 @@ def sampled(
 def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
     """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
     start, stop = bounds(measurement.grid.rows, first, first + count)
-    missing = count - (stop - start)
+    skipped, after = bounds(measurement.grid.skipped_rows, first, first + count)
+    num_skipped = after - skipped
+    missing = count - (stop - start) - num_skipped
     if missing:
         job.note("frames missing in the take are empty", path.name, f"{missing} of {count}")
+    if num_skipped:
+        job.note(
+            "rows are empty where the server's time stamps jump and its frame numbers go on",
+            path.name,
+            f"{num_skipped} of {count}",
+        )
 
 
 def note_samples_left_out(

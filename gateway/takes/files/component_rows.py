@@ -145,7 +145,7 @@ class GrowingArray:
         self._rows.resize((num_rows, *self._rows.shape[1:]), refcheck=False)
 
 
-_NO_TIMES_US: Final = np.array([0, -1, -(1 << 63)], np.int64)
+NO_TIMES_US: Final = np.array([0, -1, -(1 << 63)], np.int64)
 """What servers send if they have no time (field note 25)."""
 
 _MAX_STEP: Final = 10
@@ -202,7 +202,7 @@ def _is_beside_damage(sequence: Array, timestamp_us: Array, frame_number: Array)
 def _time_goes_back(timestamp_us: Array) -> Array:
     """Return where time stamps are less than the newest one before; those without a time do not count."""
     goes_back = np.zeros(max(len(timestamp_us) - 1, 0), bool)
-    (places,) = np.nonzero(~np.isin(timestamp_us, _NO_TIMES_US))
+    (places,) = np.nonzero(~np.isin(timestamp_us, NO_TIMES_US))
     step = np.diff(timestamp_us[places])
     is_wrap = np.abs(step + _WRAP) < _WRAP_TOLERANCE_US
     # If rows without a time are between both, the first of them belongs to what follows: it may begin at 0.

