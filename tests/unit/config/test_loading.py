@@ -1,6 +1,8 @@
 """Configuration files: what is read from them, and the error of everything else."""
 
+import errno
 import os
+import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +18,7 @@ from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.support.configurations import MODEL, load
+from tests.support.errors import names
 
 SHIPPED = Path(__file__).parents[3] / "config"
 
@@ -83,38 +86,38 @@ def test_demo_yaml_stays_on_this_machine() -> None:
 
 MISTAKES = [
     # One line of YAML after SERVER, and how the error's one line begins.
-    ("    port: abc", "4:11: sources[0].port: found 'abc'; expected a whole number from 1 to 65535"),
-    ("    prot: 3030", "4:5: sources[0].prot: unknown key (did you mean 'port'?); known keys: name, host, "),
-    ("sorces: 1", f"4:1: sorces: unknown key (did you mean 'sources'?); known keys: {SECTIONS}"),
-    ("on: 1", f"4:1: on: unknown key; known keys: {SECTIONS}"),
-    ("a b: 1", "4:1: 'a b': unknown key; known keys: "),
-    ("    byte_order: big-endian", "4:17: sources[0].byte_order: found 'big-endian'; expected big or little"),
+    ("    port: abc", "4:11: sources[0].port: found 'abc'"),
+    ("    prot: 3030", "4:5: sources[0].prot: unknown key"),
+    ("sorces: 1", "4:1: sorces: unknown key"),
+    ("on: 1", "4:1: on: unknown key"),
+    ("a b: 1", "4:1: 'a b': unknown key"),
+    ("    byte_order: big-endian", "4:17: sources[0].byte_order: found 'big-endian'"),
     ("    streams: [{rate: {frequency_hz: x}}]", "4:37: sources[0].streams[0].rate.frequency_hz: found 'x'"),
     ("    streams: [{components: [6d, 3D]}]", "4:33: sources[0].streams[0].components[1]: found '3D' (did"),
-    ("    reconnect: {first_delay_s: 20}", "4:16: sources[0].reconnect.max_delay_s: found 10; expected"),
-    ("zenoh:", "4:7: zenoh: found nothing; expected a mapping with any of the keys enabled, prefix, "),
-    ("lcm: {enabled: 1}", "4:16: lcm.enabled: found 1; expected true or false"),
-    ("  - host: lab-2", "4:5: sources[1].name: missing; this key is required"),
-    ("  - {name: LAB, host: x}", "4:12: sources[1].name: found 'LAB', which has the same LCM channels as "),
-    ("    name: lab-2", "4:5: sources[0].name: the same key as in line 2"),
-    ("? [a]\n: 1", "4:3: found a list or mapping as a key"),
-    ("<<: {lcm: {}}", "4:1: '<<': merge keys are not supported; use an alias as the value of a key"),
-    ("lcm: !url memq", "4:6: lcm: found the tag '!url'; expected a value without a tag"),
-    ("lcm: !!set {a}", "4:6: lcm: found the tag 'tag:yaml.org,2002:set'; expected a value without a tag"),
-    ("lcm: !!int a", "4:6: lcm: found 'a'; expected a number of at most 40 characters"),
-    ("lcm: !!bool a", "4:6: lcm: found 'a'; expected a number of at most 40 characters"),
-    ('lcm: !!int ""', "4:6: lcm: found ''; expected a number of at most 40 characters"),
-    ("lcm: 0x_", "4:6: lcm: found '0x_'; expected a number of at most 40 characters"),
-    (f"lcm: {'9' * 41}", f"4:6: lcm: found '{'9' * 41}'; expected a number of at most 40 characters"),
-    (r'lcm: "\ud800"', r"4:6: lcm: found '\ud800'; expected text that UTF-8 can encode"),
-    (r'lcm: "\Uffffffff"', "4:9: not YAML: a number here is out of range"),
-    ("lcm: *other", "4:6: not YAML: found undefined alias 'other'"),
-    ("lcm: &it [*it]", "4:6: more than 5000 values or 32 levels, counting those that aliases repeat"),
-    ("lcm: " + "[" * 2000, "4:36: not YAML: found more than 32 levels"),
-    ("lcm: [1", "5:1: not YAML: while parsing a flow sequence from line 4: expected ',' or ']', but got "),
-    ("\tlcm: {}", r"4:1: not YAML: found character '\t' that cannot start any token; check indentation, "),
-    ("---\n{}", "4:1: not YAML: expected a single document in the stream from line 1: but found another "),
-    ("lcm: \x07", "4:6: found the character U+0007, which YAML does not allow"),
+    ("    reconnect: {first_delay_s: 20}", "4:16: sources[0].reconnect.max_delay_s: found 10"),
+    ("zenoh:", "4:7: zenoh: found nothing"),
+    ("lcm: {enabled: 1}", "4:16: lcm.enabled: found 1"),
+    ("  - host: lab-2", "4:5: sources[1].name: missing"),
+    ("  - {name: LAB, host: x}", "4:12: sources[1].name: found 'LAB'"),
+    ("    name: lab-2", "4:5: sources[0].name: the same key"),
+    ("? [a]\n: 1", "4:3: found a list"),
+    ("<<: {lcm: {}}", "4:1: '<<': merge keys"),
+    ("lcm: !url memq", "4:6: lcm: found the tag '!url'"),
+    ("lcm: !!set {a}", "4:6: lcm: found the tag 'tag:yaml.org,2002:set'"),
+    ("lcm: !!int a", "4:6: lcm: found 'a'"),
+    ("lcm: !!bool a", "4:6: lcm: found 'a'"),
+    ('lcm: !!int ""', "4:6: lcm: found ''"),
+    ("lcm: 0x_", "4:6: lcm: found '0x_'"),
+    (f"lcm: {'9' * 41}", f"4:6: lcm: found '{'9' * 41}'"),
+    (r'lcm: "\ud800"', r"4:6: lcm: found '\ud800'"),
+    (r'lcm: "\Uffffffff"', "4:9: not YAML: a number here"),
+    ("lcm: *other", "4:6: not YAML: found undefined alias"),
+    ("lcm: &it [*it]", "4:6: more than 5000 values"),
+    ("lcm: " + "[" * 2000, "4:36: not YAML: found more than 32"),
+    ("lcm: [1", "5:1: not YAML: while parsing"),
+    ("\tlcm: {}", r"4:1: not YAML: found character '\t'"),
+    ("---\n{}", "4:1: not YAML: expected a single document"),
+    ("lcm: \x07", "4:6: found the character U+0007"),
 ]
 
 
@@ -127,16 +130,17 @@ def test_a_mistake_is_told_with_its_place(file: Path, line: str, error: str) -> 
 def test_a_key_of_an_earlier_version_is_refused_with_what_to_write_instead(file: Path) -> None:
     """After an update, whoever runs the gateway sees each line to change, in the file and in variables."""
     [found] = refused(file, f"{SERVER}metrics: {{address: 0.0.0.0}}\n")
-    assert found == "4:11: metrics.address: a key of earlier versions; write host instead"
+    assert found.startswith("4:11: metrics.address: ")
+    assert names(found, "write host")
     file.write_text(SERVER)
-    with pytest.raises(ConfigError, match=r"^RTC3D_GATEWAY__METRICS__ADDRESS: metrics.address: a key of ea"):
+    with pytest.raises(ConfigError, match=r"^RTC3D_GATEWAY__METRICS__ADDRESS: metrics.address: .*write host"):
         read(file, MODEL, {"RTC3D_GATEWAY__METRICS__ADDRESS": "127.0.0.2"})
 
 
 def test_all_mistakes_are_told_in_the_files_order(file: Path) -> None:
     text = "lcm: {enable: true}\nzenoh: {prefix: /mocap}\nsources:\n  - host: two words\n    port: 70000\n"
-    assert [line.partition(";")[0] for line in refused(file, text)] == [
-        "1:7: lcm.enable: unknown key (did you mean 'enabled'?)",
+    assert [re.split("; | \\(", line)[0] for line in refused(file, text)] == [
+        "1:7: lcm.enable: unknown key",
         "2:17: zenoh.prefix: found '/mocap'",
         "4:5: sources[0].name: missing",
         "4:11: sources[0].host: found 'two words'",
@@ -161,7 +165,7 @@ def test_aliases_that_grow_without_bound_are_refused(file: Path) -> None:
     rows = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 20)]
     [line] = refused(file, "\n".join(rows))
-    assert line.endswith(": more than 5000 values or 32 levels, counting those that aliases repeat")
+    assert names(line, "5000 values", "32 levels")
 
 
 def test_a_date_is_a_name_and_a_byte_order_mark_is_no_mistake(file: Path) -> None:
@@ -170,38 +174,36 @@ def test_a_date_is_a_name_and_a_byte_order_mark_is_no_mistake(file: Path) -> Non
     assert load(file).sources[0].name == "2026-06-01"
 
 
-EMPTY = "empty; expected a mapping with at least the key sources"
-MAPPING = f"expected a mapping with any of the keys {SECTIONS}"
 UMLAUTS = SERVER.encode() + "# Männer, Münster\n".encode() + b"# M\xfcnster"
 
 
 @pytest.mark.parametrize(
-    ("content", "error"),
+    ("content", "place", "values"),
     [
-        ("", EMPTY),
-        ("# nothing yet\n", EMPTY),
-        ("[1]", f"1:1: found a list; {MAPPING}"),
-        ("text", f"1:1: found 'text'; {MAPPING}"),
-        ("~", f"1:1: found nothing; {MAPPING}"),
-        ("lcm: {}", "1:1: sources: missing; this key is required"),
-        (b"# M\xfcnster", "1:4: found the byte 0xFC; expected text in UTF-8"),
-        (b"\xef\xbb\xbf# M\xfcnster", "1:4: found the byte 0xFC; expected text in UTF-8"),
-        (UMLAUTS, "5:4: found the byte 0xFC; expected text in UTF-8"),
-        (
-            SERVER + "#" * (MAX_FILE_BYTES - len(SERVER) + 1),
-            "cannot be read: it is too large; the limit is 262144 bytes; "
-            "name a YAML file such as config/gateway.yaml",
-        ),
+        ("", "empty; ", ["sources"]),
+        ("# nothing yet\n", "empty; ", ["sources"]),
+        ("[1]", "1:1: ", ["list", SECTIONS]),
+        ("text", "1:1: ", ["'text'", SECTIONS]),
+        ("~", "1:1: ", ["nothing", SECTIONS]),
+        ("lcm: {}", "1:1: sources: ", ["missing"]),
+        (b"# M\xfcnster", "1:4: ", ["0xFC", "UTF-8"]),
+        (b"\xef\xbb\xbf# M\xfcnster", "1:4: ", ["0xFC", "UTF-8"]),
+        (UMLAUTS, "5:4: ", ["0xFC", "UTF-8"]),
+        (SERVER + "#" * (MAX_FILE_BYTES - len(SERVER) + 1), "", [262144, "config/gateway.yaml"]),
     ],
     ids=range(10),
 )
-def test_a_file_that_is_no_configuration_is_refused(file: Path, content: str | bytes, error: str) -> None:
+def test_a_file_that_is_no_configuration_is_refused(
+    file: Path, content: str | bytes, place: str, values: list[object]
+) -> None:
     """The position is that of the first wrong character, as an editor counts."""
-    assert refused(file, content) == [error]
+    [line] = refused(file, content)
+    assert line.startswith(place)
+    assert names(line, *values)
 
 
 def test_a_file_of_the_largest_size_is_loaded_and_a_missing_one_is_refused(file: Path) -> None:
-    assert refused(file)[0].startswith("cannot be read: No such file or directory; name a YAML file")
+    assert names(refused(file)[0], os.strerror(errno.ENOENT), "config/gateway.yaml")
     file.write_text(SERVER + "#" * (MAX_FILE_BYTES - len(SERVER)))
     assert load(file)
 
@@ -211,7 +213,8 @@ def test_only_the_first_mistakes_are_listed(file: Path, count: int, more: list[i
     """Nobody reads more than twenty, and at a reload each is a line in the log."""
     lines = refused(file, SERVER + "lcm:\n" + "".join(f"  key{number}: 1\n" for number in range(count)))
     assert lines[19].startswith("24:3: lcm.key19: unknown key")
-    assert lines[20:] == [f"and {number} more mistakes; correct these first" for number in more]
+    assert len(lines[20:]) == len(more)
+    assert all(names(line, number) for line, number in zip(lines[20:], more, strict=True))
 
 
 def test_a_file_has_at_most_5000_values(file: Path) -> None:
@@ -227,7 +230,7 @@ def test_zenohs_file_with_deep_nesting_is_refused(file: Path, name: str) -> None
     """Zenoh's own parser overflows the stack, which ends the process."""
     (file.parent / name).write_text("{a: " + "[" * 100_000 + "]" * 100_000 + "}")
     [line] = refused(file, f"{SERVER}zenoh: {{config: {name}}}")
-    assert line.endswith("line 1, column 68: found more than 64 nested brackets")
+    assert names(line, "line 1, column 68", 64)
 
 
 def test_zenohs_file_may_have_brackets_in_texts_and_comments(file: Path) -> None:
@@ -249,7 +252,7 @@ def test_zenohs_file_is_looked_for_beside_this_one(file: Path, monkeypatch: pyte
     zenoh_file.write_text("{mode: 'clint'}")
     [line] = refused(file)
     assert line.startswith(f"4:17: zenoh.config: Zenoh refuses the file {zenoh_file}: ")
-    assert "unknown variant `clint`, expected one of `router`, `peer`, `client`" in line
+    assert names(line, "`clint`")
     zenoh_file.unlink()
     assert refused(file)[0].endswith(f"Zenoh refuses the file {zenoh_file}: No such file or directory")
 
@@ -257,7 +260,7 @@ def test_zenohs_file_is_looked_for_beside_this_one(file: Path, monkeypatch: pyte
 def test_a_drawing_of_zenoh_is_put_on_one_line(file: Path) -> None:
     """A log has lines; and a pipe would block the gateway for ever."""
     os.mkfifo(file.parent / "pipe")
-    assert refused(file, f"{SERVER}zenoh: {{config: pipe}}")[0].endswith("it is a pipe (FIFO), not a file")
+    assert names(refused(file, f"{SERVER}zenoh: {{config: pipe}}")[0], "pipe")
     (file.parent / "zenoh.json5").write_text("{mode: 'peer',,\n}")
     [line] = refused(file, f"{SERVER}zenoh: {{config: zenoh.json5}}\n")
     assert line.endswith("/zenoh.json5: line 1, column 15: expected identifier or string")
@@ -276,15 +279,15 @@ def _huge(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "problem"),
     [
-        (os.mkfifo, r"it is a pipe \(FIFO\), not a file"),
-        (Path.mkdir, "it is a folder, not a file"),
-        (_socket, "it is a socket, not a file"),
-        (lambda path: path.symlink_to("/dev/zero"), "it is a device, not a file"),
-        (lambda path: path.symlink_to("/dev/null"), "it is a device, not a file"),
+        (os.mkfifo, "pipe"),
+        (Path.mkdir, "folder"),
+        (_socket, "socket"),
+        (lambda path: path.symlink_to("/dev/zero"), "device"),
+        (lambda path: path.symlink_to("/dev/null"), "device"),
         (lambda path: path.symlink_to("missing"), "No such file or directory"),
         (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
         (lambda path: path.touch(), None),
-        (_huge, "it is too large; the limit is 262144 bytes"),
+        (_huge, "262144 bytes"),
     ],
 )
 def test_what_is_no_small_file_is_refused_at_once(

@@ -12,6 +12,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from tests.support.configurations import mistakes, source
+from tests.support.errors import names
 
 MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
 HERTZ = "expected a number of frames per second above 0, up to 1000000"
@@ -33,36 +34,39 @@ INTERVALS = [0.05, 0.0999, -1, 86401, True, float("nan")]
 @pytest.mark.parametrize(
     ("keys", "accepted", "refused", "expected"),
     [
-        ("port", [1, 65535], PORTS, "a whole number from 1 to 65535"),
+        ("port", [1, 65535], PORTS, [1, 65535]),
         (
             "connect_timeout_s reply_timeout_s stall_timeout_s",
             [0.001, 5, 86400],
             SECONDS,
-            "a number of seconds from 0.001 to 86400",
+            [0.001, 86400],
         ),
         (
             "max_packet_bytes max_c3d_bytes",
             [1024, 2**32 - 1],
             BYTES,
-            "a whole number of bytes from 1024 to 4294967295",
+            [1024, 4294967295],
         ),
         (
             "parameters_interval_s",
             [0, 0.1, 86400],
             INTERVALS,
-            "0 for never, or a number of seconds from 0.1 to 86400",
+            [0, 0.1, 86400],
         ),
     ],
 )
 def test_numbers_within_their_limits(
-    keys: str, accepted: list[float], refused: list[object], expected: str
+    keys: str, accepted: list[float], refused: list[object], expected: list[float]
 ) -> None:
     """The limits protect from typing errors, and a number in quotes or a switch is no number."""
     for key in keys.split():
         for value in accepted:
             assert getattr(SourceSettings.model_validate(source(**{key: value})), key) == value
         for other in refused:
-            assert of_source(**{key: other}) == [(key, f"found {describe(other)}; expected {expected}")]
+            [(location, text)] = of_source(**{key: other})
+            assert location == key
+            assert text.startswith(f"found {describe(other)}; expected ")
+            assert names(text, *expected)
 
 
 def test_host_names_and_addresses_are_accepted() -> None:
@@ -90,16 +94,14 @@ def test_invalid_hosts_are_refused(host: str) -> None:
     """A typing error is reported at the start, not by a name server a minute later."""
     [(location, text)] = of_source(host=host)
     assert location == "host"
-    assert text.endswith("; expected a host name or an IP address; the port has its own key")
+    assert text.startswith("found ")
 
 
 def test_names_that_do_not_fit_keys_and_channels_are_refused() -> None:
     """A name is part of Zenoh keys and LCM channels; the hint helps who writes a number."""
     for name in ("", "a b", "a/b", "a.b", "é", "lab\n", "a" * 25):
         assert [location for location, _ in of_source(name=name)] == ["name"]
-    assert of_source(name=5)[0][1].startswith(
-        "found 5 (use quotes to make it text); expected 1 to 24 of the "
-    )
+    assert names(of_source(name=5)[0][1], 5, "quotes", "1 to 24")
 
 
 def test_rates_are_accepted_in_three_forms() -> None:
@@ -122,8 +124,8 @@ def test_rates_are_accepted_in_three_forms() -> None:
         ({"divisor": 0}, "rate.divisor", f"found 0; {WHOLE}"),
         ({"divisor": 1.5}, "rate.divisor", f"found 1.5; {WHOLE}"),
         ({"divisor": True}, "rate.divisor", f"found true; {WHOLE}"),
-        ({"divisor": 2, "divisors": 2}, "rate.divisors", "unknown key (did you mean 'divisor'?)"),
-        ({"divisor": 2, "frequency_hz": 2}, "rate", "found frequency_hz and divisor together; expected one"),
+        ({"divisor": 2, "divisors": 2}, "rate.divisors", "unknown key"),
+        ({"divisor": 2, "frequency_hz": 2}, "rate", "found frequency_hz and divisor"),
     ],
 )
 def test_other_rates_are_refused(value: object, location: str, text: str) -> None:
@@ -141,21 +143,28 @@ def test_components_are_kept_in_wire_order() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "location", "text"),
+    ("value", "location", "found"),
     [
-        ([], "components", f"found an empty list; expected a list of {COMPONENTS}, or [all]"),
-        ("all", "components", f"found 'all'; expected a list of {COMPONENTS}, or [all]"),
-        (None, "components", f"found nothing; expected a list of {COMPONENTS}, or [all]"),
-        (["all", "3d"], "components.0", "found 'all' beside other components; expected [all] alone"),
-        (["3d", "6d", "3d"], "components.2", "found '3d' twice; expected each component once"),
-        (["3d", "Events"], "components.1", f"found 'Events' (did you mean 'event'?); expected {COMPONENTS}"),
-        (["markers"], "components.0", f"found 'markers'; expected {COMPONENTS}"),
-        ([1], "components.0", f"found 1; expected {COMPONENTS}"),
+        ([], "components", "list"),
+        ("all", "components", "'all'"),
+        (None, "components", "nothing"),
+        (["all", "3d"], "components.0", "'all'"),
+        (["3d", "6d", "3d"], "components.2", "'3d'"),
+        (["3d", "Events"], "components.1", "'Events' (did you mean 'event'?)"),
+        (["markers"], "components.0", "'markers'"),
+        ([1], "components.0", 1),
     ],
 )
-def test_other_components_are_refused(value: object, location: str, text: str) -> None:
-    """The error is at the item that is wrong, and says which components there are."""
-    assert mistakes(StreamSettings, {"components": value}) == [(location, text)]
+def test_other_components_are_refused(value: object, location: str, found: object) -> None:
+    """The error is at the item that is wrong."""
+    [(place, text)] = mistakes(StreamSettings, {"components": value})
+    assert place == location
+    assert names(text, found, "expected")
+
+
+def test_the_error_of_an_unknown_component_says_which_ones_there_are() -> None:
+    [(_, text)] = mistakes(StreamSettings, {"components": ["markers"]})
+    assert names(text, *(component.key for component in WIRE_ORDER))
 
 
 def test_max_rates_are_those_of_components() -> None:
@@ -175,24 +184,22 @@ NO_KEYS = ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb
 URLS = [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x@y"]
 NO_URLS = ["", "udpm://a b", "udpm://\n", "udpm", "udpm:", "239.255.76.67:7667", "UDPM://", "zmq://x"]
 NO_URLS += ["tcpq://me@lab", "tcpq://a..b:7700", "tcpq://127.1:7700"]
-URL = "a URL that begins with udpm://, mpudpm://, memq://, tcpq:// or file://, without a user"
-PORT = "a whole number from 1 to 65535"
 
 
 @pytest.mark.parametrize(
     ("section", "key", "accepted", "refused", "expected"),
     [
-        (ZenohSettings, "prefix", KEYS, NO_KEYS, "a Zenoh key of at most 128 characters"),
-        (LcmSettings, "url", URLS, NO_URLS, URL),
-        (LcmSettings, "prefix", ["MOCAP", "a_1", "A" * 16], ["", "A-B", "Ä", "A" * 17], ""),
-        (SpoolSettings, "max_files", [1, 100_000], [0, 100_001, 1.0], "a whole number of files"),
-        (SpoolSettings, "directory", ["/var/lib"], ["", "var", "/a\nb"], "a folder's absolute path"),
-        (MetricsSettings, "port", [1, 65535], [0, 65536, "9464"], PORT),
-        (ZenohSettings, "express", [True, False], [1, 0, "yes", None], "true or false"),
+        (ZenohSettings, "prefix", KEYS, NO_KEYS, [128]),
+        (LcmSettings, "url", URLS, NO_URLS, ["udpm://", "mpudpm://", "memq://", "tcpq://", "file://"]),
+        (LcmSettings, "prefix", ["MOCAP", "a_1", "A" * 16], ["", "A-B", "Ä", "A" * 17], []),
+        (SpoolSettings, "max_files", [1, 100_000], [0, 100_001, 1.0], [1, 100_000]),
+        (SpoolSettings, "directory", ["/var/lib"], ["", "var", "/a\nb"], ["absolute"]),
+        (MetricsSettings, "port", [1, 65535], [0, 65536, "9464"], [1, 65535]),
+        (ZenohSettings, "express", [True, False], [1, 0, "yes", None], ["true", "false"]),
     ],
 )
 def test_values_of_other_sections(
-    section: type[Section], key: str, accepted: list[object], refused: list[object], expected: str
+    section: type[Section], key: str, accepted: list[object], refused: list[object], expected: list[object]
 ) -> None:
     """What the library or the system behind the key cannot use is refused at the start."""
     for value in accepted:
@@ -200,7 +207,8 @@ def test_values_of_other_sections(
     for value in refused:
         [(location, text)] = mistakes(section, {key: value})
         assert location == key
-        assert text.startswith(f"found {describe(value)}; expected {expected}")
+        assert text.startswith(f"found {describe(value)}; expected ")
+        assert names(text, *expected)
 
 
 def test_keys_of_zenoh_itself_are_accepted() -> None:
@@ -209,7 +217,6 @@ def test_keys_of_zenoh_itself_are_accepted() -> None:
 
 
 ZENOH_REFUSES = "Zenoh refuses these keys: "
-PATH_OR_KEYS = "expected a JSON5 file's path or a mapping with Zenoh's own keys"
 
 
 @pytest.mark.parametrize(
@@ -217,15 +224,15 @@ PATH_OR_KEYS = "expected a JSON5 file's path or a mapping with Zenoh's own keys"
     [
         (
             {"mode": "per"},
-            f"{ZENOH_REFUSES}unknown variant `per`, expected one of `router`, `peer`, `client`",
+            f"{ZENOH_REFUSES}unknown variant `per`",
         ),
         ({"connect": {"endpoints": ["nowhere"]}}, f"{ZENOH_REFUSES}Endpoints must be of the form"),
-        ({"mode": float("nan")}, f"{ZENOH_REFUSES}Out of range float"),
+        ({"mode": float("nan")}, ZENOH_REFUSES),
         ({"mode": b"peer"}, f"{ZENOH_REFUSES}Object of type bytes"),
-        ([], f"found an empty list; {PATH_OR_KEYS}"),
-        ("a\nb", f"found 'a\\nb'; {PATH_OR_KEYS}"),
-        ("", f"found ''; {PATH_OR_KEYS}"),
-        (True, f"found true; {PATH_OR_KEYS}"),
+        ([], "found an empty list; expected "),
+        ("a\nb", "found 'a\\nb'; expected "),
+        ("", "found ''; expected "),
+        (True, "found true; expected "),
     ],
 )
 def test_configurations_that_zenoh_refuses_are_refused(config: object, text: str) -> None:

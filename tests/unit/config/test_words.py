@@ -14,6 +14,7 @@ from gateway.errors import ConfigError
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.output import ZenohOutput
 from tests.support.configurations import load, read
+from tests.support.errors import names, raises
 from tests.support.networks import free_port
 from tests.support.waiting import wait_until
 
@@ -72,40 +73,34 @@ def test_what_is_no_secret_stays(text: str) -> None:
     assert list(find_secrets(yaml.safe_load(text))) == []
 
 
-KEY_FILE = " with the path of the key's file, "
-
-
 @pytest.mark.parametrize(
     ("config", "column", "path", "instead"),
     [
-        ("auth: {usrpwd: {user: me, password: geheim}}", 66, "auth.usrpwd.password", ""),
-        ("auth: {usrpwd: {user: me, password: 1234567}}", 66, "auth.usrpwd.password", ""),
+        ("auth: {usrpwd: {user: me, password: geheim}}", 66, "auth.usrpwd.password", []),
+        ("auth: {usrpwd: {user: me, password: 1234567}}", 66, "auth.usrpwd.password", []),
         (
             "link: {tls: {connect_private_key_base64: geheim}}",
             71,
             "link.tls.connect_private_key_base64",
-            f"connect_private_key{KEY_FILE}",
+            ["connect_private_key"],
         ),
         (
             "auth: {pubkey: {private_key_pem: geheim}}",
             63,
             "auth.pubkey.private_key_pem",
-            f"private_key_file{KEY_FILE}",
+            ["private_key_file"],
         ),
     ],
 )
 def test_a_secret_in_the_file_is_refused(
-    file: Path, config: str, column: int, path: str, instead: str
+    file: Path, config: str, column: int, path: str, instead: list[str]
 ) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{{config}}}}}}}\n")
     with pytest.raises(ConfigError) as caught:
         load(file, {})
     variable = f"RTC3D_GATEWAY__ZENOH__CONFIG__TRANSPORT__{path.replace('.', '__').upper()}"
-    assert str(caught.value) == (
-        f"{file}:2:{column}: zenoh.config.transport.{path}: found a secret, which does not belong in this "
-        f"file; use {instead}the environment variable {variable}, "
-        "or zenoh.config as the path of a JSON5 file that only the gateway may read"
-    )
+    assert str(caught.value).startswith(f"{file}:2:{column}: zenoh.config.transport.{path}: ")
+    assert names(str(caught.value), *instead, variable)
 
 
 def test_a_secret_in_an_endpoint_in_the_file_is_refused(file: Path) -> None:
@@ -141,7 +136,7 @@ def test_a_password_from_the_environment_is_text_as_it_stands(file: Path, passwo
 
 def test_half_a_character_in_a_password_is_refused(file: Path) -> None:
     file.write_text(SERVER)
-    with pytest.raises(ConfigError, match="found bytes that are not UTF-8; expected text"):
+    with raises(ConfigError, PASSWORD, "UTF-8"):
         load(file, {PASSWORD: "\udcff"})
 
 
