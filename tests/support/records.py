@@ -29,6 +29,11 @@ def kinds(caplog: pytest.LogCaptureFixture, level: int = logging.WARNING) -> lis
     return [(record.level, record.kind) for record in logged(caplog, level)]
 
 
+def levels(caplog: pytest.LogCaptureFixture, level: int = logging.WARNING) -> list[str]:
+    """Return the levels of the records of at least ``level`` so far."""
+    return [record.level for record in logged(caplog, level)]
+
+
 def _args(record: logging.LogRecord) -> tuple[object, ...]:
     if record.args is None:
         return ()

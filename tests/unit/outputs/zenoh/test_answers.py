@@ -9,6 +9,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.token_bucket import TokenBucket
 from tests.support.clocks import Clock
+from tests.support.errors import names
 from tests.support.queried_gateway import to_reply
 from tests.support.waiting import wait_until_async
 from tests.unit.outputs.zenoh.lab import QueriedLab, with_settings
@@ -96,9 +97,8 @@ async def test_queries_beyond_the_rate_get_an_error_and_are_counted(
     assert codes == {"ok": 10, "rate": 50}
     assert lab.output.query_results == {"lab": codes}
     assert lab.lost == {"query beyond the rate": (50, 0)}
-    [warning] = [record.message for record in caplog.records if "refused" in record.message]
-    assert "10 queries a second like this one" in warning
-    assert "raise zenoh.max_queries_per_key_per_s" in warning
+    [warning] = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert names(warning.message, "lab", 10, "zenoh.max_queries_per_key_per_s")
 
 
 @pytest.mark.usefixtures("at_once")
@@ -119,18 +119,19 @@ async def test_replies_beyond_the_bytes_of_a_second_are_errors(lab: QueriedLab) 
 
 
 @pytest.mark.parametrize(
-    ("selector", "num_bytes", "text"),
+    ("selector", "num_bytes", "values"),
     [
-        ("mocap/lab/" + 600 * "x", 0, "a key has 610 characters; accepted: 512"),
-        ("mocap/lab/status?" + 2000 * "x", 0, "the options have more than 1024 characters"),
-        ("mocap/lab/$*a$*b$*c", 0, "a selector has more than 2 times $*; use * or **"),
-        ("mocap/lab/status", 5000, "a query has 5000 bytes of payload and attachment; accepted: 4096"),
+        ("mocap/lab/" + 600 * "x", 0, [610, 512]),
+        ("mocap/lab/status?" + 2000 * "x", 0, ["options", 1024]),
+        ("mocap/lab/$*a$*b$*c", 0, [2, "$*"]),
+        ("mocap/lab/status", 5000, [5000, 4096]),
     ],
 )
 async def test_a_query_that_is_too_long_is_an_error(
-    lab: QueriedLab, selector: str, num_bytes: int, text: str
+    lab: QueriedLab, selector: str, num_bytes: int, values: list[object]
 ) -> None:
     payload = bytes(num_bytes) or None
     [reply] = await asyncio.to_thread(lambda: list(lab.peer.get(selector, timeout=20, payload=payload)))
-    assert (to_reply(reply).error, to_reply(reply).code) == (text, "bad-request")
+    assert to_reply(reply).code == "bad-request"
+    assert names(to_reply(reply).error, *values)
     assert lab.service.received == []

@@ -14,6 +14,7 @@ from gateway.outputs.contract import OutputHealth
 from gateway.outputs.zenoh.config import command_config, zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from tests.support.errors import names
 from tests.support.networks import free_endpoint, zenoh_keys
 from tests.support.waiting import wait_until
 from tests.unit.outputs.zenoh.lab import Lab
@@ -182,16 +183,18 @@ output.close()
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
     )
-    assert "the Zenoh session is not open yet; is the router running" in done.stdout
+    assert names(done.stdout, "zenoh.config's")
 
 
 def test_health_says_how_to_open_a_session_before_and_after(lab: Lab) -> None:
-    remedy = "is the router running, are zenoh.config's endpoints right and free?"
-    assert lab.output.health().problem == f"the Zenoh session is not open yet; {remedy}"
+    before = lab.output.health()
+    assert not before.connected
+    assert names(before.problem, "zenoh.config's")
     lab.open()
     assert lab.output.health() == OutputHealth(True, "")
     lab.output.close()
-    assert lab.output.health().problem == "the Zenoh session is closed; start the gateway again"
+    after = lab.output.health()
+    assert (after.connected, after.problem not in {"", before.problem}) == (False, True)
 
 
 # Configuration -------------------------------------------------------------------------------
@@ -204,8 +207,8 @@ def value_of(config: zenoh.Config, path: str) -> Any:
 @pytest.mark.parametrize(
     ("config", "reason"),
     [
-        ({"mod": "client"}, "unknown field `mod`, expected one of `id`"),
-        ({"mode": "clinet"}, "unknown variant `clinet`, expected one of `router`, `peer`, `client`"),
+        ({"mod": "client"}, "`mod`"),
+        ({"mode": "clinet"}, "`clinet`"),
         ({"listen": {"endpoints": 5}}, "expected list of endpoints"),
         ({"connect": {"endpoints": ["foo"]}}, "Endpoints must be of the form <protocol>/<address>"),
         ({"transport": {"shared_memory": {"enable": True}}}, "unknown field `enable`"),

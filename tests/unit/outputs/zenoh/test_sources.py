@@ -16,6 +16,7 @@ from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from tests.support.errors import names
 from tests.support.networks import open_zenoh, zenoh_keys
 from tests.support.statuses import amounts
 from tests.support.waiting import wait_until_async
@@ -57,23 +58,18 @@ async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Querie
 
 
 @pytest.mark.parametrize(
-    ("selector", "error"),
+    ("selector", "values"),
     [
-        (
-            "mocap/lab/x/*",
-            "nothing of source 'lab' matches mocap/lab/x/*; accepted below mocap/lab/: status, c3d",
-        ),
-        (
-            "mocap/*/recording",
-            "recording needs the name of one source, not a wildcard; accepted: mocap/lab/recording",
-        ),
+        ("mocap/lab/x/*", ["'lab'", "mocap/lab/x/*", "mocap/lab/: status, c3d"]),
+        ("mocap/*/recording", ["mocap/lab/recording"]),
     ],
 )
 async def test_a_selector_that_matches_nothing_is_an_error_with_the_accepted_keys(
-    lab: QueriedLab, selector: str, error: str
+    lab: QueriedLab, selector: str, values: list[str]
 ) -> None:
     reply = await lab.query(selector)
-    assert (reply.error, reply.code) == (error, "bad-request")
+    assert reply.code == "bad-request"
+    assert names(reply.error, *values)
     assert lab.service.received == []
     await wait_until_async(lambda: lab.output.query_results == {"lab": {"bad-request": 1}})
 
@@ -87,7 +83,7 @@ async def test_errors_are_replies_with_their_code_and_are_counted(
         assert (reply.error, reply.encoding) == ("the server refuses", "text/plain;refused")
     lab.service.error = ZeroDivisionError("of the test")
     reply = await lab.query("mocap/lab/status?a=1")
-    assert reply.error == "a defect in the gateway: ZeroDivisionError('of the test')"
+    assert names(reply.error, "ZeroDivisionError('of the test')")
     assert reply.encoding == "text/plain;defect"
     [record] = caplog.records
     assert record.message == "lab: query mocap/lab/status?a=1"

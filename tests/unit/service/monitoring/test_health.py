@@ -16,6 +16,7 @@ from gateway.stream.process_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.support.configurations import make_settings
+from tests.support.errors import names
 from tests.support.memory_output import MemoryOutput
 
 MARKERS, ANALOG, EVENT = ((ComponentType.MARKERS,), (ComponentType.ANALOG,), (ComponentType.EVENT,))
@@ -73,13 +74,14 @@ async def test_a_recent_frame_is_healthy_in_every_state_and_others_only_without_
     """The page turns unhealthy when the gateway gives up the stream, not later."""
     lab = lab_with(state, STALL_TIMEOUT_S - 1)
     assert lab.problem() == ""
-    for age_s, text in (
-        (STALL_TIMEOUT_S, "no frame for"),
-        (None, "no frame so far"),
-        (41.5, "no frame for 41.5 s"),
+    for age_s, values in (
+        (STALL_TIMEOUT_S, ["no frame"]),
+        (None, ["no frame"]),
+        (41.5, ["no frame", "41.5 s"]),
     ):
         set_state(lab.statuses[0], state, age_s)
-        assert lab.problem()[: len(text)] == ("" if state is StreamState.NO_MEASUREMENT else text)
+        is_problem = state is not StreamState.NO_MEASUREMENT
+        assert names(lab.problem(), *values) if is_problem else lab.problem() == ""
 
 
 async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
@@ -90,14 +92,13 @@ async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
 
 async def test_the_problem_names_the_reason_and_what_to_check() -> None:
     lab = lab_with(StreamState.CONNECTING, None)
-    assert lab.problem() == "no frame so far: connecting to 192.0.2.20:3020"
+    assert names(lab.problem(), "no frame", "192.0.2.20:3020")
     set_state(lab.statuses[0], StreamState.WAITING, 41.5)
-    lab.statuses[0].record_error("connection refused by 192.0.2.20:3020; is the RT server running?")
-    assert lab.problem() == (
-        "no frame for 41.5 s (limit 3 s): connection refused by 192.0.2.20:3020; is the RT server running?"
-    )
+    lab.statuses[0].record_error("refused by the test")
+    assert names(lab.problem(), "41.5 s", "3 s", "refused by the test")
     lab.statuses[0].state = StreamState.IDLE  # the last error is out of date in this state
-    assert "is a measurement running?" in lab.problem()
+    assert names(lab.problem(), "41.5 s", "3 s", "192.0.2.20")
+    assert "refused" not in lab.problem()
 
 
 async def test_only_an_idle_on_demand_stream_without_subscribers_needs_no_frames() -> None:
@@ -154,13 +155,12 @@ async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200()
     lab.output.start()
     status, body = lab.health()
     assert (status, body["status"], body["healthy"]) == (200, "degraded", True)
-    assert body["reasons"] == [
-        "lab (3d): lost in the last minute: 872 messages of 436 frames (skipped while behind)",
-        "lab to memory: lost in the last minute: 1 message (not open)",
-    ]
+    of_stream, of_output = body["reasons"]
+    assert names(of_stream, "lab (3d)", "872 messages", "436 frames", "skipped while behind")
+    assert names(of_output, "lab to memory", "1 message", "not open")
     skipped, unsent = body["losses"]
     assert skipped.pop("age_s") >= 0
-    assert skipped.pop("text").startswith("frames arrive late and are skipped")
+    assert names(skipped.pop("text"), "backlog: latest")
     expected: dict[str, Any] = {
         "source": "lab",
         "stream": "3d",
@@ -196,19 +196,16 @@ async def test_a_problem_is_unhealthy_even_if_something_is_lost_and_comes_first(
 @pytest.mark.parametrize("age_s", [None, STALL_TIMEOUT_S + 1])
 async def test_frames_that_are_all_rejected_are_named(age_s: float | None) -> None:
     lab = lab_with(StreamState.IDLE, age_s)
-    lab.statuses[0].frame_rejected("3d component of 40 bytes announces 4 items", 1)
-    text = "frames come, and all are rejected: 3d component of 40 bytes announces 4 items"
-    assert lab.problem() == text
-    assert lab.line().startswith(f"lab: {text}, lost in the last minute: 1 message of 1 frame")
+    lab.statuses[0].frame_rejected("too short", 1)
+    assert names(lab.problem(), "all", "rejected", "too short")
+    assert names(lab.line(), "lab", lab.problem(), "1 message", "1 frame")
 
 
 async def test_a_frame_that_is_rejected_among_others_is_only_loss() -> None:
     lab = lab_with(StreamState.STREAMING, 0.01)
     lab.statuses[0].frame_rejected("too short", 1)
     assert lab.problem() == ""
-    assert lab.line() == (
-        "lab: streaming 0.0 Hz, lost in the last minute: 1 message of 1 frame (frame rejected)"
-    )
+    assert names(lab.line(), "lab: streaming 0.0 Hz", "1 message", "1 frame", "frame rejected")
 
 
 @pytest.mark.parametrize(
@@ -221,12 +218,9 @@ async def test_frames_without_a_component_of_the_stream_are_named(since_s: float
     status.components_received("6d analog")
     set_state(status, StreamState.STREAMING, 0.01)
     status.components_received("6d analog")
-    text = (
-        "frames come, and none has a component of this stream (3d); the newest has 6d analog: "
-        "check the server's real-time output, and sources.streams"
-    )
-    assert lab.problem() == (text if is_problem else "")
-    assert lab.line() == f"lab: {text if is_problem else 'streaming 0.0 Hz'}"
+    problem = lab.problem()
+    assert names(problem, "3d", "6d analog", "sources.streams") if is_problem else problem == ""
+    assert lab.line() == f"lab: {problem or 'streaming 0.0 Hz'}"
     status.components_received("")
     assert lab.problem() == ""
 
@@ -255,7 +249,6 @@ async def test_only_outputs_that_cannot_send_or_lose_something_have_a_line() -> 
     assert status_lines(lab.gateway) == ["lab: streaming 0.0 Hz"]
     lab.output.close()
     lab.gateway.sources[0].fan_out.publish_status(b"status")
-    assert status_lines(lab.gateway)[1:] == [
-        f"memory: {lab.output.health().problem}",
-        "lab to memory: lost in the last minute: 1 message (not open)",
-    ]
+    _, of_output, lost = status_lines(lab.gateway)
+    assert of_output == f"memory: {lab.output.health().problem}"
+    assert names(lost, "lab to memory", "1 message", "not open")
