@@ -129,6 +129,8 @@ class TakesFolder:
         self._was_open = False
         self._lock: int | None = None
         self._is_closed = False
+        self.needs_recovery = False
+        """Whether this is a new folder or another disk since ``recover`` was called last."""
         self._opening = threading.Lock()
         self._takes: dict[tuple[Path, int, int], StoredTake] = {}  # by path, size and time
 
@@ -167,6 +169,7 @@ class TakesFolder:
         except OSError:
             logger.debug("%s has no locks", self.directory)  # as some network drives
         self._lock = descriptor
+        self.needs_recovery = True
         return ""
 
     def close(self) -> None:
@@ -179,18 +182,22 @@ class TakesFolder:
                     fcntl.flock(lock, fcntl.LOCK_UN)  # a process that was just forked may still have it open
                 os.close(lock)
 
-    def recover(self) -> None:
-        """Keep the segments that a killed gateway has left behind as a take, if the folder can be used."""
+    def recover(self, own: Collection[Path] = ()) -> None:
+        """Keep the segments that a killed gateway has left behind as a take, if the folder can be used.
+
+        ``own`` are those of this gateway, which are left alone.
+        """
         if not self.open():
+            self.needs_recovery = False
             try:
-                self._recover()
+                self._recover(own)
             except OSError as error:
                 logger.warning("takes: %s", disk_problem(self.directory / ROLLING, error))
 
-    def _recover(self) -> None:
+    def _recover(self, own: Collection[Path]) -> None:
         rolling = self.directory / ROLLING
         for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
-            segments = [path for path, _ in _files(folder) if path.suffix == SUFFIX]
+            segments = [path for path, _ in _files(folder) if path.suffix == SUFFIX and path not in own]
             if segments:
                 stem = self.directory / folder.name / default_name(folder.name)
                 take = free_stem(stem, has_free_name=True)

@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 from gateway.logs.losses import Losses
@@ -104,6 +105,7 @@ class TakesOutput(Output):
         if excess_bytes and self.storage.writer is not None:
             self._end_because_full(self.storage.writer, excess_bytes)
         self._check_folder()
+        self._recover()
         for follower in self._followers.values():
             follower.maintain()
 
@@ -111,6 +113,18 @@ class TakesOutput(Output):
         if self.storage.writer is not None and not self.storage.is_closed:
             protected = {path for each in self._sources.values() for path in each.running_paths}
             self.storage.watch.check(self.storage.settings, protected)
+
+    def _recover(self) -> None:
+        """Keep what a killed gateway has left on a disk that was mounted after the start."""
+        writer, folder = self.storage.writer, self.storage.folder
+        if writer is not None and not self.storage.is_closed and folder.needs_recovery:
+            folder.needs_recovery = False
+            writer.call(lambda: folder.recover(self._own_segments()))
+
+    def _own_segments(self) -> set[Path]:
+        """Return the paths of the rolling segments, in the thread that writes."""
+        sources = [*self._sources.values()]
+        return {path for each in sources if each.segments is not None for path in each.segments.paths()}
 
     def _end_because_full(self, writer: WriterThread, excess_bytes: int) -> None:
         directory = self.storage.folder.directory

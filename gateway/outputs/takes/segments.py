@@ -1,6 +1,7 @@
 """The last seconds of a source on the disk, in segments: event logs that are saved by links, or deleted."""
 
 import contextlib
+import errno
 import logging
 import os
 import shutil
@@ -35,6 +36,8 @@ MAX_SEGMENTS: Final = 360
 _MAX_FILES: Final = 999
 """The maximum number of files of a saved take: they are numbered with three digits."""
 
+_INCOMPLETE: Final = "takes: %s lacks %d messages, because their segments were removed or could not be linked"
+
 logger = logging.getLogger(__name__)
 
 
@@ -45,31 +48,46 @@ class _Segment:
     path: Path
     begin_s: float
     end_s: float
+    num_messages: int
     index: SegmentIndex
 
 
 class Save:
     """A take that is being saved: a folder with a link to each segment.
 
-    Segments are shared, so what the take is about is in a file of its own, the first one.
+    Segments are shared, so what the take is about and lacks is in a file of its own, the first one.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, description: SourceDescription) -> None:
         self.folder = folder
         self.name: str = folder.name
         """The name of the take."""
         self.num_files = 0
+        self.num_lost = 0
+        """How many messages were in segments that could not be linked."""
+        self.lacks_present = False
+        """Whether the present segment could not be linked; at its end, that is tried again."""
+        self._description = description
+        self._num_described = 0  # how many of the lost ones the first file has
 
     def link(self, segment: Path) -> None:
         """Add a segment. Raises OSError."""
         os.link(segment, self._path(self.num_files + 1))
         self.num_files += 1
 
-    def describe(self, description: SourceDescription) -> None:
-        """Add a file that says what the take is about, after the first segment. Raises OSError."""
+    def describe(self) -> None:
+        """Write the file that says what the take is about and lacks, if that is not said yet.
+
+        Call it after the first segment. Raises OSError, TakeError.
+        """
+        is_described = self._path(0).exists() or self._description.details == NO_DETAILS
+        if not self.num_files or (is_described and self.num_lost == self._num_described):
+            return
         utime = next(EventLogReader(self._path(1)).events()).utime
-        messages = [*description.beginning(self.name, utime), description.end(utime, 0)]
-        begin_log(self._path(0), messages).close()
+        end = self._description.end(utime, self.num_lost)
+        self._path(0).unlink(missing_ok=True)
+        begin_log(self._path(0), [*self._description.beginning(self.name, utime), end]).close()
+        self._num_described = self.num_lost
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{self.name}-{number:03}{SUFFIX}"
@@ -94,6 +112,7 @@ class RollingSegments(SourceWriter):
         self._keep_s = keep_s
         self._segments: deque[_Segment] = deque()
         self._log_began_s = 0.0
+        self._num_in_log = 0  # how many messages the present log has
         self._num_segments = 0  # so far: no name is used twice
         self._saves: list[Save] = []
         self._written_s = 0.0  # when something was written before a problem of the disk
@@ -113,6 +132,11 @@ class RollingSegments(SourceWriter):
         self._keep_s = keep_s
         self._delete_expired()
 
+    def paths(self) -> list[Path]:
+        """Return the paths of all segments."""
+        present = [] if self._log is None else [self._log.path]
+        return [*(segment.path for segment in self._segments), *present]
+
     # Writing.
 
     def log_for(self, utime: int) -> LogFile:
@@ -131,6 +155,7 @@ class RollingSegments(SourceWriter):
             self._log = self._begin_log(self.path / f"{name}{SUFFIX}", name, utime)
             self._index = SegmentIndex(self._log.path)
             self._num_segments += 1
+            self._num_in_log = 0
             self._log_began_s = now_s
             for save in [*self._saves]:
                 self._add_to_save(save)
@@ -157,7 +182,15 @@ class RollingSegments(SourceWriter):
     def _end_segment(self) -> None:
         log = self._close_log()
         if log is not None:
-            segment = _Segment(log.path, self._log_began_s, self._monotonic(), self._index)
+            for save in self._saves:
+                if save.lacks_present:
+                    save.lacks_present = False
+                    try:
+                        save.link(log.path)
+                    except OSError:  # which is logged already
+                        save.num_lost += self._num_in_log
+            end_s = self._monotonic()
+            segment = _Segment(log.path, self._log_began_s, end_s, self._num_in_log, self._index)
             with self._indexing:
                 self._segments.append(segment)
                 self._index = SegmentIndex(self.path)
@@ -188,6 +221,7 @@ class RollingSegments(SourceWriter):
     def written(self, begin: int, messages: Messages) -> None:
         """See TakeWriter."""
         assert self._log is not None  # noqa: S101 - it has the messages
+        self._num_in_log += len(messages)
         newest = {channel: sequence_of(message) for channel, message in dict(messages).items()}
         with self._indexing:
             for channel in newest.keys() & self._newest.keys():
@@ -250,26 +284,38 @@ class RollingSegments(SourceWriter):
         If it ``goes_on``, further segments are added until ``end_save``. Otherwise, the present segment ends
         now, so that the take does, too. Raises OSError, and QueryError if there is such a take already.
         """
+        if self._log is not None and not self._log.is_in_place():
+            self._end_segment()
         if self._log is None and not self._segments:
             raise QueryError("no messages are kept yet, so there is nothing to save", code="nothing-yet")
-        save = Save(free_stem(folder, has_free_name=has_free_name))
+        description = replace(self.description, details=details)
+        save = Save(free_stem(folder, has_free_name=has_free_name), description)
         save.folder.mkdir()
         try:
-            for segment in self._segments:
-                if segment.end_s >= since_s:
-                    with contextlib.suppress(FileNotFoundError):  # somebody has removed it
-                        save.link(segment.path)
-            if self._log is not None:
-                save.link(self._log.path)
-            if details != NO_DETAILS:
-                save.describe(replace(self.description, details=details))
+            self._link_segments(save, since_s)
+            save.describe()
         except (OSError, TakeError):
             shutil.rmtree(save.folder, ignore_errors=True)
             raise
         self._saves.append(save)
         if not goes_on:
             self.end_save(save)
+        elif save.num_lost:
+            logger.warning(_INCOMPLETE, save.folder, save.num_lost)
         return save
+
+    def _link_segments(self, save: Save, since_s: float) -> None:
+        """Add all segments since a time to a new take. Raises OSError."""
+        for segment in self._segments:
+            if segment.end_s >= since_s:
+                try:
+                    save.link(segment.path)
+                except FileNotFoundError:  # somebody has removed it
+                    save.num_lost += segment.num_messages
+        if self._log is not None:
+            save.link(self._log.path)
+        if not save.num_files:
+            raise FileNotFoundError(errno.ENOENT, "somebody has removed the last seconds", str(self.path))
 
     def undo(self, saved: Future[Save]) -> None:
         """End and delete the take of a call of ``save``, unless that was cancelled or has failed."""
@@ -294,18 +340,31 @@ class RollingSegments(SourceWriter):
         try:
             save.link(self._log.path)
         except OSError as error:
+            save.lacks_present = True
             self.disk.failed(save.folder, error)
+
+    def _complete(self, save: Save) -> None:
+        """Note in a take what it lacks."""
+        if save.num_lost:
+            logger.warning(_INCOMPLETE, save.folder, save.num_lost)
+        try:
+            save.describe()
+        except (OSError, TakeError) as error:
+            logger.warning("takes: %s does not say what it lacks: %s", save.folder, error)
 
     def end_save(self, save: Save) -> None:
         """End a take here: the present segment ends."""
         if save in self._saves:
-            self._saves.remove(save)
             self._end_segment()
+            self._saves.remove(save)
+            self._complete(save)
 
     def close(self) -> None:
         """End all takes, and delete the segments: what was saved stays."""
-        self._saves.clear()
         self._end_segment()
+        for save in self._saves:
+            self._complete(save)
+        self._saves.clear()
         while self._segments:
             self._delete_oldest()
         with contextlib.suppress(OSError):

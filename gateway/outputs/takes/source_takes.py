@@ -226,10 +226,11 @@ class SourceTakes:
         take = self.take
         current: StoredTake | None = None
         if take is not None:
-            stored = await self.storage.read(partial(folder.take_at, take.stem, is_running=True), take.path)
-            if self.take is take:  # otherwise, it has just ended
-                current = stored._replace(num_lost=take.num_lost)
-                takes = [current if each.name == current.name else each for each in takes]
+            # Somebody may have removed its file; the next message begins another one.
+            new = StoredTake(take.name, 0, take.utime, 0.0, details=take.description.details)
+            stored = next((each for each in takes if each.name == take.name), new)
+            current = stored._replace(is_running=True, is_cut_off=False, num_lost=take.num_lost)
+            takes = [current if each.name == current.name else each for each in takes]
         kept_s = 0.0 if self.segments is None else self.segments.kept_s()
         return TakeList(current, takes, kept_s)
 

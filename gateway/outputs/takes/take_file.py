@@ -1,5 +1,6 @@
 """The files of one source: they report to the disk and count losses. The running take is one of them."""
 
+import contextlib
 import logging
 from collections import Counter
 from collections.abc import Callable, Collection
@@ -148,16 +149,22 @@ class TakeFile(SourceWriter):
         return is_full(error) and self._delete_less_important()
 
     def log_for(self, utime: int) -> LogFile:
-        """See TakeWriter. If the file was removed, another one takes its place."""
+        """See TakeWriter. If the file was removed, another one takes its place.
+
+        That has another name if somebody has put something else there: the take is renamed.
+        """
         log = self._log
         assert log is not None  # noqa: S101 - see write
         if not self._is_in_place and not log.is_in_place():
-            self.stem.parent.mkdir(exist_ok=True)
-            self._log, removed = self._begin_log(self.path, self.name, utime), log
-            removed.close()
+            stem = free_stem(self.stem, has_free_name=True)
+            self._log, removed = self._begin_log(log_path(stem), stem.name, utime), log
+            self.stem, self.path = stem, self._log.path
             logger.warning(
-                "takes: %s was removed while it was recorded; the take continues in a new file", self.path
+                "takes: %s was removed while it was recorded; the take continues in %s",
+                *(removed.path, self.path),
             )
+            with contextlib.suppress(OSError):  # nobody finds the file any more
+                removed.close()
             log = self._log
         self._is_in_place = True
         return log

@@ -4,6 +4,7 @@ The gateway's own takes (``gateway.outputs.takes``) and the recordings of a subs
 (``gateway.takes.recorder``) have different files, and report problems to different places. The rest is here.
 """
 
+import contextlib
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -26,7 +27,8 @@ def begin_log(path: Path, messages: Messages) -> LogFile:
     try:
         _append_all(log, messages)
     except OSError:
-        log.close()
+        with contextlib.suppress(OSError):  # such as the one that was reported when it was written
+            log.close()
         path.unlink(missing_ok=True)
         raise
     return log

@@ -265,7 +265,22 @@ def test_a_segment_that_cannot_be_linked_is_a_problem(
         patch.setattr(Path, "unlink", no_links)
         rolling.segments.shorten()
     assert f"{oldest} cannot be written" in rolling.disk.problem
-    assert numbers(save.folder) == [*range(10), *range(20, 30)]
+    assert numbers(save.folder) == [*range(30)]  # it was linked at its end
+
+
+def test_a_saved_take_counts_what_could_not_be_linked(
+    rolling: Rolling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A take with a hole must not look whole."""
+    rolling.write(10)
+    save = rolling.save(60, goes_on=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", no_links)
+        rolling.write(20)
+    rolling.write(10)
+    assert numbers(save.folder) == [*range(10), *range(20, 40)]
+    rolling.segments.end_save(save)
+    assert TakesFolder(rolling.takes.parent).take_at(save.folder).num_lost == 10
 
 
 @pytest.mark.parametrize(("place", "left"), [(0, [*range(10, 25)]), (-1, [*range(20), *range(22, 25)])])
@@ -278,6 +293,35 @@ def test_a_segment_that_is_removed_costs_only_itself(rolling: Rolling, place: in
     rolling.write(3)
     rolling.save(60)
     assert numbers(rolling.takes / "fall") == left
+    taken = TakesFolder(rolling.takes.parent).take_at(rolling.takes / "fall")
+    assert (taken.num_lost, taken.is_cut_off) == (25 - len(left), False)
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_segment_that_is_removed_just_before_it_is_saved_is_counted(
+    rolling: Rolling, goes_on: bool
+) -> None:
+    """Nobody has noticed yet that the present one is gone; details are in the file with the number, too."""
+    rolling.write(12)
+    for path in rolling.files[1:]:
+        path.unlink()
+    details = TakeDetails("S01")
+    save = rolling.segments.save(rolling.takes / "fall", 0, details, has_free_name=False, goes_on=goes_on)
+    rolling.write(3)
+    rolling.segments.end_save(save)
+    taken = TakesFolder(rolling.takes.parent).take_at(save.folder)
+    assert (taken.num_lost, taken.is_cut_off, taken.details) == (2, False, details)
+    assert numbers(save.folder) == [*range(10), *([12, 13, 14] if goes_on else [])]
+
+
+def test_what_was_removed_cannot_be_saved(rolling: Rolling) -> None:
+    """An empty folder would look like a take."""
+    rolling.write(12)
+    for path in rolling.files:
+        path.unlink()
+    with pytest.raises(FileNotFoundError):
+        rolling.save(60)
+    assert not (rolling.takes / "fall").exists()
 
 
 def test_a_name_that_is_taken_gets_a_number_or_is_refused(rolling: Rolling) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 import math
 import socket
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NoReturn
@@ -198,17 +198,55 @@ async def test_a_take_that_ends_while_listed_has_ended(
     """The disk is read without blocking the event loop, so anything may have changed since."""
     async with still_lab(tmp_path) as lab:
         await lab.takes.start("walk")
-        take_at = TakesFolder.take_at
+        listed = TakesFolder.takes
         ends: list[Coroutine[Any, Any, StoredTake]] = []
 
-        def end_and_read(folder: TakesFolder, path: Path, *, is_running: bool = False) -> StoredTake:
-            if not ends:
-                ends.append(lab.takes.stop())
-            return take_at(folder, path, is_running=is_running)
+        def end_and_list(folder: TakesFolder, source: str, running: Collection[str]) -> list[StoredTake]:
+            ends.append(lab.takes.stop())
+            return listed(folder, source, running)
 
-        monkeypatch.setattr(TakesFolder, "take_at", end_and_read)
+        monkeypatch.setattr(TakesFolder, "takes", end_and_list)
         assert (await lab.takes.list()).running is None
         assert (await ends[0]).name == "walk"
+
+
+async def test_a_take_is_listed_while_its_file_is_gone(tmp_path: Path) -> None:
+    """Somebody has removed it, and nothing has arrived since; the other takes must be listed, too."""
+    async with still_lab(tmp_path) as lab:
+        await lab.takes.start("fall")
+        await lab.takes.stop()
+        await lab.takes.start("walk", TakeDetails("S01"))
+        lab.path("walk.lcmlog").unlink()
+        listed = await lab.takes.list()
+        assert listed.running is not None
+        assert (listed.running.name, listed.running.details.subject) == ("walk", "S01")
+        assert [take.name for take in listed.takes] == ["fall"]
+
+
+@pytest.mark.parametrize("is_folder", [False, True])
+async def test_a_take_goes_on_under_another_name_if_something_is_in_its_place(
+    tmp_path: Path, is_folder: bool
+) -> None:
+    """A backup may move a file and put a copy there (mv, cp): nothing that comes later may be lost."""
+    clock = Clock()
+    async with still_lab(tmp_path, clock) as lab:
+        await lab.takes.start("walk")
+        before = lab.publish()
+        lab.output.storage.started_writer().call(lambda: None)
+        lab.path("walk.lcmlog").rename(tmp_path / "moved.lcmlog")
+        if is_folder:
+            lab.path("walk.lcmlog").mkdir()
+        else:
+            lab.path("walk.lcmlog").write_bytes((tmp_path / "moved.lcmlog").read_bytes())
+        assert lab.takes.take is not None
+        lab.takes.take.sync()
+        after = [lab.publish(), lab.publish()]
+        listed = await lab.takes.list()
+        stopped = await lab.takes.stop()
+        assert listed.running is not None
+    assert (stopped.name, stopped.num_lost, stopped.is_cut_off) == ("walk-2", 0, False)
+    assert frames(lab.path("walk-2.lcmlog")) == after
+    assert frames(tmp_path / "moved.lcmlog") == [before]
 
 
 async def test_a_take_that_starts_too_late_has_no_file(

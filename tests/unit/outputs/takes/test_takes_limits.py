@@ -12,7 +12,7 @@ from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.output import TakesOutput
 from gateway.takes.files.reader import log_paths
 from tests.support.clocks import Clock
-from tests.support.recording_output import NoThread, RecordingLab, settings_in, still_host, still_lab
+from tests.support.recording_output import NoThread, RecordingLab, frames, settings_in, still_host, still_lab
 from tests.support.takes import markers, write_take
 
 MIB = 1024 * 1024
@@ -134,6 +134,35 @@ async def test_the_segments_of_a_killed_gateway_are_listed_after_the_start(tmp_p
     async with still_lab(tmp_path, keep_last_s=60) as lab:
         assert [take.is_running for take in (await lab.takes.list()).takes] == [False]
         assert not segment.exists()
+
+
+@pytest.mark.parametrize("was_there", [True, False])
+async def test_the_segments_on_a_disk_that_is_mounted_later_are_kept(tmp_path: Path, was_there: bool) -> None:
+    """A slow disk may come after the gateway; the seconds before a power failure are on it."""
+    directory, disk = tmp_path / "takes", tmp_path / "disk"
+    if not was_there:
+        directory.write_text("no folder")
+    for source in ("lab", "hall"):
+        (disk / ROLLING / source).mkdir(parents=True)
+        write_take(disk / ROLLING / source / "x-000001.lcmlog", [markers(1)])
+    async with still_lab(directory, keep_last_s=60) as lab:
+        if was_there:
+            lab.publish()
+            lab.output.storage.started_writer().call(lambda: None)
+        directory.rename(tmp_path / "below")
+        disk.rename(directory)  # what is mounted there hides the former folder
+        assert lab.takes.segments is not None
+        lab.takes.segments.sync()
+        newest = lab.publish()
+        lab.output.storage.started_writer().call(lambda: None)
+        for _ in range(3):
+            lab.output.maintain()
+        [recovered] = (await lab.takes.list()).takes
+        assert [*lab.path(recovered.name).iterdir()]
+        assert len([*(directory / "hall").iterdir()]) == 1
+        saved = await lab.takes.save(60, name="saved")
+        assert frames(lab.path("saved"))[-1] == newest  # this gateway's own segment stays
+        assert saved.num_lost == was_there
 
 
 async def test_a_take_can_start_before_the_folder_was_checked(tmp_path: Path) -> None:

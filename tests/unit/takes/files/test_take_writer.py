@@ -97,11 +97,12 @@ def test_the_end_of_the_file_takes_the_place_of_a_message_on_a_full_disk(
 def test_a_file_that_cannot_begin_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty file of that name would refuse the next attempt."""
 
-    def write(_descriptor: int, _content: memoryview) -> int:
+    def write(_descriptor: int, _content: memoryview | None = None) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", write)
+        patch.setattr(os, "fsync", write)  # closing fails, too
         with pytest.raises(OSError, match="No space left"):
             begin_log(tmp_path / "walk.lcmlog", messages(1))
     begin_log(tmp_path / "walk.lcmlog", messages(1)).close()
