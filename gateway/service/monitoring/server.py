@@ -1,6 +1,6 @@
 """The monitoring server of a gateway: /metrics for Prometheus, /healthz for health checks; the status line.
 
-A gateway is healthy if every stream receives frames, every output is connected, and nothing is lost.
+A gateway is healthy if every stream receives frames in time, every output is connected, and nothing is lost.
 """
 
 import asyncio
@@ -25,6 +25,9 @@ from gateway.stream.state import StreamState
 from gateway.stream.tcp import is_address, look_up
 
 _LOOK_UP_TIMEOUT_S: Final = 5.0
+
+_LATE_S: Final = 1.0
+"""Frames that are later than this degrade the gateway: whoever uses them live would act on the past."""
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +116,7 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
     """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem.
 
     ``process_problems`` are those of the whole process, see ProcessLimits. If something was lost in the last
-    minute, the gateway is degraded, which is still 200.
+    minute, or frames are late, the gateway is degraded, which is still 200.
     """
     streams = [each for source in gateway.sources for each in _streams(source)]
     outputs = _outputs(gateway)
@@ -123,15 +126,20 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
         *(f"{each['output']}: {each['problem']}" for each in outputs if each["problem"]),
     ]
     routes = list(_routes(gateway))
+    late = [
+        f"{each['source']} ({each['stream']}): the newest frame arrived {each['lag_s']:.1f} s late"
+        for each in streams
+        if each["lag_s"] >= _LATE_S and not each["problem"]
+    ]
     losses = [f"{route.name}: {text}" for route in routes if (text := last_minute_text(route.losses))]
     causes = []
     for route in routes:
         names = {"source": route.source, "stream": route.stream, "output": route.output}
         causes += [names | loss._asdict() | {"age_s": round(loss.age_s, 1)} for loss in route.losses]
     body = {
-        "status": "unhealthy" if problems else "degraded" if losses else "healthy",
+        "status": "unhealthy" if problems else "degraded" if late or losses else "healthy",
         "healthy": not problems,
-        "reasons": [*problems, *losses],
+        "reasons": [*problems, *late, *losses],
         "process": list(process_problems),
         "streams": streams,
         "outputs": outputs,

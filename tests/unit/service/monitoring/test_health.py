@@ -173,6 +173,20 @@ async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200()
     assert unsent.items() >= (expected | {"messages": 1, "frames": 0}).items()
 
 
+@pytest.mark.parametrize(
+    ("lag_s", "age_s", "expected"),
+    [(30.0, 0.01, "degraded"), (1.0, 0.01, "degraded"), (0.9, 0.01, "healthy"), (30.0, 60.0, "unhealthy")],
+)
+async def test_late_frames_degrade_the_gateway(lag_s: float, age_s: float, expected: str) -> None:
+    """After a stop of 30 s, the gateway was healthy while all frames were from the past."""
+    lab = lab_with(StreamState.STREAMING, age_s)
+    lab.statuses[0].lag_s = lag_s
+    status, body = lab.health()
+    assert (status, body["status"]) == (503 if expected == "unhealthy" else 200, expected)
+    assert len(body["reasons"]) == (expected != "healthy")
+    assert body["streams"][0]["lag_s"] == lag_s
+
+
 async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:
     lab = lab_with(StreamState.STREAMING, 0.01)
     now_s = 1000.0
