@@ -56,6 +56,8 @@ KeyPath = tuple[str, ...]
 """A key below PREFIX/SOURCE/, split at its slashes: ("parameters", "3d")."""
 
 CONTROL_OPTION: Final = "set"
+STOP: Final = "stop"
+"""What is stopped by a command with this value of the option is stopped whatever else peers ask."""
 """The option of queries that start, stop or change something. They need ``remote_control`` of the source."""
 
 READ_OPTION: Final = "read"

@@ -18,6 +18,9 @@ from gateway.token_bucket import TokenBucket
 MAX_KEYS: Final = 256
 """Of how many keys the rate is known. The key that was asked for least recently is forgotten first."""
 
+MAX_STOPS: Final = 64
+"""How many questions that stop something are admitted although a limit refuses others."""
+
 REFUSALS_PER_S: Final = 500.0
 """How many refusals a second are sent to peers. Further questions get no reply at all."""
 
@@ -81,10 +84,11 @@ class QueryAdmission:
         with self._lock:
             return {source: results.copy() for source, results in self._results.items()}
 
-    def admit(self, source: str, key: str) -> Refusal | None:
+    def admit(self, source: str, key: str, *, is_stop: bool = False) -> Refusal | None:
         """Admit a question about ``key``, until ``finished`` is called for it; or return why not.
 
-        It is counted for ``source``, one of the gateway's.
+        It is counted for ``source``, one of the gateway's. One that stops something is admitted beyond all
+        limits but MAX_STOPS: a recording must not go on because somebody else asks too much.
         """
         with self._lock:
             bucket = self._keys.pop(key, None)
@@ -93,7 +97,8 @@ class QueryAdmission:
                 if len(self._keys) >= MAX_KEYS:
                     del self._keys[next(iter(self._keys))]
             self._keys[key] = bucket
-            refusal = self._refusal(bucket)
+            has_room = self.num_pending < self._limits.pending + MAX_STOPS
+            refusal = None if is_stop and has_room else self._refusal(bucket)
             if refusal is None:
                 self._total.take()
                 bucket.take()

@@ -259,6 +259,8 @@ class QueryHistory:
         """The version of ``newest``; 0 before the first."""
         self.is_named_recording = False
         """Whether a command with a name started the recording, so a command has to stop it."""
+        self.is_recording = False
+        """Whether a peer has started a recording, and none has stopped it."""
         self.end_of_recording: asyncio.Task[None] | None = None
         """Waits for the end of its duration, if it has one."""
 

@@ -215,6 +215,9 @@ _MAX_OPTIONS_CHARS: Final = 500
 
 _MAX_REPLY_CHARS: Final = 1000
 
+STOPS_PER_S: Final = 4.0
+"""How often a server is asked to stop at most. Each request may reach it as a packet without a reply."""
+
 _FOLLOW_S: Final = 1.0
 """How long outputs still follow a recording whose duration is over: its last frames may be on the way."""
 
@@ -229,6 +232,9 @@ class Recordings:
     (field note 16), and with commands that can (field notes 18 and 26). Without a name, the packet is sent,
     which gets no reply. With a name, the command is sent, and the packet if the server does not accept the
     command. With options, only the command is sent: without them, it would be another recording.
+
+    A stop is never refused because of a rate, and goes on if its asker is gone. Those that come before it has
+    begun share it; it begins at most STOPS_PER_S times a second.
     """
 
     def __init__(
@@ -240,6 +246,10 @@ class Recordings:
         self._history = history
         """Has whether the command started the recording, and what waits for the end of its duration."""
         self._lock = asyncio.Lock()
+        self._next_stop_s = -math.inf  # on the event loop's clock
+        self._waiting_stop: asyncio.Task[Done] | None = None
+        """The newest stop if it has not begun, and no start waits behind it."""
+        self._running: set[asyncio.Task[Done]] = set()  # stops, so that they are not collected as garbage
 
     async def start(self, name: str, options: str = "") -> Done:
         """Start a recording with a name, and with options for the server (field note 26). Raises QueryError.
@@ -247,18 +257,38 @@ class Recordings:
         The options are sent unchanged.
         """
         sent = _start_options(name, options)
+        self._waiting_stop = None
         async with self._begun():
             return await self._start(sent, needs_command=bool(options))
 
     async def stop(self) -> Done:
         """Stop the recording. Raises QueryError."""
+        stop = self._waiting_stop
+        if stop is None:
+            stop = self._waiting_stop = asyncio.create_task(self._stop())
+            self._running.add(stop)
+            stop.add_done_callback(self._finish)
+        return await asyncio.shield(stop)
+
+    def _finish(self, stop: asyncio.Task[Done]) -> None:
+        self._running.discard(stop)
+        if not stop.cancelled():
+            stop.exception()  # retrieve it, even if no asker waits any more
+
+    async def _stop(self) -> Done:
+        stop = asyncio.current_task()
         async with self._begun():
+            loop = asyncio.get_running_loop()
+            await asyncio.sleep(self._next_stop_s - loop.time())
+            self._next_stop_s = loop.time() + 1 / STOPS_PER_S
+            if self._waiting_stop is stop:
+                self._waiting_stop = None
             reply = None
             if self._history.is_named_recording:
                 reply = await self._ask(ControlRecording(start=False))
             if reply is None:
                 self._send(start=False)
-            self._history.is_named_recording = False
+            self._history.is_named_recording = self._history.is_recording = False
             content = {"source": self._source, "sent": "stop", **await self._access.follow(False, "")}
             return content, reply or ""
 
@@ -284,6 +314,7 @@ class Recordings:
             self._history.is_named_recording = reply is not None
             if reply is None:
                 self._send(start=True)
+            self._history.is_recording = True
         except QueryError:
             await following
             await self._access.follow(False, "")

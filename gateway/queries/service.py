@@ -18,7 +18,7 @@ from gateway.messages.decode import JSON, LCM_MESSAGES, XML, json_bytes, message
 from gateway.messages.encode import NOT_PUBLISHED, Stamp, encode_message
 from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages, pack_messages
 from gateway.messages.host_time import now_utime
-from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
+from gateway.outputs.contract import CONTROL_OPTION, STOP, Answer, Command, KeyPath, ServerParameters
 from gateway.outputs.registry import OUTPUTS
 from gateway.queries.answers import JsonPayload, NewestJson, QueryHistory, message_answer, schema_answer
 from gateway.queries.parameter_cache import Announce, ParameterCache
@@ -89,6 +89,7 @@ class SourceQueries:
         self._status_message = status_message
         self._last_c3d = last_c3d
         self._requests = ServerRequests(settings, streams)
+        self._history = history
         self._recordings = Recordings(settings.name, self._requests, recording, history)
         self._newest_json = NewestJson()
         self._controls = TokenBucket(CONTROLS_PER_S)
@@ -120,16 +121,20 @@ class SourceQueries:
         newest = self.parameters.newest
         return source_frame(self.settings, Parameters() if newest is None else newest.parsed.parameters)
 
-    def check_control(self) -> None:
-        """Raise QueryError unless peers may now start, stop or change something of this source."""
-        name = self.settings.name
-        if not self.settings.remote_control:
+    def check_control(self, action: str) -> None:
+        """Raise QueryError unless peers may now start, stop or change something of this source.
+
+        No rate refuses what stops something, which would go on; Recordings has a limit of its own. A
+        recording that a peer has started may be stopped even if a reload has switched the control off.
+        """
+        name, is_stop = self.settings.name, action == STOP
+        if not (self.settings.remote_control or (is_stop and self._history.is_recording)):
             raise QueryError(
                 f"remote control is off for source {name!r}; to switch it on, set remote_control: true "
                 "for it in the gateway's configuration",
                 code="refused",
             )
-        if not self._controls.try_take():
+        if not is_stop and not self._controls.try_take():
             raise QueryError(
                 f"source {name!r} takes {CONTROLS_PER_S:g} commands a second that start or stop something; "
                 "try again",
@@ -326,7 +331,7 @@ class SourceQueryService:
         else:
             answer = partial(queries.answer, parse_question(path, options, queries.components), self._output)
         if CONTROL_OPTION in options:
-            queries.check_control()
+            queries.check_control(options[CONTROL_OPTION])
         return await answer()
 
     async def answer_all(

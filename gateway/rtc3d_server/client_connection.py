@@ -132,9 +132,9 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
-        self._inbox.clear()
         self._record_for(None)
         self.filter.connection_lost()
+        self._inbox.clear()
         self._owner.connection_closed(self, exc)
         self.closed.set_result(None)
 
@@ -191,6 +191,11 @@ class ClientConnection(asyncio.BufferedProtocol):
     def hold_commands(self) -> None:
         """Answer no further packets until ``continue_commands``."""
         self._is_held = True
+
+    @property
+    def waiting(self) -> Sequence[Packet]:
+        """The packets that wait for an answer to those before them."""
+        return self._inbox
 
     def continue_commands(self) -> None:
         """Answer packets again."""

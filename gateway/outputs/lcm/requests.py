@@ -24,7 +24,7 @@ from gateway.messages.decode import JSON, LCM_MESSAGES, json_bytes
 from gateway.messages.history import unpack_messages
 from gateway.messages.texts import xml_text
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, escape_key_chunk, lcm_channel
-from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
+from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, STOP, QueryService
 from gateway.outputs.lcm.receiver import MAX_PENDING, LcmReceiver
 from gateway.outputs.lcm.sender import LcmSender, LcmThreadSender, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
@@ -39,6 +39,8 @@ MAX_REQUESTER_BYTES: Final = 128
 
 HISTORY: Final = "history"
 """The command that asks for messages again. Its option ``key`` is that of the messages on Zenoh."""
+
+_STOP_OPTION: Final = f"{CONTROL_OPTION}={STOP}".encode()
 
 _REFILL: Final = "_REFILL"
 
@@ -150,7 +152,8 @@ class LcmRequests:
         if len(data) > MAX_REQUEST_BYTES or data[:8] != kind.request._get_packed_fingerprint():  # noqa: SLF001 - see decode.py
             self._count_malformed(kind, source, data)
             return
-        refusal = self.admission.admit(source, source)
+        is_stop = _STOP_OPTION in data  # before it is decoded, which costs more
+        refusal = self.admission.admit(source, source, is_stop=is_stop)
         if refusal is not None:
             self._refuse(kind, source, data, refusal)
             return

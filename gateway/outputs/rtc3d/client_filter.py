@@ -108,7 +108,8 @@ class ClientFilter(ConnectionFilter):
         self._control = control
         self._files: list[Path] = []
         self._held: list[bytes] = []  # packets that wait for the end of a file
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()  # they end with the connection
+        self._stops: set[asyncio.Task[None]] = set()  # they do not
         self._defects = DefectLog(_log, "rtc3d")
         self._greeting = asyncio.get_running_loop().call_later(clients.limits.handshake_s, self._give_up)
         notice_vanished(connection.transport.get_extra_info("socket"), clients.limits)
@@ -134,9 +135,10 @@ class ClientFilter(ConnectionFilter):
         control = recording_control(packet)
         if control is not None:
             self._greet()
-            self._hold(partial(self._control_recording, packet, control))
+            tasks = self._tasks if control.start else self._stops
+            self._hold(partial(self._control_recording, packet, control), tasks)
         elif not self._state.is_known and asks_for_parameters(packet):
-            self._hold(partial(self._answer_when_known, packet))
+            self._hold(partial(self._answer_when_known, packet), self._tasks)
         else:
             return self._answer_now(packet)
         return []
@@ -148,11 +150,26 @@ class ClientFilter(ConnectionFilter):
         return replies
 
     def connection_lost(self) -> None:
-        """End what is done for the client."""
+        """End what is done for the client. But what it has started and asked to stop is stopped."""
         self._clients.close(self)
         self._greeting.cancel()
         for task in self._tasks:
             task.cancel()
+        for packet in self.connection.waiting:
+            control = recording_control(packet)
+            if control is not None and not control.start:
+                self._start(self._stop_recording(), self._stops)
+                break
+
+    async def _stop_recording(self) -> None:
+        """Stop the recording, for a client that has gone before its request was handled."""
+        try:
+            await self._control(self._state.source, False, "")
+        except QueryError as error:
+            _log.warning(
+                "%s: client %s has gone, and its recording was not stopped: %s; stop it on the server",
+                *(self._state.source, self.connection.name, error),
+            )
 
     def abort(self) -> None:
         """Disconnect the client at once."""
@@ -168,17 +185,19 @@ class ClientFilter(ConnectionFilter):
         self.connection.write(error_packet(f"No command within {wait_s:g} s; closing"))
         self.connection.transport.close()
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start(self, work: Coroutine[Any, Any, None], tasks: set[asyncio.Task[None]]) -> None:
         task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
 
     # Replies that come later ----------------------------------------------------------------
 
-    def _hold(self, work: Callable[[], Coroutine[Any, Any, list[bytes]]]) -> None:
+    def _hold(
+        self, work: Callable[[], Coroutine[Any, Any, list[bytes]]], tasks: set[asyncio.Task[None]]
+    ) -> None:
         """Answer no further packet until this work is done, and has returned the replies to this one."""
         self.connection.hold_commands()
-        self._start(self._send_result(work))
+        self._start(self._send_result(work), tasks)
 
     async def _send_result(self, work: Callable[[], Coroutine[Any, Any, list[bytes]]]) -> None:
         try:
@@ -217,7 +236,7 @@ class ClientFilter(ConnectionFilter):
             return
         self._files.append(path)
         if len(self._files) == 1:
-            self._start(self._send_files())
+            self._start(self._send_files(), self._tasks)
 
     async def _send_files(self) -> None:
         while self._files:

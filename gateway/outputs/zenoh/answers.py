@@ -14,6 +14,7 @@ every query gets a reply, which is an error if there is no answer, unless there 
 import asyncio
 import contextlib
 import functools
+import itertools
 import logging
 import threading
 import time
@@ -29,7 +30,7 @@ from gateway.logs.losses import Losses
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import LCM_MESSAGES, TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.contract import Answer, KeyPath, QueryService
+from gateway.outputs.contract import CONTROL_OPTION, STOP, Answer, KeyPath, QueryService
 from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, QueryLimits, Refusal
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.workers import WorkerThread
@@ -54,6 +55,8 @@ LONG_ANSWER_BYTES: Final = 512 * 1024
 It also sends messages of the history.
 """
 
+_STOP_OPTION: Final = f"{CONTROL_OPTION}={STOP}"
+
 _REST: Final = 3.0
 """How long the threads rest after they have made a payload, as a multiple of the time that this took.
 
@@ -69,6 +72,8 @@ class _Question(NamedTuple):
     source: str
     selected: str
     options: tuple[tuple[str, str], ...]
+    number: int = 0
+    """Tells commands apart: a second stop is for what was started after the first one."""
 
     @property
     def selector(self) -> str:
@@ -108,6 +113,7 @@ class ZenohAnswers:
         self._is_scheduled = False  # the call of _start_next
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_closed = False
+        self._numbers = itertools.count(1)  # of commands
         self._rest_until_s = 0.0
         self._defects = QueryDefects(logger)
 
@@ -116,8 +122,10 @@ class ZenohAnswers:
     def receive(self, source: str, query: zenoh.Query) -> None:
         """Take a query about ``source``, or refuse it."""
         if self._is_admitted(source, query):
-            options = tuple(sorted(_options(query).items()))
-            self._add(_Question(source, str(query.key_expr), options), query)
+            options = _options(query)
+            number = next(self._numbers) if CONTROL_OPTION in options else 0
+            question = _Question(source, str(query.key_expr), tuple(sorted(options.items())), number)
+            self._add(question, query)
 
     def reply(self, source: str, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
         """Reply to a query about ``source`` with answers, by key, that are known already, or refuse it."""
@@ -126,7 +134,8 @@ class ZenohAnswers:
 
     def _is_admitted(self, source: str, query: zenoh.Query) -> bool:
         selected = str(query.key_expr)
-        refusal = self.admission.admit(source, selected[:MAX_KEY_CHARS])
+        is_stop = _STOP_OPTION in str(query.parameters)
+        refusal = self.admission.admit(source, selected[:MAX_KEY_CHARS], is_stop=is_stop)
         if refusal is not None:
             self._refuse(source, query, refusal)
             return False

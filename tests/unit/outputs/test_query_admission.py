@@ -6,7 +6,7 @@ import pytest
 
 from gateway.errors import QueryError
 from gateway.outputs import query_admission as admission_module
-from gateway.outputs.query_admission import MAX_KEYS, NO_REPLY, QueryAdmission, QueryLimits
+from gateway.outputs.query_admission import MAX_KEYS, MAX_STOPS, NO_REPLY, QueryAdmission, QueryLimits
 from tests.support.clocks import Clock
 
 LIMITS = QueryLimits("zenoh", "max_queries_per_key_per_s", 100.0, 10.0, 1000.0, 40)
@@ -72,6 +72,18 @@ def test_questions_in_progress_are_limited(clock: Clock) -> None:
     admission.finished("lab", "ok")
     assert admission.admit("lab", "b") is None
     assert admission.num_pending == 3
+
+
+def test_a_stop_is_admitted_whatever_else_is_asked(clock: Clock) -> None:
+    """A recording must not go on because of a flood of questions. Stops themselves are limited, too."""
+    admission = QueryAdmission(LIMITS._replace(pending=3), clock)
+    asked(admission, "lab/recording", 10)
+    for _ in range(MAX_STOPS + 3):
+        assert admission.admit("lab", "lab/recording", is_stop=True) is None
+    refusal = admission.admit("lab", "lab/recording", is_stop=True)
+    assert refusal is not None
+    assert refusal.cause == "queue"
+    assert admission.num_pending == MAX_STOPS + 3
 
 
 def test_refusals_are_limited_and_everything_is_counted(

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -93,6 +94,7 @@ class FakeSource:
         """The XML of all announced parameters, None if they are void, with their version."""
         self.num_file_reads = 0
         self.recorded: list[bool] = []
+        self.on_recorded: Callable[[bool], None] = lambda _: None
         self.followed: list[tuple[bool, str]] = []
         self.disk = asyncio.Event()
         """Whether the disk of the takes that follow responds."""
@@ -153,6 +155,7 @@ class FakeSource:
 
     def _record(self, start: bool) -> bool:
         self.recorded.append(start)
+        self.on_recorded(start)
         return self.server.is_connected
 
     async def _follow_recording(self, start: bool, name: str) -> dict[str, Any]:

@@ -2,14 +2,17 @@
 
 import asyncio
 import contextlib
+import itertools
 import json
 import re
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gateway.errors import ClosedError, QueryError, ReplyTimeoutError, ServerError
-from gateway.queries.server_requests import ServerRequests
+from gateway.queries.server_requests import STOPS_PER_S, ServerRequests
 from gateway.rtc3d.commands import SendCurrentFrame, SendParameters
 from gateway.rtc3d.packets import Packet, PacketType
 from tests.support.clocks import run_in_virtual_time
@@ -245,6 +248,43 @@ def test_takes_follow_a_recording_for_its_duration(duration: str, end_s: float |
         assert source.followed[-1] == (True, "walk-1")
 
     run_in_virtual_time(follow())
+
+
+@given(st.lists(st.sampled_from(["start", "stop", "give up", "pause"]), max_size=20))
+def test_the_server_does_what_was_asked_last_and_stops_are_joined_and_paced(steps: list[str]) -> None:
+    """The model: commands in their order, without stops that follow a stop. An asker may have gone."""
+
+    async def run() -> None:
+        source = FakeSource()
+        stops_s: list[float] = []
+        loop = asyncio.get_running_loop()
+        source.on_recorded = lambda start: None if start else stops_s.append(loop.time())
+        asked: list[asyncio.Task[Any]] = []
+        last = ""
+        for step in steps:
+            if step == "pause":
+                await asyncio.sleep(10)
+            elif step == "give up":
+                if last == "stop":
+                    asked[-1].cancel()
+            else:
+                last = step
+                asked.append(asyncio.create_task(record(source, step)))
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+        await asyncio.sleep(100)
+        await asyncio.gather(*asked, return_exceptions=True)
+        commands = [step for step in steps if step in {"start", "stop"}]
+        assert source.recorded.count(True) == commands.count("start")
+        if commands:
+            assert source.recorded[-1] is (commands[-1] == "start")
+        runs = [command for command, _ in itertools.groupby(commands)]
+        joined = [each for each, _ in itertools.groupby(source.recorded)]
+        assert joined == [each == "start" for each in runs]
+        assert source.recorded.count(False) <= commands.count("stop")
+        assert all(after - before > 0.9 / STOPS_PER_S for before, after in itertools.pairwise(stops_s))
+
+    run_in_virtual_time(run())
 
 
 async def test_a_recording_whose_stop_is_refused_is_stopped_by_the_packet(source: FakeSource) -> None:

@@ -221,6 +221,38 @@ async def test_four_commands_a_second_may_change_something() -> None:
     await service.answer("lab", ("record", "trim"), {})
 
 
+async def test_a_stop_passes_however_many_commands_came_before() -> None:
+    """Of five starts and stops at once, the third start passed and its stop did not."""
+    source = FakeSource(remote_control=True)
+    service = service_of(source)
+
+    async def ask(action: str) -> str:
+        try:
+            await service.answer("lab", ("recording",), {"set": action})
+        except QueryError as error:
+            return error.code
+        return "ok"
+
+    answers = await asyncio.gather(*(ask(action) for _ in range(5) for action in ("start", "stop")))
+    assert answers[1::2] == ["ok"] * 5
+    assert source.recorded[-1] is False
+    await service.answer("lab", ("record", "trim"), {"set": "stop"})
+
+
+async def test_what_a_peer_has_started_may_be_stopped_after_remote_control_is_off() -> None:
+    """A reload between start and stop must not leave a server that records on."""
+    source = FakeSource(remote_control=True)
+    service = service_of(source)
+    await service.answer("lab", ("recording",), {"set": "start"})
+    source.queries.settings = source.queries.settings.model_copy(update={"remote_control": False})
+    with raises(QueryError, code="refused"):
+        await service.answer("lab", ("record", "trim"), {"set": "start"})
+    await service.answer("lab", ("recording",), {"set": "stop"})
+    with raises(QueryError, code="refused"):
+        await service.answer("lab", ("recording",), {"set": "stop"})
+    assert source.recorded == [True, False]
+
+
 async def test_a_wrong_command_is_no_command_that_changes_something() -> None:
     service = service_of(FakeSource(remote_control=True))
     for _ in range(10):

@@ -321,6 +321,16 @@ async def test_commands_and_requests_for_parameters_share_their_limits(lab: Lab)
     assert lab.lost("lab")["request beyond the rate"][0] >= 2
 
 
+@with_settings(max_queries_per_source_per_s=1.0)
+async def test_a_stop_is_carried_out_whatever_the_rate(lab: Lab) -> None:
+    """A take or a recording must not go on because of a flood of requests."""
+    for number in range(8):
+        lab.send(request(number))
+    lab.send(command_request(8, "take", "set=stop"), kind="COMMAND")
+    await lab.receive(9)
+    assert len(lab.service.commands_received) == 1
+
+
 async def test_another_message_on_the_channel_of_commands_is_malformed(lab: Lab) -> None:
     for data in (b"", request(1), command_request(1)[:-1], command_request(1, requester="x" * 129)):
         lab.send(data, kind="COMMAND")

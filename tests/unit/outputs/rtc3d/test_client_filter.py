@@ -98,6 +98,20 @@ async def test_a_client_that_goes_ends_what_waits_for_it(client: Client) -> None
     assert client.receive() == []
 
 
+@pytest.mark.parametrize("sent", [["Recording Start", "Recording Stop"], ["Recording Stop"]])
+async def test_a_stop_is_carried_out_although_its_client_has_gone(
+    server: ScriptedServer, client: Client, sent: list[str]
+) -> None:
+    """Also if it waits for the start before it. Otherwise the server would record until its disk is full."""
+    await client.ask(*sent)
+    client.line.abort()
+    await settle()
+    assert server.asked[-1] == ("lab", False, "")
+    await server.answers.put("")
+    await settle()
+    assert asyncio.all_tasks() == {asyncio.current_task()}
+
+
 # Files --------------------------------------------------------------------------------------
 
 

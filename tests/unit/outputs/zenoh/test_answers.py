@@ -44,6 +44,17 @@ async def test_equal_queries_share_an_answer_until_there_is_one(lab: QueriedLab)
     assert (await lab.query("mocap/lab/status?a=1;b=2")).payload == b"answer 2"
 
 
+@with_settings(max_queries_per_key_per_s=1.0)
+async def test_each_stop_is_carried_out_whatever_the_rate(lab: QueriedLab, at_once: None) -> None:  # noqa: ARG001
+    """A second one may be for what was started while the first one was being carried out."""
+    lab.service.may_answer.clear()
+    for action in ("start", "stop", "start", "stop"):
+        lab.peer.get(f"mocap/lab/recording?set={action}", lambda _: None, timeout=20)
+    await wait_until_async(lambda: len(lab.service.received) == 3)
+    actions = [options["set"] for _, _, options in lab.service.received]
+    assert actions == ["start", "stop", "stop"]  # the second start was beyond the rate
+
+
 async def test_at_the_end_peers_see_at_once_that_no_answer_follows(lab: QueriedLab) -> None:
     async with asyncio.timeout(60):
         lab.service.may_answer.clear()
