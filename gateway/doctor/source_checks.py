@@ -23,7 +23,7 @@ from gateway.messages.summary import described_items
 from gateway.outputs.findings import Check, Finding, MessageLoad, Result, as_sentence, failing_first
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.tcp import is_address, look_up
+from gateway.stream.tcp import is_address, look_up, open_connection
 
 CHECKS: Final = (
     "name",
@@ -153,10 +153,26 @@ class SourceChecks:
                 await stream.session.connect()
         except ConnectError as error:
             found, _, question = str(error).partition("; ")
-            return self._check("TCP").failing(found, f"{question[:1].upper()}{question[1:]}")
+            remedy = f"{question[:1].upper()}{question[1:]}"
+            if isinstance(error.__cause__, ConnectionRefusedError):
+                remedy += await self._other_ports()
+            return self._check("TCP").failing(found, remedy)
         count = len(self._streams)
         connections = "a connection" if count == 1 else f"{count} connections, one per stream"
         return self._check("TCP").passing(f"{self._server} accepts {connections}")
+
+    async def _other_ports(self) -> str:
+        """Return a sentence about the usual ports that accept a connection, because this one refuses."""
+        open_ports = []
+        for port in (FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT):
+            if port != self._source.port:
+                with contextlib.suppress(ConnectError):
+                    other = self._source.model_copy(update={"port": port})
+                    (await open_connection(other, asyncio.Protocol())).abort()
+                    open_ports.append(str(port))
+        if not open_ports:
+            return ""
+        return f" Port {' and '.join(open_ports)} of {self._source.host} accepts connections ({_PORTS})."
 
     async def _check_protocol(self) -> Finding:
         for stream in self._streams:

@@ -122,6 +122,10 @@ async def _addresses(source: SourceSettings) -> list[str]:
         ) from error
 
 
+_NETWORK_ADVICE: Final = "check address, cable and routing, and whether a firewall rejects the connection"
+"""Firewalls that reject give the same errors as a network without a route."""
+
+
 async def _connect(
     source: SourceSettings, protocol: Any, address: str, timeout_s: float
 ) -> asyncio.Transport:
@@ -141,5 +145,5 @@ async def _connect(
             f"connection refused by {server}; is the RT server running, and is this its port?"
         ) from error
     except OSError as error:
-        advice = FILES_ADVICE if error.errno in NO_FILES else "check address, cable and routing"
+        advice = FILES_ADVICE if error.errno in NO_FILES else _NETWORK_ADVICE
         raise ConnectError(f"no connection to {server}: {error.strerror or error}; {advice}") from error

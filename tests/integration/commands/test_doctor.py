@@ -277,6 +277,17 @@ async def test_an_unknown_host_name_ends_the_checks_of_its_source_only() -> None
     assert "127.0.0.1" in findings.of("name", "other").found
 
 
+@pytest.mark.netns
+@pytest.mark.parametrize(("configured", "answering"), [(3030, 3020), (3020, 3030), (3021, 3030)])
+async def test_the_usual_port_that_answers_is_named(configured: int, answering: int) -> None:
+    """A laboratory that changed from First Principles to WaveFront needs one number."""
+    with socket.create_server(("127.0.0.1", answering)):
+        findings = await run_doctor(lab(configured, connect_timeout_s=5.0))
+    assert findings.failing() == ["TCP"]
+    assert str(configured) in findings.of("TCP").found
+    assert re.findall(r"Port (\d+)", findings.of("TCP").remedy) == [str(answering)]
+
+
 @pytest.mark.parametrize("is_full", [False, True], ids=["refused", "no answer"])
 async def test_a_server_that_does_not_accept_connections_fails(is_full: bool) -> None:
     found, remedy, port = "connection refused by 127.0.0.1:", "Is the RT server running, and is", free_port()

@@ -188,7 +188,8 @@ def test_the_error_of_a_server_that_does_not_answer() -> None:
 @pytest.mark.netns
 def test_the_error_of_any_other_failure_of_the_network() -> None:
     assert error_of(source(host="192.0.2.20", port=3020)) == (
-        "no connection to 192.0.2.20:3020: Network is unreachable; check address, cable and routing"
+        "no connection to 192.0.2.20:3020: Network is unreachable; check address, cable and "
+        "routing, and whether a firewall rejects the connection"
     )
 
 
