@@ -29,7 +29,7 @@ _KEY: Final = 0x50
 _FIRST_PARAMETER_BLOCK: Final = 2
 _DATA_BLOCK_OFFSET: Final = 16
 """Where the header has the number of the block where the frames begin."""
-_DEC, _BIG_ENDIAN = 85, 86  # of the types of processors; the usual one is 84, little-endian
+DEC, BIG_ENDIAN = 85, 86  # of the types of processors; the usual one is 84, little-endian
 _FORMATS: Final = {1: "B", 2: "H", 4: "f"}
 
 
@@ -51,23 +51,23 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
 
     ``head`` is its first PARAMETERS_END_BYTES. Check it before a reader allocates what it states.
     """
-    start = (head[0] - 1) * _BLOCK_BYTES
+    start = parameters_start(head)
     if len(head) < start + 4:
         return "it ends before its parameters"
     processor = head[start + 3]
-    order = ">" if processor == _BIG_ENDIAN else "<"
+    order = ">" if processor == BIG_ENDIAN else "<"
     (data_block,) = struct.unpack_from(f"{order}H", head, _DATA_BLOCK_OFFSET)
     data_start = max(data_block - 1, 0) * _BLOCK_BYTES
     stated_end = max(data_start, start + head[start + 2] * _BLOCK_BYTES)
     end = stated_end if start < stated_end <= file_bytes else file_bytes
     numbers: dict[str, float] = {}
-    for name, element_bytes, offset, num_bytes in _parameters(head[:end], start + 4, order):
+    for name, element_bytes, offset, num_bytes in parameter_places(head[:end], start + 4, order):
         if offset + num_bytes > end:
             return f"its parameter {safe_text(name)} would have {num_bytes} bytes, more than it has"
         if num_bytes == element_bytes in _FORMATS and offset + 4 <= len(head):
             (numbers[name],) = struct.unpack_from(order + _FORMATS[element_bytes], head, offset)
     rates_hz = numbers.get("ANALOG:RATE", 0.0), numbers.get("POINT:RATE", 0.0)
-    ratio = rates_hz[0] / rates_hz[1] if processor != _DEC and rates_hz[1] > 0 else 1.0
+    ratio = rates_hz[0] / rates_hz[1] if processor != DEC and rates_hz[1] > 0 else 1.0
     samples = ratio if math.isfinite(ratio) else 1.0
     values = 4 * numbers.get("POINT:USED", 0) + numbers.get("ANALOG:USED", 0) * samples
     room = max(file_bytes - data_start, 0)
@@ -76,7 +76,12 @@ def problem_of_sizes(head: bytes, file_bytes: int) -> str:
     return ""
 
 
-def _parameters(head: bytes, position: int, order: str) -> list[tuple[str, int, int, int]]:
+def parameters_start(head: bytes) -> int:
+    """Return where the parameters of a C3D file begin, which ``problem_of_c3d`` has found to be one."""
+    return (head[0] - 1) * _BLOCK_BYTES
+
+
+def parameter_places(head: bytes, position: int, order: str) -> list[tuple[str, int, int, int]]:
     """Return the name of each parameter, the size of an element, and where its values are and their size.
 
     The name is GROUP:NAME. What cannot be read ends the list.

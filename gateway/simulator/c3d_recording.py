@@ -1,14 +1,18 @@
 """What a C3D file has, read with ezc3d: points, analog channels, force plates and events."""
 
 import logging
+import os
+import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from gateway.c3d_files.receiving import PARAMETERS_END_BYTES, problem_of_sizes
 from gateway.descriptions.labels import UNUSED, common
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, MISSING_MARKER, ComponentType, Items
@@ -29,9 +33,9 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d_server.scene import NO_EVENTS
 from gateway.simulator.bodies import force_channels
+from gateway.simulator.c3d_header import Correction, corrections
 
 _log = logging.getLogger(__name__)
-_HEADER_BYTES: Final = 512
 _ITEM_TEXTS: Final = ("LABELS", "DESCRIPTIONS")
 _WHOLE_UNITS: Final = {"mill": "mm", "cent": "cm", "mete": "m"}
 """Units that programs cut to four characters (field note 28)."""
@@ -54,9 +58,17 @@ class C3dRecording(NamedTuple):
 
 def load_recording(path: Path) -> C3dRecording:
     """Read a whole file; log what it lacks. Raises TakeError if it cannot be played, and MemoryError."""
-    content = _read(path)
     with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
+        head = file.read(PARAMETERS_END_BYTES)
+        # What is impossible is refused, not corrected.
+        is_possible = not problem_of_sizes(head, os.fstat(file.fileno()).st_size)
+        found = corrections(head) if is_possible else []
+        for each in found:
+            if not each.is_rounding:
+                given, stated = f"{each.value:g}", f"{each.stated:g}"
+                text = "%s: %s is %s, but the header says %s; the header is taken"
+                _log.warning(text, path, each.parameter, given, stated)
+        content = _read(path, _corrected_copy(file, found) if found else path)
     try:
         recording = _convert(path, content, head)
     except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -71,16 +83,30 @@ def load_recording(path: Path) -> C3dRecording:
     return recording
 
 
-def _read(path: Path) -> Any:
-    """Return what ezc3d reads from the file, including force plates if it supports their type."""
+def _corrected_copy(file: BinaryIO, found: Sequence[Correction]) -> Path:
+    """Return a copy of a file with the corrections, in memory until the process ends."""
+    descriptor = os.memfd_create("c3d")
+    with os.fdopen(descriptor, "wb", closefd=False) as copy:
+        file.seek(0)
+        shutil.copyfileobj(file, copy)
+    for each in found:
+        os.pwrite(descriptor, each.content, each.position)
+    return Path(f"/proc/self/fd/{descriptor}")
+
+
+def _read(path: Path, copy: Path) -> Any:
+    """Return what ezc3d reads from ``copy``, including force plates if it supports their type.
+
+    ``path`` is the user's file, for messages.
+    """
     import ezc3d  # noqa: PLC0415 - an optional extra
 
     try:
-        return ezc3d.c3d(str(path), extract_forceplat_data=True)
+        return ezc3d.c3d(str(copy), extract_forceplat_data=True)
     except Exception as error:  # noqa: BLE001 - the C++ library does not document its errors
         _raise_memory_error(error)
     try:
-        content = ezc3d.c3d(str(path))
+        content = ezc3d.c3d(str(copy))
     except Exception as error:
         _raise_memory_error(error)
         raise TakeError(f"{path} cannot be read as a C3D file ({error}); choose another file") from error
@@ -149,6 +175,13 @@ def _describe(
     if not unit and num_points:
         _log.warning("%s does not say the unit of its points (POINT:UNITS); mm is assumed", path)
     unit = _WHOLE_UNITS.get(unit, unit or "mm")
+    for group, name, count in ((point, "POINT", num_points), (analog, "ANALOG", num_channels)):
+        num_labels = sum(map(bool, _texts_of(group, "LABELS", count)))
+        if 0 < num_labels < count:
+            _log.warning(
+                "%s has %d labels for its %d items (%s:LABELS); the others are numbered",
+                *(path, num_labels, count, name),
+            )
     point_texts = zip(*(_texts_of(point, name, num_points) for name in _ITEM_TEXTS), strict=True)
     markers = tuple(
         Marker(str(number), label or f"Marker {number}", description)
@@ -209,6 +242,8 @@ _COUNT_OFFSET: Final = 300
 """Where the header has the number of its events. It has room for 18."""
 _MAX_HEADER_EVENTS: Final = 18
 _SECOND_US: Final = 1_000_000
+_SAME_TIME_S: Final = 1e-4
+"""Times in C3D are minutes and float32 seconds: after an hour, they differ by so much from what was meant."""
 _NO_LABEL: Final = "Event"
 
 
@@ -227,7 +262,7 @@ def _read_events(
 ) -> tuple[ParametersEvents, Items]:
     """Return the events of the group EVENT, or else those of the header, in µs since the first frame.
 
-    ``content`` is what ezc3d reads, ``head`` the first block of the file. Times count from frame 1 of the
+    ``content`` is what ezc3d reads, ``head`` has the first block of the file. Times count from frame 1 of the
     trial (Vicon, Qualisys), also if the file begins with a later frame, or else from the first frame of the
     file: what places more events in it.
     """
@@ -242,9 +277,16 @@ def _read_events(
     (chosen,) = np.nonzero(within[best])
     # A frame has the events up to its own time, so those after the last frame would come in the next pass.
     seconds = np.clip(choices_s[best], 0.0, max(length_s - period_s, 0.0))
+    moved_s = np.abs(seconds - choices_s[best])[chosen]
+    count, moved_ms = len(texts.seconds), 1e3 * moved_s.max(initial=0.0)
+    if num_moved := int((moved_s > _SAME_TIME_S).sum()):
+        _log.warning(
+            "%s: %d of %d events are before the first frame or after the last one; they are played with "
+            "that frame, up to %.1f ms from their time",
+            *(path, num_moved, count, moved_ms),
+        )
     chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
-    count, left_out = len(texts.seconds), len(texts.seconds) - len(chosen)
-    if left_out:
+    if left_out := count - len(chosen):
         _log.warning("%s: %d of %d events are outside of its frames and are left out", path, left_out, count)
     definitions, numbers = _define(texts)
     items = np.full(len(chosen), UNUSED, LONG_EVENT)

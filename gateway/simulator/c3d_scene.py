@@ -148,7 +148,10 @@ def _read_in_process(path: Path, file_bytes: int) -> tuple[C3dRecording, list[st
     if done.returncode == -signal.SIGXCPU:
         raise _malformed(path, f"took more than {cpu_s} s of CPU time")
     if done.returncode == _NO_MEMORY:
-        raise _malformed(path, f"needed more than {memory_bytes / 1e6:.0f} MB of memory")
+        raise TakeError(
+            f"{path} cannot be read as a C3D file: it is damaged, or of a kind that ezc3d cannot read with "
+            f"{memory_bytes / 1e6:.0f} MB of memory; {_REMEDY}"
+        )
     if done.returncode < 0:
         raise _malformed(path, f"crashed ({signal.Signals(-done.returncode).name})")
     if done.returncode:

@@ -10,6 +10,7 @@ import ezc3d
 import numpy as np
 import pytest
 
+from gateway.c3d_files.receiving import parameter_places
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D, Point
@@ -216,6 +217,173 @@ def test_events_of_the_header_are_played_if_there_is_no_group(path: Path) -> Non
     labels = {int(each.id): each.label for each in take.parameters.events.events}
     events = take.events(0, 50_000)
     assert [(each["timestamp"], labels[each["id"]]) for each in events] == [(10_000, "RTO"), (40_000, "LHS")]
+
+
+def changed(path: Path, **numbers: float) -> Path:
+    """Change what a file states: fields of the header, or parameters such as ANALOG_RATE."""
+    whole = bytearray(path.read_bytes())
+    header = {"points": (2, "H"), "analog": (4, "H"), "first": (6, "H"), "last": (8, "H"), "scale": (12, "f")}
+    header |= {"samples": (18, "H"), "rate": (20, "f")}
+    places = {
+        name.replace(":", "_"): (at, size)
+        for name, size, at, _ in parameter_places(bytes(whole), 512 + 4, "<")
+    }
+    for name, number in numbers.items():
+        at, kind = header[name] if name in header else (places[name][0], {2: "H", 4: "f"}[places[name][1]])
+        struct.pack_into(f"<{kind}", whole, at, number)
+    path.write_bytes(whole)
+    return path
+
+
+def content_of(scene: C3dScene) -> list[Any]:
+    """Return all that is played of a file, as bytes, and its rates."""
+    found: list[Any] = [scene.rates_hz, scene.num_frames, scene.measurement_rate_hz]
+    for component, rate_hz in scene.rates_hz.items():
+        samples = round(scene.num_frames * rate_hz / scene.measurement_rate_hz)
+        found.append(scene.items(component, np.arange(samples)).tobytes())
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("ANALOG_RATE", 1),
+        ("ANALOG_RATE", 0),
+        ("ANALOG_RATE", 100),
+        ("ANALOG_RATE", 500),
+        ("ANALOG_RATE", 999),
+        ("ANALOG_RATE", 1100),
+        ("POINT_RATE", 50),
+        ("POINT_RATE", 200),
+        ("POINT_RATE", 0),
+        ("POINT_USED", 1),
+        ("POINT_USED", 3),
+        ("ANALOG_USED", 0),
+        ("ANALOG_USED", 6),
+        ("ANALOG_USED", 8),
+        ("POINT_FRAMES", 3),
+        ("POINT_FRAMES", 4),
+        ("POINT_SCALE", 0.5),
+        ("POINT_SCALE", -2),
+    ],
+)
+def test_what_contradicts_the_header_is_replaced_by_it_with_a_warning(
+    path: Path, name: str, value: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """ezc3d believes the parameters: it would leave out channels and frames, or read the wrong bytes."""
+    expected = content_of(C3dScene(path))
+    assert not caplog.records
+    assert content_of(C3dScene(changed(path, **{name: value}))) == expected
+    [record] = caplog.records
+    assert record.levelno == logging.WARNING
+    assert name.replace("_", ":") in record.message
+    assert str(path) in record.message
+
+
+@pytest.mark.parametrize("name", ["POINT_LABELS", "ANALOG_LABELS"])
+def test_fewer_labels_than_items_are_reported(
+    path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Labels are by position, so one that is missing may have moved all others."""
+    whole = bytearray(path.read_bytes())
+    places = {each[0].replace(":", "_"): each for each in parameter_places(bytes(whole), 512 + 4, "<")}
+    _, _, at, num_bytes = places[name]
+    last = at + num_bytes * (1 if name == "POINT_LABELS" else 6) // (2 if name == "POINT_LABELS" else 7)
+    whole[last : at + num_bytes] = b" " * (at + num_bytes - last)
+    path.write_bytes(whole)
+    parameters = C3dScene(path).parameters
+    assert parameters.markers is not None
+    assert parameters.analog is not None
+    labels = [each.label for each in parameters.markers.markers]
+    labels += [each.label for each in parameters.analog.channels]
+    assert ("Marker 2" in labels, "Analog 7" in labels) == (name == "POINT_LABELS", name == "ANALOG_LABELS")
+    [record] = caplog.records
+    assert name.replace("_", ":") in record.message
+
+
+def test_one_analog_sample_per_frame_is_played_whatever_the_rate_says(tmp_path: Path) -> None:
+    """The file that was found: 100 Hz, one sample per frame, and an ANALOG:RATE of 1 Hz."""
+    content = new_recording()
+    content["parameters"]["ANALOG"]["RATE"]["value"] = [100]
+    content["data"]["analogs"] = content["data"]["analogs"][:, :, :5]
+    path = changed(written(content, tmp_path), ANALOG_RATE=1)
+    scene = C3dScene(path)
+    assert scene.rates_hz[ComponentType.ANALOG] == 100
+    assert scene.items(ComponentType.ANALOG, np.arange(5)).shape == (5, 7)
+
+
+def test_a_rate_that_was_rounded_is_corrected_without_a_word(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """ezc3d would read nine samples per frame instead of ten, and positions from the wrong bytes."""
+    expected = content_of(C3dScene(path))
+    assert content_of(C3dScene(changed(path, ANALOG_RATE=999.99))) == expected
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        {"rate": 0},
+        {"samples": 0},
+        {"last": 0xFFFF},
+        {"last": 0},
+        {"scale": 0},
+        {"rate": float("nan")},
+    ],
+)
+def test_what_the_header_does_not_say_contradicts_nothing(
+    path: Path, statements: dict[str, float], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Programs leave fields empty, and it cannot count more than 65535 frames."""
+    expected = content_of(C3dScene(path))
+    assert content_of(C3dScene(changed(path, **statements))) == expected
+    assert not caplog.records
+
+
+@pytest.mark.takes
+def test_the_channels_of_a_recording_with_a_wrong_rate_are_played() -> None:
+    """The header says one analog sample per frame at 100 Hz, ANALOG:RATE 1 Hz."""
+    path = Path(os.environ.get("RTC3D_TAKES") or ".") / "analog_rate_1.c3d"
+    if not path.exists():
+        pytest.skip("RTC3D_TAKES names no folder with analog_rate_1.c3d")
+    scene = C3dScene(path)
+    assert scene.items(ComponentType.ANALOG, np.arange(1)).shape == (1, 3)
+    assert scene.rates_hz[ComponentType.ANALOG] == 100
+
+
+def with_events(folder: Path, *seconds: float) -> Path:
+    """Write five frames at 100 Hz with events at these times."""
+    content = new_recording()
+    content.add_parameter("EVENT", "USED", [len(seconds)])
+    content.add_parameter("EVENT", "LABELS", [f"at {each}" for each in seconds])
+    content.add_parameter("EVENT", "TIMES", np.array([[0.0] * len(seconds), seconds]))
+    return written(content, folder)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "played_us", "moved"),
+    [
+        ((0.01, 0.04), [10_000, 40_000], ""),
+        ((0.01, 0.049), [10_000, 40_000], "1 of 2 events"),
+        ((0.0, 0.04999), [0, 40_000], "1 of 2 events"),
+        ((-0.006, 0.02), [0, 20_000], "1 of 2 events"),
+        ((-0.006, 0.046), [0, 40_000], "2 of 2 events"),
+        ((0.0400001, 0.0), [0, 40_000], ""),
+    ],
+)
+def test_events_that_move_to_the_first_or_last_frame_are_reported(
+    tmp_path: Path,
+    seconds: tuple[float, ...],
+    played_us: list[int],
+    moved: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """An event less than a frame after the last one is played with it, or the pass would end without it."""
+    events = C3dScene(with_events(tmp_path, *seconds)).events(0, 50_000)
+    assert events["timestamp"].tolist() == played_us
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * bool(moved)
+    assert moved in caplog.text
 
 
 def test_events_outside_of_the_frames_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
