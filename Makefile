@@ -260,8 +260,9 @@ image: deb
 	set -e; export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct); \
 	    release/image/build dist/rtc3d-gateway_$(VERSION)_amd64.deb $(IMAGE_OPTIONS); \
 	    podman save --quiet --format oci-dir --output build/image rtc3d-gateway:$(VERSION); \
-	    tar --create --file $(OCI) --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner \
-	        --mode=u=rwX,go=rX --directory build/image blobs index.json oci-layout
+	    tar --create --file build/image.tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 --group=0 --numeric-owner \
+	        --mode=u=rwX,go=rX --directory build/image blobs index.json oci-layout; \
+	    mv build/image.tar $(OCI)
 	$(RELEASE).sbom build/release-packages/bin/python $(OCI)
 
 # Check the workflows and the shell scripts. Building actionlint takes 10 s, once, and needs go; without it or without

@@ -17,6 +17,7 @@ import sysconfig
 import tempfile
 import venv
 from collections.abc import Iterator, Mapping, Set
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -47,7 +48,9 @@ def main() -> None:
     arguments.dist.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="rtc3d-gateway-") as folder:
         for built in build(kinds, Path(folder)):
-            print(shutil.copyfile(built, arguments.dist / built.name))
+            with complete_file(arguments.dist / built.name) as unfinished:
+                shutil.copyfile(built, unfinished)
+            print(arguments.dist / built.name)
 
 
 def missing_to_compile() -> str:
@@ -82,6 +85,18 @@ def build(kinds: Set[str], folder: Path) -> Iterator[Path]:
         compiler = compiler_environment(folder) if kind == "compiled" else {}
         run(*hatchling, "wheel", cwd=sources, env={**environment, **compiler})
     yield from (folder / "built").glob("*.whl")
+
+
+@contextmanager
+def complete_file(path: Path) -> Iterator[Path]:
+    """Provide a hidden name, in the folder of ``path``, for a file that becomes ``path`` once it is complete.
+
+    A build that is killed leaves nothing under a name that somebody would publish or install.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}")
+    yield unfinished
+    unfinished.replace(path)
 
 
 def reproducible_environment() -> dict[str, str]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 from license_expression import ExpressionError, get_spdx_licensing
 
 from gateway import __version__
-from release.build import ROOT
+from release.build import ROOT, complete_file
 from release.packages import contents_of, mypy, packages_of
 
 _TABLE: Final = tomllib.loads((ROOT / "release/licences.toml").read_text())
@@ -35,7 +35,8 @@ def main() -> None:
     if problems := [problem for package in packages for problem in problems_of(package)]:
         sys.exit("\n".join([*problems, "See release/licences.toml."]))
     sections = [_HEADER.format(version=__version__), *map(section, packages)]
-    Path(output).write_text(f"\n{'=' * 80}\n".join(sections))
+    with complete_file(Path(output)) as unfinished:
+        unfinished.write_text(f"\n{'=' * 80}\n".join(sections))
 
 
 def licence_of(package: Distribution) -> str | None:

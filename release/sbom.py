@@ -17,7 +17,7 @@ from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 
 from gateway import __version__
-from release.build import ROOT, reproducible_environment, run
+from release.build import ROOT, complete_file, reproducible_environment, run
 from release.deb.packages import contained_packages, debian_purl
 from release.image.contents import image_packages
 from release.licences import licence_of
@@ -32,7 +32,8 @@ def main() -> None:
         text = json.dumps(bill_of_file(file, packages), indent=1, sort_keys=True)
         if error := JsonStrictValidator(SchemaVersion.V1_6).validate_str(text):
             sys.exit(f"The bill of materials of {file} is not valid CycloneDX: {error}")
-        Path(f"{file}.cdx.json").write_text(text + "\n")
+        with complete_file(Path(f"{file}.cdx.json")) as unfinished:
+            unfinished.write_text(text + "\n")
 
 
 def bill_of_packages(python: str) -> dict[str, Any]:

