@@ -223,15 +223,21 @@ class LcmRequests:
             refill = functools.partial(self._refill, source, send, channel, messages)
             if not self.long_sender.offer(refill, content.num_bytes):
                 self._is_refilling = False
-            return
-        if content.num_bytes <= LONG_REPLY_BYTES:
+                self._drop_reply(kind, source, request)
+        elif content.num_bytes <= LONG_REPLY_BYTES:
             send()
         elif not self.long_sender.offer(send, content.num_bytes):
-            self._losses[source].lost(
-                "reply beyond the queue",
-                "a reply on LCM is dropped, because earlier ones wait to be sent; ask less often",
-                frames=0,
-            )
+            self._drop_reply(kind, source, request)
+
+    def _drop_reply(self, kind: RequestKind, source: str, request: Any) -> None:
+        """Count a long reply that is not sent, and send an error, which is short, instead."""
+        self._losses[source].lost(
+            "reply beyond the queue",
+            "a reply on LCM is dropped, because earlier ones wait to be sent; ask less often",
+            frames=0,
+        )
+        error = QueryError("earlier replies wait to be sent; try again", code="busy")
+        self._send_error(kind, source, request, error)
 
     async def _answer_parameters(self, source: str, request: Any) -> ReplyContent:
         parameters = await self._service.parameters(source, request.sections, fresh=request.fresh)
