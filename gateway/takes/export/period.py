@@ -15,6 +15,9 @@ from gateway.takes.files.component_rows import Array
 from gateway.takes.files.spool import release_pages
 
 _BLOCK_FRAMES: Final = 64
+_LOWER: Final = 0.3
+"""Gaps that the numbers do not show make periods longer only, so this part of a block decides, not half."""
+
 _BLOCKS_AT_ONCE: Final = 4000
 
 _MAX_COUNTED: Final = 1000
@@ -34,8 +37,10 @@ _FITS_PART: Final = 0.01
 
 _GAP_ROWS: Final = 1.75
 _JUMP_ROWS: Final = 0.65
-"""A step of more than _GAP_ROWS is a gap if it moves the median of three frames by _JUMP_ROWS: otherwise, a
-frame was only late."""
+"""A step of more than _GAP_ROWS is a gap if it moves the median of three frames by _JUMP_ROWS and by its
+length: otherwise, a frame was only late."""
+_CATCHES_UP_ROWS: Final = 0.6
+"""The step after a frame that was only late is shorter than this."""
 
 _NUM_PASSES: Final = 2
 """With the period of the first pass, more gaps are seen."""
@@ -104,7 +109,7 @@ def measured_period_us(run: RunTimes) -> float | None:
     periods_us = periods_us[periods_us > 0]
     if not len(periods_us):
         return None
-    period_us = float(np.median(periods_us))
+    period_us = float(np.quantile(periods_us, 0.5, method="lower"))
     for _ in range(_NUM_PASSES):
         period_us = _refined(run, period_us)
     return period_us
@@ -136,17 +141,17 @@ def _refined(run: RunTimes, rough_us: float) -> float:
 
 
 def block_periods_us(run: RunTimes) -> Array:
-    """Return the median period of each block of frames, by what their numbers count."""
+    """Return about the period of each block of frames, by what their numbers count."""
     size = _block_size(len(run))
     if len(run) < 2:
         return np.empty(0)
-    distance = max(size // 4, 1)
+    distance = min(max(size // 4, 1), _BLOCK_FRAMES // 4)
     found = []
     for part in _parts(run, size):
         rows = np.concatenate([[0], np.cumsum(part.counted())]).reshape(-1, size)
         times = part.times_us.reshape(-1, size)
         slopes = (times[:, distance:] - times[:, :-distance]) / (rows[:, distance:] - rows[:, :-distance])
-        found.append(np.median(slopes, axis=1))
+        found.append(np.quantile(slopes, _LOWER, axis=1))
     return np.concatenate(found)
 
 
@@ -182,8 +187,11 @@ def _lines(run: RunTimes, size: int, period_us: float) -> tuple[Array, Array, Ar
     shifts[-2:] = shifts[-3]
     medians = np.median(sliding_window_view(shifts, 3), axis=1)
     jumps = medians[3:] - medians[: len(elapsed)]
-    is_gap = (elapsed >= _GAP_ROWS) & (elapsed <= _MAX_COUNTED) & (steps == 1) & (jumps >= _JUMP_ROWS)
-    steps = np.where(is_gap, np.round(np.clip(elapsed, 1, _MAX_COUNTED)), steps)
+    lengths = 1 + np.round(np.clip(jumps, 0, _MAX_COUNTED))
+    is_gap = (elapsed >= _GAP_ROWS) & (abs(elapsed - lengths) <= 1) & (steps == 1) & (jumps >= _JUMP_ROWS)
+    follows = np.concatenate([elapsed[1:], [1.0]]) if len(elapsed) else elapsed
+    is_gap &= (lengths > 2) | (follows >= _CATCHES_UP_ROWS)
+    steps = np.where(is_gap, lengths, steps)
     rows = np.concatenate([[0.0], np.cumsum(steps)]).reshape(-1, size)
     times = (run.times_us - run.times_us[0]).astype(np.float64).reshape(-1, size)
     row, time = rows - rows.mean(axis=1, keepdims=True), times - times.mean(axis=1, keepdims=True)
