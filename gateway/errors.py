@@ -1,6 +1,6 @@
 """All errors of the gateway, in one tree below GatewayError.
 
-- ConfigError, ServerError, PortError, OutputError, PeerError, SpoolError, ViewError, QueryError
+- ConfigError, ServerError, PortError, OutputError, PeerError, SpoolError, ViewError, QueryError, ForkError
 - TakeError: SelectionError
 - ProtocolError: PacketError, FrameError, CommandError, ParametersError
 - LinkError: ConnectError, ReplyTimeoutError, SilenceError, RequestError, DefectError, ClosedError
@@ -149,6 +149,10 @@ class QueryError(GatewayError):
     def __init__(self, message: str, *, code: str = "bad-request") -> None:
         super().__init__(message)
         self.code = code
+
+
+class ForkError(GatewayError):
+    """A connection to gateways cannot be used, because the process is a fork of the one that opened it."""
 
 
 NO_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})

@@ -24,6 +24,7 @@ from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION
 from gateway.outputs.lcm.settings import effective_lcm_url, lcm_queries_url
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.outputs.zenoh.subscriber import open_zenoh
+from gateway.program_end import Process, close_at_end
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from gateway.takes.files.event_log import EventBoundary
 
@@ -76,6 +77,7 @@ class GatewayClient:
         self._address = address
         self._timeout_s = timeout_s
         self._opened: Transport | None = None
+        self._process = Process()
 
     def __enter__(self) -> Self:
         return self
@@ -85,9 +87,9 @@ class GatewayClient:
 
     def close(self) -> None:
         """Close the connection."""
-        if self._opened is not None:
-            self._opened.close()
-            self._opened = None
+        opened, self._opened = self._opened, None
+        if opened is not None and not self._process.is_forked:
+            opened.close()
 
     # What there is.
 
@@ -177,10 +179,12 @@ class GatewayClient:
         """
         transport = _open(self._address)
         try:
-            return transport.subscribe(
-                sources, components, reception, Completeness(complete, last_s, patience_s)
+            return close_at_end(
+                transport.subscribe(
+                    sources, components, reception, Completeness(complete, last_s, patience_s)
+                )
             )
-        except Exception:
+        except BaseException:  # Ctrl-C, too: Zenoh's threads would keep the process alive
             transport.close()
             raise
 
@@ -190,6 +194,8 @@ class GatewayClient:
         """Return the connection. Raises QueryError if Zenoh does not open, OutputError if LCM does not."""
         if self._opened is None:
             self._opened = _open(self._address)
+            self._process = Process()
+        self._process.check("this client")
         return self._opened
 
     def _ask(self, query: Query, source: str | None) -> Replies[list[Reply]]:
@@ -223,15 +229,16 @@ class GatewayClient:
 
 
 def _open(address: GatewayAddress) -> Transport:
+    """Return an open connection. Raises ForkError, and see ``GatewayClient._transport``."""
     if address.is_lcm:
         url = effective_lcm_url(address.url)
         queries_url = address.queries_url or lcm_queries_url(url)
-        return LcmTransport(url, queries_url, address.prefix or DEFAULT_LCM_PREFIX)
+        return close_at_end(LcmTransport(url, queries_url, address.prefix or DEFAULT_LCM_PREFIX))
     try:
         session = open_zenoh(address.connect, address.zenoh_config)
     except OutputError as error:
         raise QueryError(str(error), code="no-gateway") from error
-    return ZenohTransport(session, address.prefix or DEFAULT_ZENOH_PREFIX)
+    return close_at_end(ZenohTransport(session, address.prefix or DEFAULT_ZENOH_PREFIX))
 
 
 def _described(name: str | None, details: TakeDetails) -> dict[str, str]:

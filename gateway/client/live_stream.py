@@ -22,6 +22,7 @@ from gateway.client.transport import GatewaySubscriber, close_in_time, silence_t
 from gateway.errors import SelectionError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.encode import VERSION_OFFSET
+from gateway.program_end import Process, close_at_end
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.reader import MessageBatch
@@ -132,6 +133,7 @@ class Live:
 
     def open(self) -> Self:
         """Connect now, and not when it is first used."""
+        self._check_process()
         with self._taking:
             if self._connection is None and not self._is_closed:
                 complete, last_s = self._completeness
@@ -140,11 +142,19 @@ class Live:
                 )
                 self._connection = _Connection(subscriber, self._reception)
                 weakref.finalize(self, self._connection.close)
+                close_at_end(self)
         return self
+
+    def _check_process(self) -> None:
+        """Raise ForkError if this is a fork of the process that has opened it: nothing would arrive."""
+        if self._connection is not None:
+            self._connection.process.check("live()")
 
     def close(self) -> None:
         """Disconnect. Iterations end."""
         self._is_closed = True
+        if self._connection is not None and self._connection.process.is_forked:
+            return  # a thread of the parent may have held any lock at the fork
         self._reception.close()
         if self._connection is not None:
             self._connection.close()
@@ -290,6 +300,7 @@ class Live:
 
         Returns how long to wait for the next call unless something arrives; None if not before.
         """
+        self._check_process()
         with self._taking:
             now_s = self._decoded_s = time.monotonic()
             arrivals, wait_s = self._described(now_s)
@@ -363,13 +374,14 @@ class _Connection:
     def __init__(self, subscriber: GatewaySubscriber, reception: LiveReception) -> None:
         self._subscriber = subscriber
         self._reception = reception
+        self.process = Process()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live-sources", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Unsubscribe."""
-        if not self._closed.is_set():
+        if not (self._closed.is_set() or self.process.is_forked):
             self._closed.set()
             self._thread.join(_CLOSE_S)
             close_in_time(self._subscriber)

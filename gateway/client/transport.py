@@ -214,6 +214,8 @@ class GatewaySubscriber(ABC):
         if completeness != INCOMPLETE:
             reception.complete(self._ask_history, self._find_kept, completeness)
         self._series: dict[str, Series | None] = {}  # by address; None: left out
+        self._closing = threading.Lock()
+        self._is_closed = False
 
     # In the threads that receive.
 
@@ -297,10 +299,13 @@ class GatewaySubscriber(ABC):
         """Return that no gateway is found, or none with these sources; "" if one is. It may take 1 s."""
 
     def close(self) -> None:
-        """Unsubscribe. It may block while a peer does not read."""
-        if self._reception.refill is not None:
-            self._reception.refill.close()
-        self._close()
+        """Unsubscribe. It may block while a peer does not read, or another thread is closing it."""
+        with self._closing:
+            if not self._is_closed:
+                self._is_closed = True
+                if self._reception.refill is not None:
+                    self._reception.refill.close()
+                self._close()
 
     @abstractmethod
     def _close(self) -> None: ...
@@ -364,7 +369,10 @@ def silence_text(subscriber: GatewaySubscriber, reception: Reception[Any, Any]) 
 
 
 def close_in_time(subscriber: GatewaySubscriber) -> None:
-    """Close a subscriber, but do not wait longer than 0.5 s: a peer that does not read delays it."""
-    thread = threading.Thread(target=subscriber.close, name="subscriber-close", daemon=True)
+    """Close a subscriber, but do not wait longer than 0.5 s: a peer that does not read delays it.
+
+    The thread is no daemon: a program that ends meanwhile waits for it, instead of crashing in Zenoh.
+    """
+    thread = threading.Thread(target=subscriber.close, name="subscriber-close", daemon=False)
     thread.start()
     thread.join(_CLOSE_S)

@@ -1,6 +1,8 @@
 """The five programs of docs/how-to/live-python.md, as printed there, with a gateway and simulators."""
 
+import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -53,6 +55,23 @@ def run(name: str, *arguments: str) -> "subprocess.Popen[str]":
     )
 
 
+def interrupted(process: "subprocess.Popen[str]", text: str) -> tuple[int, str]:
+    """Send one Ctrl-C when the program has printed ``text``; return its exit status and its output."""
+    with process:
+        assert process.stdout is not None
+        printed = []
+        try:
+            for line in process.stdout:
+                printed.append(line)
+                if text in line and "nan" not in line:
+                    process.send_signal(signal.SIGINT)
+                    printed.append(process.communicate(timeout=120)[0])
+                    return process.returncode, "".join(printed)
+        finally:
+            process.kill()
+    pytest.fail("".join(printed))
+
+
 @pytest.mark.parametrize("name", [*ENDLESS, "live_record.py"])
 def test_the_page_has_the_program_as_it_is(name: str) -> None:
     assert (EXAMPLES / name).read_text() in [block.text for block in blocks(PAGE, "python")]
@@ -60,18 +79,33 @@ def test_the_page_has_the_program_as_it_is(name: str) -> None:
 
 @pytest.mark.netns
 @pytest.mark.parametrize("name", ENDLESS)
-def test_a_program_prints_live_data(name: str, endpoint: str) -> None:
-    with run(name, endpoint) as process:
-        assert process.stdout is not None
-        printed = []
-        try:
-            for line in process.stdout:
-                printed.append(line)
-                if ENDLESS[name] in line and "nan" not in line:
-                    return
-        finally:
-            process.kill()
-    pytest.fail("".join(printed))
+def test_a_program_prints_live_data_and_ends_by_one_ctrl_c(name: str, endpoint: str) -> None:
+    status, output = interrupted(run(name, endpoint), ENDLESS[name])
+    assert status == -signal.SIGINT
+    assert output.endswith("KeyboardInterrupt\n")
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize("name", ["join.py", "subscriber_zenoh.py"])
+def test_a_program_without_the_client_ends_by_one_ctrl_c(name: str, endpoint: str) -> None:
+    status, output = interrupted(run(name, "--connect", endpoint), "listening")
+    assert status == 0
+    assert "Traceback" not in output
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize("page", ["README.md", PAGE])
+def test_the_first_program_of_a_page_ends_by_one_ctrl_c(page: str, endpoint: str, tmp_path: Path) -> None:
+    """The program is as printed; only the network namespace needs the endpoint."""
+    [*_, program] = [block.text for block in blocks(page, "python")][:1]
+    config = tmp_path / "zenoh.json5"
+    file = tmp_path / "program.py"
+    config.write_text(json.dumps(zenoh_keys("client", connect=endpoint)))
+    options = f'components=["3d"], zenoh_config="{config}")'
+    file.write_text(program.replace('components=["3d"])', options))
+    status, output = interrupted(run(str(file)), " ")
+    assert status == -signal.SIGINT
+    assert output.endswith("KeyboardInterrupt\n")
 
 
 @pytest.mark.netns

@@ -16,9 +16,13 @@ from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRe
 from gateway.outputs.zenoh.config import command_config, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX, ZenohSettings
+from gateway.program_end import Process
 
 _PORTS: Final = range(20_000, 32_768)
 """Those of the demo. Linux gives the ports above to other sockets: one could get it before Zenoh listens."""
+
+_first_use: Final[list[Process]] = []
+"""The process that has opened the first session; empty before."""
 
 
 def key_patterns(prefix: str, source: str | None, component: str | None) -> tuple[str, ...]:
@@ -51,7 +55,14 @@ def subscriber_config(connect: str | None, config_file: Path | None) -> zenoh.Co
 
 
 def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Session:
-    """Return an open session with ``subscriber_config``. Raises OutputError if it does not open."""
+    """Return an open session with ``subscriber_config``.
+
+    Raises OutputError if it does not open, and ForkError in a fork of a process that has used Zenoh: the
+    threads that all sessions share are not there.
+    """
+    if not _first_use:
+        _first_use.append(Process())
+    _first_use[0].check("a Zenoh session")
     try:
         return zenoh.open(subscriber_config(connect, config_file))
     except zenoh.ZError as error:

@@ -1,0 +1,124 @@
+"""The end of programs that use this package, and their forks: what they have opened is closed, or refused.
+
+Python waits for all threads that are not daemons before it runs atexit and weakref.finalize. Zenoh calls back
+in such threads, which end when their session is closed; so a program that does not close it would never end.
+A daemon thread that closes it may return from Zenoh during Python's shutdown, which aborts the process.
+"""
+
+import atexit
+import os
+import sys
+import threading
+import traceback
+import weakref
+from typing import Any, Final, Protocol, TypeVar
+
+from gateway.errors import ForkError
+
+_ZENOH_THREAD: Final = "(pyo3-closure)"
+"""How the names of the threads end in which Zenoh calls back."""
+
+_OWN_DAEMONS: Final = frozenset({"live-sources", "refill"})
+"""Threads of this package that may be in a call of Zenoh. It returns when the session is closed."""
+
+_JOIN_S: Final = 2.0
+
+
+class _Closable(Protocol):
+    def close(self) -> Any: ...
+
+
+_ClosableT = TypeVar("_ClosableT", bound=_Closable)
+
+
+class _OpenObjects:
+    """What the program has opened, in this order, and the thread that closes it at the end."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._opened: list[weakref.ref[Any]] = []
+        self._closer: threading.Thread | None = None
+        atexit.register(self.close)  # if Ctrl-C has ended the waiting for threads
+        os.register_at_fork(after_in_child=self._forget)
+
+    def add(self, opened: _Closable) -> None:
+        with self._lock:
+            self._opened = [ref for ref in self._opened if ref() is not None]
+            self._opened.append(weakref.ref(opened))
+            if self._closer is None:
+                self._closer = threading.Thread(target=self._close_at_end, name="close-at-end", daemon=False)
+                self._closer.start()
+
+    def close(self) -> None:
+        """Close everything, the newest first."""
+        while True:
+            with self._lock:
+                if not self._opened:
+                    return
+                opened = self._opened.pop()()
+            if opened is not None:
+                try:
+                    opened.close()
+                except Exception:  # noqa: BLE001 - the others must be closed nevertheless
+                    traceback.print_exc()
+
+    def _close_at_end(self) -> None:
+        threading.main_thread().join()
+        if getattr(sys, "last_type", None) is None:  # no exception has ended the program
+            self._join_others()
+        self.close()
+        for thread in threading.enumerate():
+            if thread.name in _OWN_DAEMONS:
+                thread.join(_JOIN_S)
+
+    def _join_others(self) -> None:
+        """Wait for the threads that Python waits for: the program has not ended before."""
+        mine = {threading.main_thread(), threading.current_thread()}
+        while others := [
+            thread
+            for thread in threading.enumerate()
+            if not (thread.daemon or thread in mine or thread.name.endswith(_ZENOH_THREAD))
+        ]:
+            for thread in others:
+                thread.join()
+
+    def _forget(self) -> None:
+        """Leave what is open to the parent: closing it here would close the connections of both."""
+        self._lock = threading.Lock()
+        self._opened = []
+        self._closer = None
+
+
+_open_objects: Final = _OpenObjects()
+
+
+def close_at_end(opened: _ClosableT) -> _ClosableT:
+    """Close an object when the program has ended, unless nothing refers to it any more; return it.
+
+    The program has ended when its main thread has, and all other threads that are not daemons; or when an
+    exception, such as that of Ctrl-C, has ended the main thread. Closing twice must be allowed.
+    """
+    _open_objects.add(opened)
+    return opened
+
+
+class Process:
+    """The process that something was opened in: after a fork, the child has no threads to receive with."""
+
+    def __init__(self) -> None:
+        self._pid = os.getpid()
+
+    @property
+    def is_forked(self) -> bool:
+        """Whether this is a fork of that process."""
+        return os.getpid() != self._pid
+
+    def check(self, what: str) -> None:
+        """Raise ForkError, which says that ``what`` was opened before the fork, if this is a fork."""
+        if self.is_forked:
+            raise ForkError(
+                f"{what} was opened in process {self._pid}, and does not work in process {os.getpid()}, "
+                "which is a fork of it; start processes with multiprocessing's method 'spawn' "
+                "(in joblib: backend 'loky'; in a DataLoader: multiprocessing_context='spawn'), "
+                "or open it only after the fork"
+            )
