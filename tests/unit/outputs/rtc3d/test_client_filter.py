@@ -109,6 +109,7 @@ async def test_a_stop_is_carried_out_although_its_client_has_gone(
     assert server.asked[-1] == ("lab", False, "")
     await server.answers.put("")
     await settle()
+    assert server.answers.empty()  # it was not cancelled
     assert asyncio.all_tasks() == {asyncio.current_task()}
 
 
