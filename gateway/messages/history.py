@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from gateway.errors import ProtocolError
 from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
+from gateway.messages.host_time import HostClock, host_clock
 
 MAX_ANSWER_BYTES: Final = 200_000
 """How long the messages of one answer may be together, unless a single one is longer."""
@@ -34,12 +35,14 @@ class WantedMessages(NamedTuple):
     """Which messages of a key are wanted: from number ``first``, or since ``since_utime``, up to ``last``.
 
     One of the first two is None. ``since_utime`` is in µs since the Unix epoch; ``last`` is included, and
-    None means the newest message.
+    None means the newest message. With ``last_s``, those of so many seconds are wanted, whatever the wall
+    clock has shown since then; ``since_utime`` is then for the disk, which does not know their ages.
     """
 
     first: int | None
     since_utime: int | None = None
     last: int | None = None
+    last_s: float | None = None
 
 
 class FoundMessages(NamedTuple):
@@ -72,11 +75,13 @@ class MessageHistory:
     The numbers of a key grow, and some may be missing. ``begin_block`` must be called once a second.
     """
 
-    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic, host: HostClock = host_clock) -> None:
         self._monotonic = monotonic
+        self._host = host
+        self._steps = host.steps  # of the wall clock, before the newest block
         self._seconds = 0.0
         self._max_bytes = 0
-        self._blocks: deque[_Block] = deque([_Block(monotonic())])
+        self._blocks: deque[_Block] = deque([self._new_block(monotonic())])
         self._newest = self._blocks[-1]
 
     def set_limits(self, seconds: float, max_bytes: int) -> None:
@@ -117,6 +122,9 @@ class MessageHistory:
     def add(self, key: str, message: bytes) -> None:
         """Keep a message."""
         if self._max_bytes:
+            if self._host.steps != self._steps:
+                self._blocks.append(self._new_block(self._monotonic()))
+                self._newest = self._blocks[-1]
             block = self._newest
             messages = block.messages.get(key)
             if messages is None:
@@ -135,8 +143,14 @@ class MessageHistory:
             num_bytes -= blocks.popleft().num_bytes
         newest = blocks[-1] if blocks else None
         if newest is None or newest.num_bytes * _BLOCKS > self._max_bytes or now_s >= newest.end_s:
-            blocks.append(_Block(now_s))
+            blocks.append(self._new_block(now_s))
         self._newest = blocks[-1]
+
+    def _new_block(self, now_s: float) -> "_Block":
+        """Return a block that begins now: between two steps of the wall clock, it tells ages."""
+        utime = self._host.read()[0]
+        self._steps = self._host.steps
+        return _Block(now_s, utime)
 
     def forget(self, key: str) -> None:
         """Forget the messages of a key, because its numbers begin again."""
@@ -154,7 +168,9 @@ class MessageHistory:
             return None
         oldest, newest = sequence_of(runs[0][0]), sequence_of(runs[-1][-1])
         first = wanted.first
-        if first is None:
+        if wanted.last_s is not None:
+            first = self._first_of_last(key, wanted.last_s, newest + 1)
+        elif first is None:
             since_utime = 0 if wanted.since_utime is None else wanted.since_utime
             first = _first_since(runs, since_utime, newest + 1)
         last = newest if wanted.last is None else min(wanted.last, newest)
@@ -170,18 +186,56 @@ class MessageHistory:
             messages.append(message)
         return FoundMessages(messages, first, last, oldest, newest)
 
+    def utime_before(self, key: str, last_s: float) -> int | None:
+        """Return the time ``last_s`` ago on the wall clock, as it was set for the oldest message of a key.
+
+        None if the key has no messages.
+        """
+        for block, end_s in self._blocks_with(key):
+            oldest = block.messages[key][0]
+            older_s = block.time_s(oldest, end_s) - (self._monotonic() - last_s)
+            return utime_of(oldest) - round(1e6 * older_s)
+        return None
+
+    def _first_of_last(self, key: str, last_s: float, otherwise: int) -> int:
+        """Return the number of the first message of a key that is not older than ``last_s``."""
+        since_s = self._monotonic() - last_s
+        for block, end_s in self._blocks_with(key):
+            messages = block.messages[key]
+            if block.time_s(messages[-1], end_s) >= since_s:
+                return next(sequence_of(each) for each in messages if block.time_s(each, end_s) >= since_s)
+        return otherwise
+
+    def _blocks_with(self, key: str) -> list[tuple["_Block", float]]:
+        """Return the blocks that have messages of a key, and when each ended, in order."""
+        ends_s = [*(block.begin_s for block in self._blocks), self._monotonic()][1:]
+        return [pair for pair in zip(self._blocks, ends_s, strict=True) if pair[0].messages.get(key)]
+
     def _runs(self, key: str) -> list[list[bytes]]:
         """Return the messages of a key in each block that has some, in order."""
         return [messages for block in self._blocks if (messages := block.messages.get(key))]
 
 
 class _Block:
-    """The messages of about a second."""
+    """The messages of about a second, during which nobody has set the wall clock.
 
-    def __init__(self, begin_s: float) -> None:
+    It began at ``begin_s`` on the monotonic clock, and at ``begin_utime``, in µs since the Unix epoch.
+    """
+
+    def __init__(self, begin_s: float, begin_utime: int) -> None:
+        self.begin_s = begin_s
         self.end_s = begin_s + _BLOCK_S
+        self._begin_utime = begin_utime
         self.messages: dict[str, list[bytes]] = {}
         self.num_bytes = 0
+
+    def time_s(self, message: bytes, end_s: float) -> float:
+        """Return when a message was published, on the monotonic clock; the block ended at ``end_s``.
+
+        A message may have been dated just before the step of the wall clock that begins the block.
+        """
+        time_s = self.begin_s + 1e-6 * (utime_of(message) - self._begin_utime)
+        return min(max(time_s, self.begin_s), end_s)
 
 
 def sequence_of(message: bytes) -> int:

@@ -233,6 +233,9 @@ class FanOut:
         disk, oldest, _ = on_disk
         if found is None:
             return await self._recorded(disk, key, wanted)
+        if wanted.last_s is not None:
+            since_utime = self.history.utime_before(key, wanted.last_s)
+            wanted = wanted._replace(since_utime=since_utime, last_s=None)
         is_older = found.first < found.oldest if wanted.first is not None else found.first == found.oldest
         if is_older:
             last = found.oldest - 1 if wanted.last is None else min(wanted.last, found.oldest - 1)

@@ -124,14 +124,15 @@ def _wanted(options: Mapping[str, str]) -> WantedMessages:
     """Return which messages are wanted. Raises QueryError."""
     if len(_BEGIN_OPTIONS & options.keys()) != 1:
         raise QueryError(f"messages of the history need one of {', '.join(sorted(_BEGIN_OPTIONS))}")
-    first = since_utime = None
+    first = since_utime = last_s = None
     if "from" in options:
         first = _whole_number("from", options)
     elif "since_utime" in options:
         since_utime = _whole_number("since_utime", options)
     else:
         try:
-            last_us = round(1e6 * float(options["last_s"]))
+            last_s = float(options["last_s"])
+            last_us = round(1e6 * last_s)
         except (ValueError, OverflowError):
             last_us = -1
         if last_us < 0:
@@ -139,7 +140,8 @@ def _wanted(options: Mapping[str, str]) -> WantedMessages:
                 f"last_s={quoted(options['last_s'])} is not accepted; accepted: a number of seconds"
             )
         since_utime = max(0, now_utime() - last_us)
-    return WantedMessages(first, since_utime, _whole_number("to", options) if "to" in options else None)
+    last = _whole_number("to", options) if "to" in options else None
+    return WantedMessages(first, since_utime, last, last_s)
 
 
 def _whole_number(name: str, options: Mapping[str, str]) -> int:

@@ -15,6 +15,7 @@ from gateway.messages.history import (
     sequence_of,
     unpack_messages,
 )
+from gateway.messages.host_time import HostClock
 from tests.support.clocks import Clock
 
 
@@ -126,3 +127,91 @@ def test_packed_messages_are_unpacked_and_a_cut_is_noticed(messages: list[bytes]
     if messages:
         with pytest.raises(ProtocolError):
             unpack_messages(payload[:-num_cut])
+
+
+class SteppedHost(HostClock):
+    """The clocks of a computer whose wall clock somebody sets; ``clock`` is the monotonic one."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.steps = 0
+        self.offset_us = 1_700_000_000_000_000
+
+    @property
+    def utime(self) -> int:
+        return self.offset_us + round(1e6 * self._clock.now_s)
+
+    def read(self) -> tuple[int, int]:
+        return self.utime, round(1e6 * self._clock.now_s)
+
+    def step(self, by_s: int) -> None:
+        self.offset_us += by_s * 1_000_000
+        self.steps += 1
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.0, 0.01, 0.3, 1.1, 5.0]),
+            st.sampled_from(["", "", "", "maintain", "step"]),
+            st.sampled_from([-86_400, -50, -1, 1, 9, 50, 86_400]),
+        ),
+        min_size=1,
+        max_size=60,
+    ),
+    st.sampled_from([0.05, 1.0, 10.0, 30.0, 1000.0]),
+)
+def test_the_last_seconds_are_those_of_a_clock_that_nobody_sets(
+    steps: list[tuple[float, str, int]], last_s: float
+) -> None:
+    """After a step forward, ten seconds were one; after a step back, they were the whole minute."""
+    clock = Clock()
+    host = SteppedHost(clock)
+    history = MessageHistory(clock, host)
+    history.set_limits(60.0, 1 << 20)
+    times: list[float] = []
+    for pause_s, work, by_s in steps:
+        clock.now_s += pause_s
+        if work == "step":
+            host.step(by_s)
+        elif work == "maintain":
+            history.begin_block()
+        history.add("3d", message(len(times), host.utime))
+        times.append(clock.now_s)
+    kept = read_all(history, "3d", WantedMessages(0))
+    found = read_all(history, "3d", WantedMessages(None, None, None, last_s))
+    certain = {number for number in kept if times[number] >= clock.now_s - last_s + 1e-4}
+    possible = {number for number in kept if times[number] >= clock.now_s - last_s - 1e-4}
+    assert certain <= {*found} <= possible
+    assert found == sorted(found)
+
+
+def test_a_message_that_was_dated_before_a_step_and_kept_after_it_is_young() -> None:
+    """Another stream may have noticed the step in between."""
+    clock = Clock()
+    host = SteppedHost(clock)
+    history = MessageHistory(clock, host)
+    history.set_limits(60.0, 1 << 20)
+    for number, by_s in enumerate((1000, -1000)):
+        utime = host.utime
+        host.step(by_s)
+        history.add("3d", message(number, utime))
+    clock.now_s += 1
+    history.begin_block()
+    clock.now_s += 4
+    assert read_all(history, "3d", WantedMessages(None, None, None, 6.0)) == [0, 1]
+    assert read_all(history, "3d", WantedMessages(None, None, None, 3.9)) == []
+
+
+def test_the_disk_is_asked_for_the_time_that_the_clock_showed_before_a_step() -> None:
+    clock = Clock()
+    host = SteppedHost(clock)
+    history = MessageHistory(clock, host)
+    history.set_limits(60.0, 1 << 20)
+    assert history.utime_before("3d", 10.0) is None
+    before = host.utime
+    history.add("3d", message(0, before))
+    clock.now_s += 5
+    host.step(-50)
+    history.add("3d", message(1, host.utime))
+    assert history.utime_before("3d", 10.0) == before - 5_000_000
