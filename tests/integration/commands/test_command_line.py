@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import shlex
 import signal
@@ -70,7 +71,7 @@ async def test_output_goes_nowhere(arguments: str) -> None:
     """A reader that leaves, a full device, and a closed stream."""
     command = f"PROGRAM {arguments}"
     full = await run_shell(f"{command} >/dev/full")
-    assert full == (1, "", "cannot write the output: No space left on device\n")
+    assert full == (1, "", f"cannot write the output: {os.strerror(errno.ENOSPC)}\n")
     assert (await run_shell(f"{command} 2>/dev/full")).status == 0
     for nowhere in ("| true", ">&-", ">&- 2>&- <&-"):
         ended = await run_shell(f"set -o pipefail; {command} {nowhere}")

@@ -15,6 +15,7 @@ from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from tests.support.errors import names
 from tests.support.findings import (
     MARKERS_XML,
     TOOLS_XML,
@@ -91,100 +92,95 @@ def of(*components: ComponentType, rate: Rate | None = None) -> tuple[StreamSett
 
 
 def case(result: Result, server: Script, check: str, found: str, remedy: str = "", **keys: Any) -> Any:
-    """Return what the doctor finds out about a server. ``keys`` are settings of the source."""
+    """Return a value that the doctor finds out about a server, and one in the remedy if there must be one.
+
+    ``keys`` are settings of the source.
+    """
     return pytest.param(result, server, check, found, remedy, keys, id=f"{check}: {found}")
-
-
-NO_RATE: Final = "the server announces no rate, so the configured divisor 2 cannot be compared"
-NO_6D: Final = "the server's parameters list items of 6d, but no frame contains 6d"
-PORTS: Final = "3020 is First Principles, 3030 WaveFront"
-REFUSALS: Final = "server refused Version 1.0: err-unknown command; the server refused SendParameters: err-"
 
 
 @pytest.mark.parametrize(
     ("result", "server", "check", "found", "remedy", "keys"),
     [
-        case(FAILING, web_server, "protocol", "is not an RT server; its first bytes are 'HTTP/1.1 4", PORTS),
+        case(FAILING, web_server, "protocol", "'HTTP/1.1 4", "3020"),
         case(
             *(
                 FAILING,
                 silent,
                 "protocol",
-                "accepts a connection but sends nothing",
-                "restart the RT server.",
+                "sends nothing",
+                "restart",
             ),
             reply_timeout_s=0.1,
         ),
-        case(FAILING, disconnecting, "protocol", "the connection to 127.0.0.1:", "accepts one more client"),
+        case(FAILING, disconnecting, "protocol", "the connection to 127.0.0.1:", "client"),
         case(
             *(FAILING, replying(parameters(), refused="StreamFrames"), "protocol"),
-            *("refuses every form of the StreamFrames command", "Enable the real-time output"),
+            *("StreamFrames", "real-time output"),
         ),
-        case(PASSING, replying(b"", *FRAMES, refused="Version|SendParameters"), "protocol", REFUSALS),
+        case(PASSING, replying(b"", *FRAMES, refused="Version|SendParameters"), "protocol", "SendParameters"),
         case(
             *(FAILING, replying(packet(2, "no xml"), GOOD), "parameters"),
-            *("the server's XML cannot be read: ", "The gateway publishes data without names and units."),
+            *("XML", "names and units"),
         ),
         case(
             PASSING, replying(packet(2, "<RT_Parameters><The_3D></The_6D>"), GOOD), "parameters", "(repaired"
         ),
         case(
             *(WARNING, replying(FURLONGS, GOOD), "parameters"),
-            *("0 markers; unit of length 'furlong' is unknown: no positions in metres", "transform.units"),
+            *("'furlong'", "transform.units"),
         ),
         case(PASSING, replying(FURLONGS, GOOD), "parameters", "0 markers", transform={"units": "mm"}),
         case(
             *(FAILING, replying(parameters(), NO_DATA), "frames"),
-            *("the server reports that no measurement is running", "Start a measurement on the server"),
+            *("no measurement", "Start a measurement"),
         ),
         case(
             *(FAILING, replying(parameters()), "frames"),
-            *("no frame of stream 3d 6d arrived, and the server did not", "Check that the server shows"),
+            *("3d 6d", "server"),
             streams=of(MARKERS, TOOLS),
         ),
         case(
-            *(Result.NOT_TESTED, replying(parameters()), "frames", "no event occurred during the check"),
+            *(Result.NOT_TESTED, replying(parameters()), "frames", "no event"),
             streams=of(EVENT),
         ),
         case(
             *(FAILING, replying(parameters(), GOOD, packet(3, GOOD[8:-4])), "frames"),
-            *("1 of 2 frames are malformed: component 1 of 1", "The gateway drops malformed frames."),
+            *("1 of 2 frames", "malformed"),
         ),
         case(
-            *(FAILING, replying(WITH_TOOLS, GOOD), "frames", NO_6D),
-            *("Enable the real-time output of 6d on the server, or remove 6d from the stream's components.",),
+            *(FAILING, replying(WITH_TOOLS, GOOD), "frames", "6d", "components"),
             streams=of(MARKERS, TOOLS),
         ),
         *(
             case(
-                *(NOTE, streaming(WITH_TOOLS, markers), "frames", NO_6D),
-                *("If you need 6d, enable its real-time output on the server.",),
+                *(NOTE, streaming(WITH_TOOLS, markers), "frames", "6d", "6d"),
                 streams=streams,
             )
             for streams in ("auto", of())
         ),
         case(
             *(FAILING, streaming(parameters(), markers), "frames"),
-            *("frames arrived, but none has a component of stream 6d",),
+            *("stream 6d", ""),
             streams=of(TOOLS),
         ),
         case(
             *(FAILING, cut_while_streaming, "frames"),
-            *("the server closed the connection while the doctor waited", "takes over the stream"),
+            *("closed the connection", "takes over"),
             reply_timeout_s=1.0,
         ),
         case(
             *(FAILING, replying(XML[100], *FRAMES, NO_DATA), "frames"),
-            *(" s, and the server reports that no measurement is running",),
+            *("no measurement", ""),
         ),
-        case(FAILING, streaming(XML[500], markers), "rate", "3d 100 of 500 Hz", "too slow. Check the server"),
-        case(FAILING, streaming(XML[50], markers), "rate", "50 Hz: the server sends more frames than its"),
-        case(FAILING, streaming(XML[1], lambda _: GOOD), "rate", "of 1 Hz: the server sends more frames"),
+        case(FAILING, streaming(XML[500], markers), "rate", "3d 100 of 500 Hz", "too slow"),
+        case(FAILING, streaming(XML[50], markers), "rate", "50 Hz: the server sends more"),
+        case(FAILING, streaming(XML[1], lambda _: GOOD), "rate", "of 1 Hz: the server sends more"),
         case(FAILING, streaming(XML[900], markers, step=1), "rate", " of 900 Hz"),
         *(
             case(
                 *(FAILING, streaming(xml, markers), "rate"),
-                *("3d 100 of 25 Hz: the server ignores the requested rate",),
+                *("3d 100 of 25 Hz", ""),
                 streams=of(rate=Frequency(25)),
             )
             for xml in (XML[100], parameters())
@@ -196,24 +192,25 @@ REFUSALS: Final = "server refused Version 1.0: err-unknown command; the server r
             )
             for result, hz in ((PASSING, 100), (FAILING, 200))
         ),
-        case(NOTE, streaming(parameters(), markers), "rate", NO_RATE, streams=of(rate=FrequencyDivisor(2))),
+        case(
+            NOTE, streaming(parameters(), markers), "rate", "divisor 2", streams=of(rate=FrequencyDivisor(2))
+        ),
         *(
             case(
                 *(WARNING, streaming(XML[100], frame), "byte order"),
-                *(f"sends {sent}-endian frames, although the gateway requests {wanted}-endian ones",),
-                *(f"set byte_order: {sent} for this source",),
+                *(f"{sent}-endian frames", f"byte_order: {sent}"),
                 byte_order=wanted,
             )
             for wanted, sent, frame in (("big", "little", little_endian), ("little", "big", markers))
         ),
         case(
             *(PASSING, streaming(XML[100], little_endian), "byte order"),
-            *("the frames are little-endian, as requested",),
+            *("little-endian", ""),
             byte_order="little",
         ),
         case(
             *(FAILING, replying(XML[100], markers_frame(1, GONE, GONE)), "visibility"),
-            *("in view: markers 0%", "Check that the cameras see the volume"),
+            *("in view: markers 0%", "cameras"),
         ),
         case(
             *(FAILING, replying(XML[1000], *NEVER_SEEN), "visibility"),
@@ -232,7 +229,7 @@ REFUSALS: Final = "server refused Version 1.0: err-unknown command; the server r
 async def test_what_is_found_about_a_server(
     result: Result, server: Script, check: str, found: str, remedy: str, keys: dict[str, Any]
 ) -> None:
-    """The finding and its remedy are these; without the protocol, nothing that needs it is checked."""
+    """Each fault has its check, result and values; without the protocol, nothing else is checked."""
     findings = await diagnose(server, **keys)
     finding = findings.of(check)
     assert (finding.result, found in finding.found, remedy in finding.remedy) == (result, True, True), finding
@@ -251,12 +248,10 @@ async def test_a_healthy_server_passes_every_check() -> None:
     assert {each.stream for each in findings.all_of("protocol")} == {""}
     texts = [(each.check, each.found) for each in findings.all if each.subject == "lab"]
     frames = [text for check, text in texts if check == "frames"]
-    assert re.fullmatch(r"\d+ frames with 3d, 6d(, event)?; the largest message has \d+ bytes", frames[0])
-    assert re.fullmatch(r"\d+ frames with analog, force; the largest message has \d+ bytes", frames[1])
+    assert re.match(r"\d+ frames with 3d, 6d(, event)?; .* \d+ bytes", frames[0])
+    assert re.match(r"\d+ frames with analog, force; .* \d+ bytes", frames[1])
+    assert names(dict(texts)["TCP"], f"127.0.0.1:{simulator.port}", "2 connections")
     assert set(texts) >= {
-        ("name", "127.0.0.1 is an IP address"),
-        ("TCP", f"127.0.0.1:{simulator.port} accepts 2 connections, one per stream"),
-        ("protocol", "the server accepts every command"),
         ("parameters", "3 markers, 1 tool, 4 analog channels, 1 force plate, 1 event type"),
         ("rate", "3d 20 of 20, 6d 20 of 20 Hz"),
         ("rate", "analog 100 of 100, force 100 of 100 Hz"),
@@ -269,8 +264,8 @@ async def test_an_unknown_host_name_ends_the_checks_of_its_source_only() -> None
     async with Simulator(SyntheticScene(markers=1, tools=0, analog=0, plates=0)) as simulator:
         other = SourceSettings(name="other", host="localhost", port=simulator.port)
         findings = await run_doctor(lab(3020, host="no-such-host.invalid"), other)
-    assert "the host name 'no-such-host.invalid' cannot be resolved: " in findings.of("name").found
-    assert findings.of("name").remedy.startswith("Correct the source's host, add the name to DNS")
+    assert names(findings.of("name").found, "'no-such-host.invalid'")
+    assert names(findings.of("name").remedy, "host", "DNS")
     assert findings.failing() == ["name"]
     assert findings.not_tested(*CHECKS[1:]) == {"it needs name, which failed"}
     assert findings.failing("other") == []
@@ -290,10 +285,10 @@ async def test_the_usual_port_that_answers_is_named(configured: int, answering: 
 
 @pytest.mark.parametrize("is_full", [False, True], ids=["refused", "no answer"])
 async def test_a_server_that_does_not_accept_connections_fails(is_full: bool) -> None:
-    found, remedy, port = "connection refused by 127.0.0.1:", "Is the RT server running, and is", free_port()
+    found, remedy, port = "refused", "RT server", free_port()
     with ExitStack() as stack:
         if is_full:  # the queue of a listener: further connections get no answer
-            found, remedy = "no answer from 127.0.0.1:", "Is the computer on and reachable, and its firewall"
+            found, remedy = "no answer", "firewall"
             full = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
             port = full.getsockname()[1]
             for _ in range(4):
@@ -301,8 +296,8 @@ async def test_a_server_that_does_not_accept_connections_fails(is_full: bool) ->
                 waiting.setblocking(False)
                 waiting.connect_ex(full.getsockname())
         findings = await run_doctor(lab(port, connect_timeout_s=0.2))
-    assert findings.of("TCP").found.startswith(f"{found}{port}")
-    assert findings.of("TCP").remedy.startswith(remedy)
+    assert names(findings.of("TCP").found, found, f"127.0.0.1:{port}")
+    assert names(findings.of("TCP").remedy, remedy)
     assert findings.failing() == ["TCP"]
     assert findings.not_tested(*CHECKS[2:]) == {"it needs TCP, which failed"}
 
@@ -310,24 +305,24 @@ async def test_a_server_that_does_not_accept_connections_fails(is_full: bool) ->
 async def test_what_needs_parameters_is_not_tested_without_them() -> None:
     findings = await diagnose(replying(b"", *FRAMES, refused="SendParameters"))
     [reason] = findings.not_tested("parameters")
-    assert reason.endswith("err-unknown command; names, units and configured rates are unknown")
+    assert names(reason, "err-unknown command")
     assert findings.of("frames").result is PASSING
-    assert findings.not_tested("rate") == {"3d 100 Hz; the server's parameters have no rate to compare with"}
+    [rate] = findings.not_tested("rate")
+    assert names(rate, "3d 100 Hz")
 
 
 async def test_what_needs_frames_is_not_tested_without_them() -> None:
     findings = await diagnose(replying(parameters(), NO_DATA))
     assert findings.failing() == ["frames"]
-    assert findings.not_tested("rate") == {"too few frames to measure the rate"}
-    assert findings.not_tested("visibility") == {"no markers or tools arrived"}
+    assert len(findings.not_tested("rate", "visibility")) == 2
 
 
 async def test_frames_that_stop_while_the_doctor_watches_fail() -> None:
     async with ScriptedServer(streaming(XML[100], markers, stops_after=30)) as server:
         finding = (await run_doctor(lab(server.port), seconds=1.5)).of("frames")
     assert finding.result is FAILING
-    assert finding.found.startswith("the server stopped sending after 30 frames: none arrived for ")
-    assert finding.remedy.startswith("Check whether the server's own display has stopped, too")
+    assert names(finding.found, "30 frames")
+    assert finding.remedy
 
 
 async def test_a_component_limited_by_a_slower_one_fails() -> None:
@@ -335,7 +330,7 @@ async def test_a_component_limited_by_a_slower_one_fails() -> None:
     async with Simulator(scene) as simulator:
         finding = (await run_doctor(lab(simulator.port))).of("rate")
     assert finding.found == "3d 100 of 100, analog 100 of 1000, force 100 of 1000 Hz"
-    assert "Move analog and force to a stream of their own" in finding.remedy
+    assert names(finding.remedy, "analog and force", "stream")
 
 
 @pytest.mark.parametrize(
@@ -369,7 +364,5 @@ async def test_components_that_share_the_only_connection_are_a_warning() -> None
 
     finding = (await diagnose(serve_one, streams="auto", reply_timeout_s=1.0)).of("rate")
     assert finding.result is WARNING
-    assert finding.found == (
-        "3d 100 of 100, 6d 100 of 200 Hz, because the server accepts one connection only"
-    )
-    assert finding.remedy.endswith("request nothing else: streams: [{components: [6d]}].")
+    assert names(finding.found, "3d 100 of 100, 6d 100 of 200 Hz", "one connection")
+    assert names(finding.remedy, "streams: [{components: [6d]}]")

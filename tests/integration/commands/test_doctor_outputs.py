@@ -10,6 +10,7 @@ from pathlib import Path
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.commands import Completed, run
+from tests.support.errors import names
 from tests.support.networks import free_port, zenoh_keys
 
 
@@ -40,8 +41,8 @@ async def test_a_failed_check_prints_its_remedy_and_exits_with_status_1() -> Non
     done, quiet = await doctor(*server), await doctor(*server, "-q")
     lines = done.stdout.splitlines()
     assert (done.status, done.stderr) == (1, "")
-    assert "FAIL  TCP         connection refused by" in done.stdout
-    assert "→ Is the RT server running, and is this its port?" in done.stdout
+    assert "FAIL  TCP " in done.stdout
+    assert "→ " in done.stdout
     assert max(map(len, lines)) <= 80
     assert all(line == line.rstrip() for line in lines)
     assert re.search(r"^\d+ ok, \d+ failed, \d+ not tested(, \d+ warnings?)?(, \d+ notes?)?$", lines[-1])
@@ -59,6 +60,6 @@ async def test_an_invalid_configuration_fails(tmp_path: Path) -> None:
     assert done.status == 1
     wrong = findings["configuration", "file"]
     assert [line.split(":")[1] for line in wrong["found"].splitlines()] == ["1", "2"]
-    assert wrong["remedy"] == "Correct these lines; config/gateway.yaml explains every key."
-    assert findings["source", "TCP"]["found"] == "it needs the configuration, which failed"
+    assert names(wrong["remedy"], "config/gateway.yaml")
+    assert findings["source", "TCP"]["result"] == "not tested"
     assert findings["this computer", "clock"]["result"] in {"green", "warning", "not tested"}

@@ -18,6 +18,7 @@ from gateway.stream.state import StreamState
 from tests.support import servers
 from tests.support.commands import run
 from tests.support.configurations import make_settings
+from tests.support.errors import names
 from tests.support.findings import MARKERS_XML, Findings, lab, parameters, replying, run_doctor, streaming
 from tests.support.gateways import monitored_gateway
 from tests.support.networks import free_port
@@ -84,11 +85,9 @@ async def test_what_the_running_gateway_lost_is_reported_by_cause() -> None:
         findings = await run_doctor(lab(server.port), metrics=metrics, connects=False)
     loss = findings.of("loss", GATEWAY)
     assert loss.result is Result.WARNING
-    assert loss.found == (
-        f"{STREAM}: lost in the last minute: 2 messages of 2 frames (frame rejected); "
-        "since the start: 2 messages of 2 frames (frame rejected)"
-    )
-    assert loss.remedy.startswith("The newest was: frame rejected: component 1 of 1")
+    assert loss.found.startswith(f"{STREAM}: ")
+    assert loss.found.count("2 messages of 2 frames (frame rejected)") == 2  # of a minute, and in all
+    assert names(loss.remedy, "component 1 of 1")
     assert findings.failing(GATEWAY) == []
 
 
@@ -99,9 +98,9 @@ async def test_a_problem_of_the_running_gateway_fails() -> None:
         with_connection = await run_doctor(lab(port), metrics=metrics)
     stream = findings.of("stream", GATEWAY)
     assert stream.result is Result.FAILING
-    assert f"no frame so far: connection refused by 127.0.0.1:{port}" in stream.found
-    assert stream.remedy.endswith("Without --no-connect, doctor looks for the reason.")
-    assert with_connection.of("stream", GATEWAY).remedy == "The checks of lab below look for the reason."
+    assert names(stream.found, f"127.0.0.1:{port}")
+    assert names(stream.remedy, "--no-connect")
+    assert names(with_connection.of("stream", GATEWAY).remedy, "lab")
     assert with_connection.all_of("connection") == []  # the gateway has none either
 
 
@@ -112,7 +111,7 @@ async def test_a_measurement_that_does_not_run_fails_without_a_connection() -> N
     ):
         findings = await run_doctor(lab(server.port), metrics=metrics, connects=False)
     assert findings.of("stream", GATEWAY).result is Result.FAILING
-    assert "reports that no measurement is running" in findings.of("stream", GATEWAY).found
+    assert names(findings.of("stream", GATEWAY).found, "no measurement")
 
 
 async def command(metrics: MetricsSettings, *arguments: str) -> tuple[int, Findings, str]:
@@ -147,9 +146,8 @@ async def test_no_second_connection_is_opened_if_asked_not_to_and_one_is_announc
     assert (status, err) == (0, "")
     assert of_command.of("health", GATEWAY).result == "green"
     assert of_command.of("stream", GATEWAY).found.startswith(f"{STREAM}: streaming")
-    assert announced == (
-        f"lab: the running gateway is connected to {address}; doctor now opens further connections to it\n"
-    )
+    assert announced.count("\n") == 1
+    assert names(announced, "lab", address)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
@@ -172,13 +170,13 @@ async def test_a_gateway_that_does_not_run_is_a_note_and_a_failure_without_conne
         disabled = await run_doctor(source, connects=False)
     health = findings.of("health", GATEWAY)
     assert health.result is Result.NOTE
-    assert health.found == f"no gateway runs here: nothing listens on 127.0.0.1:{nobody.port}"
-    assert "connections of their own to the servers" in health.remedy
+    assert names(health.found, "no gateway", f"127.0.0.1:{nobody.port}")
+    assert names(health.remedy, "connections")
     unasked = findings.not_tested("stream", "output", "loss", subject=GATEWAY)
-    assert unasked == {"no running gateway could be asked"}
+    assert len(unasked) == 1
     assert findings.of("frames").result is Result.PASSING
     assert unconnected.failing(GATEWAY) == disabled.failing(GATEWAY) == ["health"]
-    assert disabled.of("health", GATEWAY).found.startswith("metrics.enabled is false, so a running gateway")
+    assert names(disabled.of("health", GATEWAY).found, "metrics.enabled")
 
 
 @pytest.mark.parametrize(
@@ -196,7 +194,7 @@ async def test_another_program_on_the_port_fails(page: bytes) -> None:
         )
     assert health.result is Result.FAILING
     assert f"127.0.0.1:{port}" in health.found
-    assert health.remedy.endswith("If it is another program, set metrics.port.")
+    assert names(health.remedy, "metrics.port")
 
 
 async def test_a_source_that_the_running_gateway_does_not_have_is_a_warning() -> None:
@@ -204,4 +202,4 @@ async def test_a_source_that_the_running_gateway_does_not_have_is_a_warning() ->
         other = lab(server.port).model_copy(update={"name": "hall"})
         warning, *_ = (await run_doctor(other, metrics=metrics, connects=False)).all_of("stream", GATEWAY)
     assert warning.result is Result.WARNING
-    assert warning.found == "hall: the running gateway has no source of this name"
+    assert names(warning.found, "hall")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from tests.support.commands import run
+from tests.support.errors import names
 from tests.support.networks import free_endpoint
 from tests.support.routers import Routers, run_routers
 from tests.support.secure_zenoh import run_gateway_with_simulator
@@ -49,12 +50,12 @@ async def test_all_that_arrives_behind_two_routers_is_complete(routers: Routers,
     assert status == 0
     assert found["lab", "data"]["found"].endswith("none missing")
     assert found["zenoh", "carried"]["found"] == "site-a → site-b: mocap/lab/force"
-    assert found["zenoh", "routers"]["found"].endswith("which is linked with site-a")
+    assert found["zenoh", "routers"]["found"].endswith("linked with site-a")
     for each in (listed, top):
         [source] = json.loads(each.stdout)["sources"]
         assert source["routers"] == ["site-a", "site-b"]
     assert missing == 1
-    assert absent["zenoh", "gateway"]["found"] == "no gateway serves source 'hall'"
+    assert names(absent["zenoh", "gateway"]["found"], "'hall'")
 
 
 async def test_what_a_router_leaves_out_is_missing_and_is_in_the_history(
@@ -66,7 +67,7 @@ async def test_what_a_router_leaves_out_is_missing_and_is_in_the_history(
         status, found = await doctor("--connect", routers.endpoints["site-b"])
     data = found["lab", "data"]
     assert (status, data["result"]) == (0, "warning")
-    assert "are missing, of which the gateway's history has all of them" in data["found"]
+    assert names(data["found"], "missing", "history", "all")
     assert "site-a → site-b" in data["remedy"]
 
 
@@ -79,16 +80,14 @@ async def test_frames_that_do_not_arrive_at_all_fail(routers: Routers, tmp_path:
     with run_gateway_with_simulator(tmp_path, client_of(routers.endpoints["site-a"])):
         status, found = await doctor("--connect", routers.endpoints["site-a"])
     assert (status, found["lab", "data"]["result"]) == (1, "red")
-    assert found["lab", "data"]["found"].startswith(
-        "its gateway receives frames, but no message arrives here"
-    )
+    assert names(found["lab", "data"]["found"], "gateway", "no message")
 
 
 async def test_a_router_that_does_not_run_fails() -> None:
     endpoint = free_endpoint()
     status, found = await doctor("--connect", endpoint)
     assert status == 1
-    assert found["zenoh", "link"]["found"].startswith("the session does not open: Unable to connect")
+    assert found["zenoh", "link"]["result"] == "red"
     assert found["zenoh", "gateway"]["result"] == "not tested"
 
 

@@ -20,6 +20,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.integration.commands.test_params_command import SIDES, Lab, lab_without_server
 from tests.support.commands import run
+from tests.support.errors import names
 from tests.support.networks import free_endpoint, lcm_url, open_zenoh
 from tests.support.pseudo_terminals import in_terminal
 from tests.support.queried_gateway import ParameterServer, run_gateway, wait_until_cached
@@ -66,7 +67,7 @@ async def test_without_a_gateway_all_commands_say_the_same(side: str) -> None:
     assert {done.stdout for done in ended[:-1]} == {""}
     assert json.loads(ended[-1].stdout) == {"sources": [], "num_left_out": 0}
     [sentence] = {done.stderr for done in ended}
-    assert sentence.startswith("no gateway found on ")
+    assert names(sentence, "no gateway")
     assert sentence.count("\n") == 1
 
 
@@ -77,7 +78,8 @@ async def test_a_source_that_nobody_serves_is_named_with_those_that_exist(lab: L
     ended = await asyncio.gather(
         *(run(*name.split(), *lab.options(side), "--source", "hall") for side, name in commands)
     )
-    assert set(ended) == {(3, "", "no gateway serves source 'hall'; sources found: lab\n")}
+    assert {(status, output) for status, output, _ in ended} == {(3, "")}
+    assert all(names(error, "'hall'", "lab") for _, _, error in ended)
 
 
 # echo ----------------------------------------------------------------------------------------
@@ -100,7 +102,7 @@ async def test_silence_of_a_source_is_said_once_with_its_state(lab: Lab) -> None
     """The user learns that the gateway runs, and that only this component is silent."""
     for done in await lab.run("echo", "--component", "c3d", "--seconds", "9"):
         assert (done.status, done.stdout) == (0, "")
-        assert done.stderr.startswith("nothing heard of c3d although a gateway runs (lab: streaming ")
+        assert names(done.stderr, "c3d", "lab: streaming")
         assert done.stderr.count("\n") == 1
 
 
@@ -171,7 +173,7 @@ async def test_fewer_messages_than_count_are_status_1_with_hz_too(lab: Lab) -> N
     arguments = ("--component", "status", "--count", "1000", "--seconds", "1", *lab.options("zenoh"))
     done = await run("echo", "--hz", *arguments)
     assert done.status == 1
-    assert "of 1000 messages arrived within 1 s" in done.stderr
+    assert names(done.stderr, "1000 messages", "1 s")
 
 
 # list ----------------------------------------------------------------------------------------
@@ -218,9 +220,9 @@ async def test_hostile_or_missing_answers_do_not_hide_a_gateway(lab: Lab) -> Non
     assert done.status == 0
     lines = dict(line.split("\t", 1) for line in done.stdout.splitlines())
     assert list(lines) == ["evil0", "evil1", "evil2", "ghost", "lab"]
-    assert lines["evil0"].startswith("its status is of another version of rtc3d-gateway")
-    assert lines["evil1"].startswith("its status is too long: 3000000 bytes")
-    assert lines["ghost"].startswith("its gateway does not answer\t")
+    assert names(lines["evil0"], "status", "version")
+    assert names(lines["evil1"], "status", "3000000 bytes")
+    assert names(lines["ghost"], "gateway", "answer")
     assert lines["lab"].startswith("streaming ")
     assert "\x1b" not in done.stdout
 
@@ -235,4 +237,4 @@ async def test_messages_of_other_programs_on_lcm_are_listed_as_unreadable(lab: L
         await asyncio.sleep(0.05)
     lines = dict(line.split("\t", 1) for line in (await task).stdout.splitlines())
     assert sorted(lines) == ["lab", "old"]
-    assert lines["old"].startswith("its status is of another version of rtc3d-gateway")
+    assert names(lines["old"], "status", "version")

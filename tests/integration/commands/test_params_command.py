@@ -18,6 +18,7 @@ from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.support.commands import Completed, run, run_in_process
+from tests.support.errors import names
 from tests.support.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.support.parameters import spec_xml
 from tests.support.queried_gateway import ParameterServer, run_gateway, wait_until_cached, wait_until_found
@@ -108,7 +109,7 @@ async def test_a_router_without_a_gateway_is_status_3(is_late: bool) -> None:
         done = await run("params", "--connect", endpoint, "--timeout", "0.5")
         queries.clear()
     assert done.status == 3
-    assert done.stderr.startswith("no gateway found on Zenoh (mocap/*/alive); check that it is running")
+    assert names(done.stderr, "Zenoh (mocap/*/alive)")
 
 
 async def test_a_source_or_prefix_that_no_gateway_serves_is_status_3() -> None:
@@ -117,28 +118,27 @@ async def test_a_source_or_prefix_that_no_gateway_serves_is_status_3() -> None:
         elsewhere = await at.params("--prefix", "other", "--timeout", "0.5")
     assert {done.status for done in (*missing, *elsewhere)} == {3}
     on_zenoh, on_lcm = (done.stderr for done in missing)
-    assert on_zenoh.startswith("no gateway serves source 'hall'; sources found: lab")
-    assert on_lcm.startswith("no gateway found on LCM (MOCAP_HALL")
+    assert names(on_zenoh, "'hall'", "lab")
+    assert names(on_lcm, "LCM")
+    assert "MOCAP_HALL" in on_lcm
 
 
 async def test_a_gateway_without_its_server_is_status_4() -> None:
     async with lab_without_server() as (port, at):
         for done in await at.params("3d"):
             assert (done.status, done.stdout) == (4, "")
-            assert done.stderr.startswith(
-                f"source 'lab' has no connection: refused by 127.0.0.1:{port}, tried"
-            )
+            assert names(done.stderr, "'lab'", "no connection", f"127.0.0.1:{port}")
 
 
 @pytest.mark.parametrize(
     ("settings", "refuses", "timeout_s", "status", "text"),
     [
-        ({"reply_timeout_s": 0.3}, False, 10, 5, "did not answer SendParameters within 0.3 s"),
+        ({"reply_timeout_s": 0.3}, False, 10, 5, "SendParameters within 0.3 s"),
         (
             *({"reply_timeout_s": 20.0, "query_timeout_s": 20.0}, False, 0.2),
             *(5, "within 0.2 s although a gateway is running"),
         ),
-        ({}, True, 10, 1, "the server does not know SendParameters, or refuses it: err-unknown command"),
+        ({}, True, 10, 1, "err-unknown command"),
     ],
     ids=["the server is silent", "the gateway is silent", "the server refuses"],
 )
@@ -195,7 +195,7 @@ async def test_sources_of_several_gateways_are_shown_and_one_without_a_server_hi
     assert (several.status, several.stderr) == (0, "")
     assert labels(several) == {"lab": "of the first", "hall-2": "of the second"}
     assert (partly.status, list(labels(partly))) == (4, ["lab"])
-    assert partly.stderr.startswith("source 'hall' has no connection")
+    assert names(partly.stderr, "'hall'", "no connection")
 
 
 @pytest.mark.parametrize("code", ["", "rate", "busy"])
@@ -224,7 +224,7 @@ async def test_a_query_without_a_reply_is_repeated(code: str, answered: bool) ->
         assert json.loads(done.stdout)["lab"]["age_s"] == 3.5
     else:
         assert done.status == (1 if code else 5)
-        assert ("too many queries" in done.stderr) is bool(code)
+        assert names(done.stderr, "too many") is bool(code)
 
 
 async def test_a_request_on_lcm_is_repeated_after_a_refusal() -> None:

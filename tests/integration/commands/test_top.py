@@ -16,6 +16,7 @@ import pytest
 from gateway.display.top.pages import TWO_GATEWAYS
 from tests.support.commands import Completed, run_command
 from tests.support.configurations import write_config
+from tests.support.errors import names
 from tests.support.gateway_process import program, simulator
 from tests.support.networks import free_endpoint, lcm_url, open_zenoh, zenoh_keys
 from tests.support.pseudo_terminals import PseudoTerminal, in_terminal
@@ -153,7 +154,7 @@ def test_json_says_once_that_there_is_no_gateway_and_goes_on() -> None:
     """A log of the lines is complete, and its reader learns at once why it is empty."""
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with program("top", "--json", "--lcm", "--url", lcm_url(), **pipes) as process:
-        assert process.stderr.readline().startswith("no gateway found on LCM (")
+        assert names(process.stderr.readline(), "no gateway", "LCM")
         assert [json.loads(process.stdout.readline())["sources"] for _ in range(3)] == [[]] * 3
         process.send_signal(signal.SIGTERM)
         _, rest = process.communicate(timeout=120)
@@ -163,7 +164,8 @@ def test_json_says_once_that_there_is_no_gateway_and_goes_on() -> None:
 def test_a_source_that_nobody_serves_is_named_with_those_that_exist(lab: Lab) -> None:
     """The sources that exist are shown all the same."""
     [ended] = top(("--once", *lab.zenoh, "--source", "stage", "--source", "Lab-1"))
-    assert (ended.status, ended.stderr) == (3, "no gateway serves source 'stage'; sources found: Lab-1\n")
+    assert ended.status == 3
+    assert names(ended.stderr, "'stage'", "Lab-1")
     assert "Marker 12" in ended.stdout
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from tests.support.commands import run_command
 from tests.support.configurations import write_config
+from tests.support.errors import names
 from tests.support.networks import free_port
 from tests.support.secure_zenoh import SecureRouter, run_gateway_with_simulator
 from tests.support.waiting import wait_until
@@ -27,7 +28,8 @@ def test_connect_replaces_the_address_in_the_file(secured: SecureRouter, tmp_pat
     printed = run_command(*echo)
     assert (printed.status, printed.stderr, len(printed.stdout.splitlines())) == (0, "", 2)
     unknown = run_command(*echo, "--source", "hall")
-    assert unknown == (3, "", "no gateway serves source 'hall'; sources found: lab\n")
+    assert unknown[:2] == (3, "")
+    assert names(unknown[2], "'hall'", "lab")
 
 
 def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
@@ -36,12 +38,12 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
     for command in ("echo", "params", "list"):
         result = run_command(command, "--zenoh-config", str(file))
         assert result.status == 2
-        assert f"Zenoh does not accept the file {file}" in result.stderr
+        assert names(result.stderr, file)
         assert "Traceback" not in result.stderr
     config = write_config(tmp_path / "gateway.yaml", 9, zenoh={}, lcm={})
     link = doctor(config, "--zenoh-config", str(file))["link"]
-    assert link["found"].startswith(f"Zenoh does not accept the file {file}")
-    assert (link["result"], link["remedy"]) == ("red", "Correct this file.")
+    assert link["result"] == "red"
+    assert names(link["found"], file)
 
 
 @pytest.mark.parametrize("command", ["echo", "params", "list"])
@@ -67,11 +69,11 @@ def test_the_doctor_works_with_the_gateways_and_with_a_viewers_certificate(
     (tmp_path / "viewer.json5").write_text(secured.client("viewer"), encoding="utf-8")
     config = write_config(tmp_path / "gateway.yaml", 9, zenoh={"config": "gateway.json5"})
     findings = doctor(config)
-    assert findings["link"]["found"] == "the session is open and connected to a router"
+    assert names(findings["link"]["found"], "a router")
     assert findings["gateway"]["result"] == "not tested"
     findings = doctor(config, "--zenoh-config", str(tmp_path / "viewer.json5"))
-    assert findings["link"]["found"] == "the session is open and connected to a router"
-    assert findings["gateway"]["found"] == "a gateway serves lab"
+    assert names(findings["link"]["found"], "a router")
+    assert names(findings["gateway"]["found"], "lab")
 
 
 @pytest.mark.parametrize(("host", "name"), [("127.0.0.1", "router"), ("[::]", "gateway")])
@@ -109,7 +111,7 @@ def test_the_commands_show_the_certificate_of_a_gateway_that_listens(
     with run_gateway_with_simulator(tmp_path, "zenoh.json5") as log:
         wait_until(lambda: "the session is open" in log.read_text())
         findings = doctor(tmp_path / "gateway.yaml")
-        assert findings["link"]["found"] == "the session is open and connected to 0 routers and 1 peer"
-        assert findings["gateway"]["found"] == "a gateway serves lab"
+        assert names(findings["link"]["found"], "0 routers and 1 peer")
+        assert names(findings["gateway"]["found"], "lab")
         params = run_command("params", "3d", "--zenoh-config", str(file), "--json")
         assert (params.status, params.stderr) == (0, "")
