@@ -269,7 +269,9 @@ def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iter
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
     # Nor is a component that never has any, such as 6D without tools.
     runs = {
-        key: series.without_empty_frames().runs() for key, series in source.series.items() if series.labels
+        key: series.without_empty_frames().with_constant_labels().runs()
+        for key, series in source.series.items()
+        if series.labels
     }
     for key in keys:
         if key in runs:

@@ -327,6 +327,39 @@ class Series(ItemValues):
         recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
         return self._part(columns, recorded, self._entries[has_items])
 
+    def with_constant_labels(self) -> "Series":
+        """Return the frames with as many items each as the parameters have at most, NaN where one is missing.
+
+        The number of markers changes from frame to frame if a server sends unlabelled ones. Frames whose
+        labels would take several times as much memory as was recorded stay as they are.
+        """
+        most = max(self._recorded, default=0)
+        sizes: dict[tuple[str, ...], int] = {}
+        labels: dict[int, tuple[str, ...]] = {}
+        for entry, num_items in self._layouts:
+            parameters = self._parameters[entry].parameters if entry >= 0 else None
+            labels[entry] = describe(self.component, parameters, most).labels
+            sizes[labels[entry]] = max(sizes.get(labels[entry], 0), num_items)
+        if all(sizes[labels[entry]] == num_items for entry, num_items in self._layouts):
+            return self
+        padded = np.zeros(len(self), self._num_items.dtype)
+        for entry, found in labels.items():
+            padded[self._entries == entry] = sizes[found]
+        item_bytes = NATIVE_ITEM_DTYPES[self.component].itemsize
+        recorded_bytes = int(self._num_items.sum(dtype=np.int64)) * item_bytes
+        if padded.sum(dtype=np.int64) * item_bytes > max(MAX_PADDING * recorded_bytes, MIN_LIMIT_BYTES):
+            return self
+        recorded = {}
+        for number in np.unique(padded).tolist():
+            (rows,) = np.nonzero(padded == number)
+            counts = self._num_items[rows]
+            items = np.full((len(rows), number), MISSING, NATIVE_ITEM_DTYPES[self.component])
+            for count in np.unique(counts).tolist():
+                places = padded[self._num_items == count] == number
+                items[counts == count, :count] = self._recorded[count][places]
+            recorded[number] = items
+        return self._part(self._columns | {"num_items": padded}, recorded, self._entries)
+
     def _part(self, columns: dict[str, Array], recorded: dict[int, Array], entries: Array) -> "Series":
         """Return a series of some of the rows."""
         about = (self._parameters, self.start_utime)

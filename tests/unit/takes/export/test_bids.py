@@ -233,8 +233,8 @@ def test_new_labels_begin_a_run_while_other_components_go_on(tmp_path: Path) -> 
     """One motion file has one set of channels; the samples of analog channels must not be in two files."""
     analog = [frame(ComponentType.ANALOG, [number], number) for number in range(20)]
     before = [markers(1, number) for number in range(8)]
-    after = [markers(2, number) for number in range(8, 20)]
-    export(tmp_path, [*analog, *before, *after])
+    after = [markers(2, number, version=2) for number in range(8, 20)]
+    export(tmp_path, [labelled("a"), labelled("a", "b", version=2), *analog, *before, *after])
     assert runs_of(tmp_path) == {("labAnalog", "1"), ("labMarkers", "1"), ("labMarkers", "2")}
     assert len(read_motion(only(tmp_path, "*labAnalog*_motion.tsv"))) == 20
 
@@ -285,8 +285,13 @@ def test_events_count_from_the_first_sample_of_their_run(tmp_path: Path) -> None
 def test_an_event_is_in_the_nearest_run_only_beside_the_markers(tmp_path: Path) -> None:
     """An event within 1 s of a measurement belongs to it, unless it is in another one."""
     analog = [frame(ComponentType.ANALOG, [number], number) for number in range(20)]
-    before, after = [markers(1, number) for number in range(5, 20)], [markers(2, n) for n in range(20, 40)]
-    export(tmp_path, [*analog, *before, *after, event(1, 100_000), event(2, 250_000), event(3, 900_000)])
+    before = [markers(1, number) for number in range(5, 20)]
+    after = [markers(2, number, version=2) for number in range(20, 40)]
+    described = [labelled("a"), labelled("a", "b", version=2)]
+    export(
+        tmp_path,
+        [*described, *analog, *before, *after, event(1, 100_000), event(2, 250_000), event(3, 900_000)],
+    )
     assert events_of(tmp_path, "tracksys-labMarkers_run-1") == [("0.050000", "event 1")]
     assert events_of(tmp_path, "run-2") == [("0.050000", "event 2"), ("0.700000", "event 3")]
 

@@ -15,8 +15,8 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import BidsNames, ExportJob, export_take
-from tests.support.takes import START_UTIME, Message, description, frame, parameters, write_take
-from tests.unit.takes.export.exported import Values, notes_of, read_ezc3d, read_independently
+from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+from tests.unit.takes.export.exported import Values, labelled, notes_of, read_ezc3d, read_independently
 from tests.unit.takes.export.test_bids import read_motion
 from tests.unit.takes.export.test_every_format import since_begin_s
 from tests.unit.takes.export.test_opensim import read_storage
@@ -155,3 +155,26 @@ def test_each_row_has_the_time_of_its_frame(tmp_path: Path, case: str, form: str
     assert any("differ from the times of the grid" in note for note in notes) == (case == "late frames") or (
         case == "another rate"
     )
+
+
+@pytest.mark.parametrize("form", [".c3d", ".trc", "bids"])
+def test_a_number_of_markers_that_varies_is_one_measurement(tmp_path: Path, form: str) -> None:
+    """Servers send markers without a label, so each frame may have another number of them."""
+    counts = np.random.default_rng(2).integers(2, 7, 400).tolist()
+    messages = [labelled("head", "hip"), *(markers(count, number) for number, count in enumerate(counts))]
+    take = write_take(tmp_path / "take.lcmlog", messages)
+    chosen = "" if form.startswith(".") else form
+    job = ExportJob(take, tmp_path / f"take{'' if chosen else form}", chosen, bids=BidsNames("walking"))
+    job.details = {"subject": "01"}
+    export_take(job)
+    if form == ".c3d":
+        x = read_ezc3d(tmp_path / "take.c3d")["data"]["points"][0].T
+    elif form == ".trc":
+        x = read_trc(tmp_path / "take.trc").positions[..., 0]
+    else:
+        [motion] = (tmp_path / "take").rglob("*_motion.tsv")
+        x = read_motion(motion)[:, ::4] * 1000
+    assert x.shape == (400, 6)
+    assert (~np.isnan(x)).sum(axis=1).tolist() == counts
+    places = np.where(np.isnan(x), 0, x) - np.where(np.isnan(x), 0, np.arange(6))
+    assert abs(places).max() < 1e-6
