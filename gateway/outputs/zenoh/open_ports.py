@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import zenoh
 
 from gateway.config.settings import SourceSettings
+from gateway.outputs.listen_address import is_loopback
 from gateway.outputs.open_ports import Access, OpenPort, control_or
 from gateway.outputs.zenoh.config import endpoints, mode_of, zenoh_config
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -36,11 +37,18 @@ class _Protection(NamedTuple):
 
 def open_ports(settings: ZenohSettings, sources: Sequence[SourceSettings]) -> list[OpenPort]:
     """Return where the session listens, and the ports of scouting. Raises ConfigError."""
-    config = zenoh_config(settings.config)
-    ports = [*_scouting_ports(config)]
-    if mode_of(config) != "client":
-        ports = [*_listen_ports(config), *ports]
+    ports = _ports(zenoh_config(settings.config))
     return [port._replace(access=control_or(port.access, sources)) for port in ports]
+
+
+def is_open_to_others(config: zenoh.Config) -> bool:
+    """Return whether programs on other computers can get links, without a password or certificate."""
+    return any(not is_loopback(port.host) and not port.authentication for port in _ports(config))
+
+
+def _ports(config: zenoh.Config) -> list[OpenPort]:
+    listening = [] if mode_of(config) == "client" else _listen_ports(config)
+    return [*listening, *_scouting_ports(config)]
 
 
 def _listen_ports(config: zenoh.Config) -> Iterator[OpenPort]:

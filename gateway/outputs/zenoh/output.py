@@ -22,6 +22,7 @@ from gateway.outputs.zenoh.answers import ZenohAnswers
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.confirmation import LINK_LOST, SILENT_S, RouterConfirmation
 from gateway.outputs.zenoh.json_publishing import JsonConverter
+from gateway.outputs.zenoh.open_ports import is_open_to_others
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts, declare_publisher, in_zenoh_thread
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -109,6 +110,11 @@ class ZenohOutput(Output):
 
     def start(self) -> None:
         """Start the thread that opens the session and retries until it succeeds or ``close`` is called."""
+        if is_open_to_others(self.config):
+            logger.info(
+                "zenoh: programs on other computers can subscribe and publish, without a password; "
+                "`rtc3d-gateway doctor --exposure` lists what is open"
+            )
         self._holder.start()
 
     def _declare_all(self, session: zenoh.Session) -> None:

@@ -2,6 +2,8 @@
 
 from typing import Any, Final
 
+import pytest
+
 from gateway.config.settings import SourceSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.open_ports import (
@@ -9,6 +11,8 @@ from gateway.outputs.open_ports import (
     listening_ports,
 )
 from gateway.outputs.registry import OUTPUTS
+from gateway.outputs.zenoh.config import zenoh_config
+from gateway.outputs.zenoh.open_ports import is_open_to_others
 from gateway.outputs.zenoh.settings import ZenohSettings
 
 ALL_IPV4: Final = "0.0.0.0"  # noqa: S104 - not bound
@@ -43,6 +47,10 @@ def test_each_output_lists_its_ports_and_only_remote_control_gives_control() -> 
     assert opened("takes", [CONTROLLED]) == opened("ros2", [CONTROLLED]) == []
 
 
+LOCAL: Final = {
+    "scouting": {"multicast": {"enabled": False}},
+    "listen": {"endpoints": ["tcp/127.0.0.1:7447"]},
+}
 LCM_GROUP: Final = "239.255.76.67"
 
 
@@ -109,3 +117,21 @@ def test_zenoh_lists_the_ports_of_scouting_which_a_password_does_not_protect() -
     assert zenoh_ports(**nobody, **other)[0] == ("udp", "224.0.0.225", 7000, "", "")
     assert zenoh_ports(mode="client", **on) == [(*answers, "", "")]
     assert zenoh_ports(mode="client", **on, connect={"endpoints": ["tcp/192.0.2.10:7447"]}) == []
+
+
+@pytest.mark.parametrize(
+    ("config", "is_open"),
+    [
+        ({}, True),
+        ({"scouting": {"multicast": {"enabled": False}}}, True),
+        (LOCAL, False),
+        (LOCAL | {"listen": {"endpoints": ["tcp/0.0.0.0:7447"]}}, True),
+        (LOCAL | {"scouting": {"multicast": {"enabled": True}}}, True),
+        ({"mode": "client", "connect": {"endpoints": ["tcp/192.0.2.9:7447"]}}, False),
+    ],
+)
+def test_whether_zenoh_is_open_to_other_computers_without_a_password(
+    config: dict[str, Any], *, is_open: bool
+) -> None:
+    """The gateway logs it at its start: by default, it is."""
+    assert is_open_to_others(zenoh_config(config)) is is_open
