@@ -81,8 +81,9 @@ def test_the_last_seconds_count_from_now() -> None:
     wanted = parse_question(("3d",), {"last_s": "2.5"}, ALL).wanted
     assert wanted is not None
     assert wanted.since_utime is not None
+    assert wanted.last_s == 2.5
     assert before - 2_500_000 <= wanted.since_utime <= now_utime() - 2_500_000
-    assert parse_question(("3d",), {"last_s": "1e12"}, ALL).wanted == WantedMessages(None, 0)
+    assert parse_question(("3d",), {"last_s": "1e12"}, ALL).wanted == WantedMessages(None, 0, None, 1e12)
 
 
 @pytest.mark.parametrize(
