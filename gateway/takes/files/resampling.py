@@ -43,7 +43,8 @@ def resample(
             f"at most {_MAX_RATE_HZ} Hz, and gaps at least 0 s"
         )
     times = _grid(series, rate_hz, from_s, to_s)
-    runs = sorted(series.without_empty_frames().runs(), key=lambda run: int(run.capture_utime.min()))
+    parts = [part for run in series.without_empty_frames().runs() for part in _between_clock_steps(run)]
+    runs = sorted(parts, key=lambda run: int(run.capture_utime.min()))
     bounds = np.searchsorted(times, [run.capture_utime.min() for run in runs]).tolist()
     bounds = [0, *bounds[1:], len(times)]
     items: dict[int, list[Array]] = {}
@@ -67,6 +68,14 @@ def resample(
         np.concatenate([run.content.entries[frames] for run, frames in nearest]),
         rate_hz,
     )
+
+
+def _between_clock_steps(run: Series) -> list[Series]:
+    """Return the parts of a run between steps back of the gateway's clock, after which times occur again."""
+    order = np.argsort(run.sequence, kind="stable")
+    steps = np.diff(run.capture_utime[order])
+    (places,) = np.nonzero(steps < -(regular_step(steps) or 0) / 2)
+    return [run.rows(np.sort(chosen)) for chosen in np.split(order, places + 1)] if len(places) else [run]
 
 
 def _grid(series: Series, rate_hz: float, from_s: float | None, to_s: float | None) -> Array:

@@ -360,6 +360,12 @@ class Series(ItemValues):
             recorded[number] = items
         return self._part(self._columns | {"num_items": padded}, recorded, self._entries)
 
+    def rows(self, chosen: Array) -> "Series":
+        """Return some of the rows of a run, in which all have the same number of items."""
+        [(num_items, items)] = self._recorded.items()
+        columns = {name: values[chosen] for name, values in self._columns.items()}
+        return self._part(columns, {num_items: items[chosen]}, self._entries[chosen])
+
     def _part(self, columns: dict[str, Array], recorded: dict[int, Array], entries: Array) -> "Series":
         """Return a series of some of the rows."""
         about = (self._parameters, self.start_utime)

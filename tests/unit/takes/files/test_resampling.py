@@ -187,3 +187,24 @@ def test_what_cannot_be_resampled_is_an_error_that_says_why(series: Open) -> Non
     for rate_hz, max_gap_s in ((0, 0.1), (-1, 0.1), (NAN, 0.1), (1e9, 0.1), (100, -1)):
         with pytest.raises(TakeError, match="cannot resample to"):
             far.resample(rate_hz, max_gap_s=max_gap_s)
+
+
+@pytest.mark.parametrize("step_s", [-0.024, -0.503, -1.0, -1.007])
+def test_a_step_back_of_the_gateways_clock_mixes_no_moments(series: Open, step_s: float) -> None:
+    """Times that occur twice belong to frames before and after the step, and rows are of one of them."""
+    rows = [(0.003 + 0.01 * n + (step_s if n >= 300 else 0.0), [n]) for n in range(600)]
+    found = series(ComponentType.ANALOG, rows).resample(100)
+    values = found.values[:, 0]
+    steps = np.diff(values[~np.isnan(values)])
+    assert (steps > 0).all()
+    assert (steps > 1.5).sum() <= 1
+    assert values[~np.isnan(values)].max() > 598
+    assert np.count_nonzero(np.isnan(values)) <= 2
+
+
+def test_overtaken_messages_are_no_step_of_the_clock(tmp_path: Path) -> None:
+    messages = captured(ComponentType.ANALOG, [(0.01 * n, [n]) for n in range(50)])
+    messages[20], messages[21] = messages[21], messages[20]
+    [found] = open_take(write_take(tmp_path / "a.lcmlog", [description(), *messages])).sources.values()
+    assert found.analog is not None
+    assert found.analog.resample(100).values[:, 0].tolist() == [*range(50)]
