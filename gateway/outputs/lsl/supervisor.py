@@ -154,14 +154,14 @@ class LslProcesses:
             self._retry_delay_s = _FIRST_RETRY_S
         self._retry_s = time.monotonic() + self._retry_delay_s
         self._retry_delay_s = min(2 * self._retry_delay_s, _MAX_RETRY_S)
-        self._socket = None  # after the delay is known, because is_due needs both
-        ours.close()
         if hung:
             self._failed(f"the process for LSL has not answered for {SILENCE_S:g} s")
         elif self._report.failure:
             self._failed(f"the process for LSL failed: {self._report.failure}")
         else:
             self._failed(f"the process for LSL ended {_reason(status)}")
+        self._socket = None  # after problem and delay are known: from now on, others look at them
+        ours.close()
 
     def _take(self, report: Report) -> None:
         before, self._report = self._report, report

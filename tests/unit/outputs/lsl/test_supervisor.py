@@ -260,6 +260,27 @@ def test_the_next_process_gets_the_streams_again(monkeypatch: pytest.MonkeyPatch
     connections[1].close()
 
 
+def test_why_a_process_ended_is_known_as_soon_as_it_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody ever sees the problem of the time before the first process again."""
+    lab = Lab(monkeypatch)
+    seen: list[str] = []
+
+    def start(_settings: LslSettings) -> tuple[Mock, Mock]:
+        ours, lab.theirs = socket.socketpair()
+
+        def close() -> None:
+            seen.append(lab.processes.problem)
+            ours.close()
+
+        return Mock(wraps=ours, close=close), Mock(wait=Mock(return_value=3))
+
+    monkeypatch.setattr(supervisor, "_start_process", start)
+    before = lab.processes.problem
+    lab.live(0.0)
+    wait_until(lambda: seen)
+    assert seen == [lab.processes.problem] != [before]
+
+
 def test_the_wait_for_the_next_process_doubles_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that cannot live must not cost all the time; one that lived is replaced soon."""
     lab = Lab(monkeypatch)
