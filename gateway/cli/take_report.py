@@ -223,6 +223,7 @@ def _report(statistics: TakeStatistics) -> Iterator[RenderableType]:
         begin_text = f"{statistics.start_utime} µs after 1970"
     messages = counted(statistics.num_messages, "message")
     yield f"{begin_text}, {_duration(statistics.seconds)}, {messages}"
+    yield from _incomplete(statistics)
     for source in statistics.sources.values():
         yield ""
         yield from _source_lines(statistics, source)
@@ -233,6 +234,19 @@ def _report(statistics: TakeStatistics) -> Iterator[RenderableType]:
     if problems:
         yield ""
         yield from problems
+
+
+def _incomplete(statistics: TakeStatistics) -> Iterator[str]:
+    """Yield what the recorder could not write, and what cannot be read: whoever uses the take must know."""
+    for source in statistics.sources.values():
+        if source.is_cut_off:
+            yield f"INCOMPLETE: {source.name}: the recording was cut off: its end is missing"
+        if source.num_lost:
+            lost = counted(source.num_lost, "message")
+            yield f"INCOMPLETE: {source.name}: the recording lacks {lost} that found no room on the disk"
+    if statistics.num_damaged:
+        places = counted(statistics.num_damaged, "place")
+        yield f"INCOMPLETE: {statistics.damaged_bytes} bytes at {places} could not be read"
 
 
 def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
@@ -349,8 +363,7 @@ def _problems(statistics: TakeStatistics) -> Iterator[str]:
         for text in _source_problems(source):
             yield f"{source.name}: {text}"
     if statistics.num_damaged:
-        places = counted(statistics.num_damaged, "place")
-        yield f"Damage: {statistics.damaged_bytes} bytes at {places} could not be read"
+        yield "Damage:"
         for damage in statistics.damage[:_MAX_SHOWN]:
             yield f"  {damage.file.name}: {damage.num_bytes} bytes from {damage.offset} on"
         for text in statistics.empty_files.values():
@@ -363,10 +376,6 @@ def _problems(statistics: TakeStatistics) -> Iterator[str]:
 
 
 def _source_problems(source: SourceStatistics) -> Iterator[str]:
-    if source.is_cut_off:
-        yield "the recording was cut off: its end is missing"
-    if source.num_lost:
-        yield f"the recording lacks {counted(source.num_lost, 'message')} that found no room on the disk"
     for (place, cause), number in source.drops.items():
         yield f"the gateway lost {counted(number, 'message')} ({place}: {cause})"
     parts: dict[str, MessageStatistics] = {**source.components, **source.others}

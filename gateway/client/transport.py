@@ -141,6 +141,10 @@ class Reply(NamedTuple):
     facts: Mapping[str, Any] = {}
     gateway: str = ""
 
+    def __repr__(self) -> str:
+        """Return a summary: the content may have megabytes."""
+        return f"<Reply of {self.source}: {len(self.content)} bytes>"
+
     @property
     def age_s(self) -> float | None:
         """The time since the gateway received parameters from the server; None if unknown."""

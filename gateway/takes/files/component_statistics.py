@@ -34,16 +34,16 @@ class MessageStatistics:
         """How many messages could not be read."""
         self.num_bytes = 0
         self.first_utime = self.last_utime = 0
-        """``utime`` of the first and the last message."""
+        """``utime`` of the earliest and the latest message, wherever they are in the file."""
         self.gaps = SequenceCheck(max_listed=MAX_LISTED_GAPS)
 
     def add_messages(self, utime: Array, sequence: Array) -> None:
         """Take the next messages."""
         if not len(utime):
             return
-        if not self.num_messages:
-            self.first_utime = int(utime[0])
-        self.last_utime = int(utime[-1])
+        first_utime, last_utime = int(utime.min()), int(utime.max())
+        self.first_utime = min(self.first_utime, first_utime) if self.num_messages else first_utime
+        self.last_utime = max(self.last_utime, last_utime)
         self.num_messages += len(utime)
         self.gaps.add_all(sequence, utime)
 

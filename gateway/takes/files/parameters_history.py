@@ -22,6 +22,10 @@ class ParametersEntry(NamedTuple):
     parameters: Parameters
     xml: bytes
 
+    def __repr__(self) -> str:
+        """Return a summary: the XML may have megabytes."""
+        return f"<ParametersEntry {self.version} at {self.utime}: {len(self.xml)} bytes of XML>"
+
 
 def recorded_parameters(xml: bytes) -> Parameters | None:
     """Return the parameters in recorded XML, without any section if it is empty; None if it is unreadable."""

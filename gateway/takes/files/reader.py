@@ -36,6 +36,7 @@ class SourceNames:
 
     def __init__(self, events: Iterable[Event]) -> None:
         self._names: dict[str, str] = {}  # by the beginning of the channels
+        self._taken: set[str] = set()  # the same names: with thousands of channels, a look-up must be quick
         for event in events:
             try:
                 kind = message_type(event.message)
@@ -60,18 +61,22 @@ class SourceNames:
 
         Labels and names of sources may have the separator in them, too.
         """
-        known = [channels for channels in self._names if channel.startswith(channels + _POSE)]
-        channels = max(known, key=len, default="") or channel.partition(_POSE)[0]
+        channels = channel.partition(_POSE)[0]
+        end = len(channels)
+        while end >= 0:
+            if channel[:end] in self._names:
+                channels = channel[:end]
+            end = channel.find(_POSE, end + 1)
         label = channel[len(channels) + len(_POSE) :]
         return (self.source(channels), f"6d/{label}") if label else None
 
     def _add(self, channels: str, name: str) -> None:
         if channels in self._names:
             return
-        taken = set(self._names.values())
-        if not name or name in taken:
+        if not name or name in self._taken:
             name = channels.lower()
-        self._names[channels] = unique_name(name, taken, _MAX_NAME_LENGTH)
+        self._names[channels] = unique_name(name, self._taken, _MAX_NAME_LENGTH)
+        self._taken.add(self._names[channels])
 
 
 SUFFIX: Final = ".lcmlog"
@@ -129,10 +134,14 @@ FIRST_PLACE: Final = Place(0, 0)
 
 @dataclass(slots=True)
 class MessageBatch:
-    """Messages of one source and key in their order, with the times of their events in µs since 1970."""
+    """Messages of one source and key in their order, with the times of their events in µs since 1970.
+
+    ``recording`` counts the takes that somebody has put into one file, one after the other (``cat``).
+    """
 
     source: str
     key: str
+    recording: int = 0
     utimes: list[int] = field(default_factory=list)
     messages: list[bytes] = field(default_factory=list)
 
@@ -242,8 +251,8 @@ class TakeReader:
         """Yield the messages of a gateway in batches of some MB, each with one entry per source and key.
 
         This is the fast way to read everything. A batch ends before parameters that differ from those
-        before. What comes more than 10 s after ``end_utime`` is not read: nothing before it arrives so late.
-        Raises TakeError, also if there are no such messages.
+        before, and before another take in the same file. What comes more than 10 s after ``end_utime`` is
+        not read: nothing before it arrives so late. Raises TakeError, also if there are no such messages.
         """
         for batches in self._batches():
             # `all` stops at the first batch with an earlier message, so that reading a whole take stays fast.
@@ -257,6 +266,8 @@ class TakeReader:
         batches: dict[tuple[str, bytes], MessageBatch] = {}  # by channel and fingerprint
         columns: dict[bytes, EventColumns] = {}  # of the same, except parameters
         newest: dict[str, bytes] = {}  # parameters, by source
+        described: set[tuple[int, str]] = set()  # files and sources
+        recording = 0
         first_byte = 0
         for event in self._collect(columns):
             if event is None:
@@ -274,15 +285,24 @@ class TakeReader:
                 if route is None:
                     self.unknown[channel] += 1
                     continue
-                batch = MessageBatch(*route)
-            if batch.key != "parameters":
+                batch = MessageBatch(*route, recording)
+            if batch.key == "take":
+                if (self._log, batch.source) in described:  # a file has one description of each source
+                    recording += 1
+                    described.clear()
+                    yield [*batches.values()]
+                    batches.clear()
+                    columns.clear()
+                    batch = MessageBatch(batch.source, batch.key, recording)
+                described.add((self._log, batch.source))
+            elif batch.key != "parameters":
                 columns[channel.encode() + message[:8]] = EventColumns(batch.utimes, batch.messages)
             elif newest.get(batch.source) != message[VERSION_OFFSET:]:
                 newest[batch.source] = message[VERSION_OFFSET:]
                 yield [*batches.values()]
                 batches.clear()
                 columns.clear()
-                batch = MessageBatch(batch.source, batch.key)
+                batch = MessageBatch(batch.source, batch.key, recording)
             batches[identity] = batch
             batch.utimes.append(utime)
             batch.messages.append(message)

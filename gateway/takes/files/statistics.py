@@ -220,8 +220,8 @@ _MAX_SOURCES: Final = 256
 class TakeStatistics:
     """What a take has, and what is missing.
 
-    Times are in µs since 1970, on the clock of the recording computer. ``seconds`` is from the first event to
-    the latest. ``unknown`` counts messages that are none of a gateway's, by channel.
+    Times are in µs since 1970, on the clock of the recording computer. ``seconds`` is from the earliest event
+    to the latest. ``unknown`` counts messages that are none of a gateway's, by channel.
     """
 
     path: Path
@@ -279,6 +279,7 @@ def take_statistics(path: Path, progress: Callable[[int, int], object] | None = 
     for batches in reader.batches():
         for batch in batches:
             statistics.num_messages += len(batch.messages)
+            statistics.start_utime = min(statistics.start_utime, *batch.utimes)
             statistics.end_utime = max(statistics.end_utime, *batch.utimes)
             name = batch.source
             if name in statistics.sources or len(statistics.sources) < _MAX_SOURCES:

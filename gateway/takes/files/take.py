@@ -10,17 +10,18 @@ from typing import Final
 import numpy as np
 
 from gateway.errors import ProtocolError, SelectionError, TakeError
+from gateway.logs.safe_text import quoted
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.files.component_rows import decode_rows
-from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
+from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.joined import join_series
 from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory
 from gateway.takes.files.reader import MessageBatch, TakeReader
 from gateway.takes.files.series import MAX_GAP_S, Series, SeriesBuilder
 
 
-@dataclass
+@dataclass(repr=False)
 class TakeSource:
     """One source (a server) of a take. A component that was not recorded is None.
 
@@ -28,7 +29,9 @@ class TakeSource:
     both "" if the take does not say. ``details`` has ``subject``, ``session`` and ``note``, each "" if nobody
     said it. ``parameters`` has the server's parameters at the beginning and at each change, in order.
     ``malformed`` is how many messages could not be read, by component. ``recorded`` has the keys of
-    all components in the range of time, also of those that were not loaded.
+    all components in the range of time, also of those that were not loaded. ``num_lost`` messages are in no
+    file, because the recorder had no room for them. ``is_cut_off`` tells that a file was not ended in order;
+    it is False if the end was not read, because of ``to_s``.
     """
 
     name: str
@@ -43,6 +46,13 @@ class TakeSource:
     parameters: list[ParametersEntry] = field(default_factory=list)
     malformed: Counter[str] = field(default_factory=Counter)
     recorded: set[str] = field(default_factory=set)
+    num_lost: int = 0
+    is_cut_off: bool = False
+
+    def __repr__(self) -> str:
+        """Return a summary."""
+        rows = [f"{len(series)} rows of {key}" for key, series in self.series.items()]
+        return f"<TakeSource {self.name}: {', '.join(rows) or 'nothing'}>"
 
     @property
     def series(self) -> dict[str, Series]:
@@ -60,11 +70,16 @@ _FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "
 """The fields of TakeSource by the keys of components."""
 
 
-@dataclass
+_MAX_SHOWN: Final = 5
+"""How many sources the summary of a take names."""
+
+
+@dataclass(repr=False)
 class Take:
     """A take in memory: its sources by name.
 
-    ``start_utime`` is the time of the first event, in µs since 1970; all seconds count from it.
+    ``start_utime`` is the time of the first event, in µs since 1970; all seconds count from it. Of several
+    takes in one file (``cat``), it is that of the earliest.
     ``num_damaged`` places of the files, with ``damaged_bytes`` in all, could not be read. ``unknown`` is how
     many messages have a type that is none of a gateway's, by channel. ``path`` is None if it was collected
     live, or joined from several takes.
@@ -76,6 +91,18 @@ class Take:
     num_damaged: int = 0
     damaged_bytes: int = 0
     unknown: dict[str, int] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return a summary."""
+        name = "" if self.path is None else f" {quoted(self.path.name)}"
+        names = [quoted(each) for each in self.sources][:_MAX_SHOWN]
+        more = ", …" if len(self.sources) > len(names) else ""
+        return f"<Take{name}: {', '.join(names) or 'no sources'}{more}>"
+
+    @property
+    def was_cut_short(self) -> bool:
+        """Whether the recorder was cut off, or lost messages."""
+        return any(source.is_cut_off or source.num_lost for source in self.sources.values())
 
     def resample(self, rate_hz: float, *, max_gap_s: float = MAX_GAP_S) -> "Take":
         """Return the take with all components of all sources at the same times, as ``Series.resample`` does.
@@ -127,10 +154,10 @@ def open_take(
     if there is no take, and SelectionError, a TakeError, if a source is not in it or a component does not
     exist.
 
-    Of several takes, ``open_take([first, second])``, sources of the same name are joined in the order of
-    their times, and others are side by side; seconds count from the earliest take. A message that several
-    takes have, because they overlap, occurs once. What describes a source, such as its subject, is that of
-    the earliest take that has it. Joining needs twice the memory for a moment.
+    Of several takes, ``open_take([first, second])`` or ``cat``, sources of the same name are joined in the
+    order of their times, and others are side by side; seconds count from the earliest take. A message that
+    several takes have, because they overlap, occurs once. What describes a source, such as its subject, is
+    that of the earliest take that has it. Joining needs twice the memory for a moment.
     """
     sources = [sources] if isinstance(sources, str) else sources
     components = [components] if isinstance(components, str) else components
@@ -153,7 +180,9 @@ def open_take(
                 loader.add(batch, first_utime, end_utime)
             if progress is not None:
                 progress(sum(each.read_bytes for each in readers), total)
-        take = Take(reader.path, start_utime, loader.finish(start_utime))
+        begin_utime = int(min(start_utime, loader.earliest_utime))
+        sources_of_take = loader.finish(begin_utime, is_whole=end_utime == math.inf)
+        take = Take(reader.path, begin_utime, sources_of_take)
         take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
         take.unknown = dict(reader.unknown)
         takes.append(take)
@@ -185,7 +214,7 @@ def _join_takes(takes: Sequence[Take]) -> Take:
             sources.setdefault(name, []).append(source)
     return Take(
         None,
-        takes[0].start_utime,
+        min(take.start_utime for take in takes),
         {name: _join_sources(parts) for name, parts in sources.items()},
         sum(take.num_damaged for take in takes),
         sum(take.damaged_bytes for take in takes),
@@ -203,6 +232,8 @@ def _join_sources(parts: Sequence[TakeSource]) -> TakeSource:
         parameters=[entry for part in parts for entry in part.parameters],
         malformed=sum((part.malformed for part in parts), Counter()),
         recorded=set().union(*(part.recorded for part in parts)),
+        num_lost=sum(part.num_lost for part in parts),
+        is_cut_off=any(part.is_cut_off for part in parts),
     )
     for key, name in _FIELDS.items():
         found = [part.series[key] for part in parts if key in part.series]
@@ -222,10 +253,15 @@ class TakeLoader:
         self._wanted, self._components, self._spool_folder = sources, components, spool_folder
         self._sources: dict[str, TakeSource] = {}
         self._histories: dict[str, ParametersHistory] = {}  # by source
-        self._builders: dict[tuple[str, str], SeriesBuilder] = {}
+        self._builders: dict[tuple[str, str, int], SeriesBuilder] = {}  # by source, component and recording
+        self.earliest_utime = math.inf
+        """The time of the earliest message of takes that follow another one in its file."""
+        self._num_open: Counter[str] = Counter()  # files that should have an end, and have none so far
 
     def add(self, batch: MessageBatch, first_utime: float = -math.inf, end_utime: float = math.inf) -> None:
         """Take messages in a range of time; parameters are taken from the whole take."""
+        if batch.recording:
+            self.earliest_utime = min(self.earliest_utime, *batch.utimes)
         if self._wanted is not None and batch.source not in self._wanted:
             return
         source = self._sources.setdefault(batch.source, TakeSource(batch.source))
@@ -239,15 +275,17 @@ class TakeLoader:
             rows = decode_rows(COMPONENTS_BY_KEY[batch.key], messages)
             if rows.malformed:
                 source.malformed[batch.key] += rows.malformed
-            builder = self._builders.get((source.name, batch.key))
-            if builder is None:
-                builder = SeriesBuilder(COMPONENTS_BY_KEY[batch.key], self._spool_folder)
-                self._builders[source.name, batch.key] = builder
-            builder.add(rows)
-        elif batch.key in ("take", "details", "status", "parameters"):
+            self._builder(batch).add(rows)
+        elif batch.key in ("take", "details", "end", "status", "parameters"):
             for message in batch.messages:
-                if batch.key in ("details", "parameters") or not source.server:
+                if batch.key != "status" or not source.server:
                     self._describe(source, batch.key, message)
+
+    def _builder(self, batch: MessageBatch) -> SeriesBuilder:
+        identity = (batch.source, batch.key, batch.recording)
+        if identity not in self._builders:
+            self._builders[identity] = SeriesBuilder(COMPONENTS_BY_KEY[batch.key], self._spool_folder)
+        return self._builders[identity]
 
     def describe(self, name: str, status: bytes | None, entries: Sequence[ParametersEntry]) -> None:
         """Take what is known about a source of which something was added: its status, its parameters."""
@@ -257,11 +295,17 @@ class TakeLoader:
             if status is not None:
                 self._describe(source, "status", status)
 
-    def finish(self, start_utime: int) -> dict[str, TakeSource]:
-        """Return the sources with their arrays."""
-        for (name, key), builder in self._builders.items():
-            source = self._sources[name]
-            setattr(source, _FIELDS[key], builder.build(source.parameters, start_utime))
+    def finish(self, start_utime: int, *, is_whole: bool = True) -> dict[str, TakeSource]:
+        """Return the sources with their arrays. ``is_whole`` tells whether the end of the take was read."""
+        for source in self._sources.values():
+            source.is_cut_off = is_whole and self._num_open[source.name] > 0
+        parts: dict[tuple[str, str], list[Series]] = {}
+        for (name, key, _), builder in self._builders.items():
+            series = builder.build(self._sources[name].parameters, start_utime)
+            if series is not None:
+                parts.setdefault((name, key), []).append(series)
+        for (name, key), found in parts.items():
+            setattr(self._sources[name], _FIELDS[key], join_series(found))
         return self._sources
 
     def _describe(self, source: TakeSource, key: str, message: bytes) -> None:
@@ -279,5 +323,11 @@ class TakeLoader:
                     source.malformed[key] += 1
         elif key == "details":
             source.details = decoded_details(decoded)
+        elif key == "end":
+            source.num_lost += decoded.messages_lost
+            self._num_open[source.name] -= 1
         else:
-            source.server, source.gateway_version = decoded.server, decoded.gateway_version
+            if key == "take":
+                self._num_open[source.name] += has_end(decoded)
+            if not source.server:
+                source.server, source.gateway_version = decoded.server, decoded.gateway_version

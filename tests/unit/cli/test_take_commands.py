@@ -13,8 +13,9 @@ from gateway.cli.main import app
 from gateway.cli.take_report import ListedTake, size_text, write_list
 from gateway.errors import TakeError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from gateway.takes.files.description import SourceDescription
 from tests.support.errors import names
-from tests.support.takes import description, markers, parameters, write_take
+from tests.support.takes import START_UTIME, description, markers, parameters, write_take
 
 TAKE = {"name": "walk-1", "bytes": 3_456_789, "begin_utime": 1_700_000_000_000_000, "seconds": 83.25}
 
@@ -95,6 +96,24 @@ def test_the_report_and_json_have_what_is_there_and_what_is_missing(tmp_path: Pa
     assert (part["messages"], part["missing"], part["largest_gap"]) == (97, 2, {"at_s": 0.52, "missing": 2})
     assert part["visible"] == {"head[red]": 1.0, "foot": 1.0}
     assert (found["damage"]["places"], found["is_complete"]) == (1, False)
+
+
+def test_what_is_incomplete_comes_first(tmp_path: Path) -> None:
+    """Below the tables of a long take, nobody would read that its end is missing."""
+    about = SourceDescription("lab", "MOCAP_LAB")
+    messages = [(channel.decode(), each) for channel, each in about.beginning("walk", START_UTIME)]
+    channel, end = about.end(START_UTIME, 7)
+    for name, rest, num_incomplete in (
+        ("a", [markers(2)], 1),  # the end is missing
+        ("b", [markers(2), (channel.decode(), end)], 1),
+        ("c", [markers(2), (channel.decode(), about.end(START_UTIME, 0)[1])], 0),
+    ):
+        path = write_take(tmp_path / f"{name}.lcmlog", [*messages, *rest])
+        result = CliRunner().invoke(app, ["take", "info", str(path)])
+        lines = result.stdout.splitlines()
+        assert [line.startswith("INCOMPLETE") for line in lines].count(True) == num_incomplete
+        assert lines[2].startswith("INCOMPLETE") == bool(num_incomplete)
+        assert result.exit_code == num_incomplete
 
 
 def test_a_file_that_is_no_recording_is_an_error(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rtc3d
 
+from gateway.client.transport import Reply
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import ComponentType
@@ -26,8 +27,10 @@ from gateway.rtc3d.parameters import (
     Tool,
 )
 from gateway.takes import open_take
+from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series
+from gateway.takes.files.statistics import take_statistics
 from gateway.takes.files.take import TakeSource
 from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
 
@@ -279,3 +282,79 @@ def test_a_pose_on_a_foreign_channel_is_unknown(tmp_path: Path) -> None:
     reader = TakeReader(write_take(tmp_path / "take.lcmlog", [markers(1, 0), pose("ARM")]))
     assert len(list(reader.messages())) == 1
     assert reader.unknown == {"ARM": 1}
+
+
+# Takes that are not whole, or not one --------------------------------------------------------
+
+
+def recorded(folder: Path, name: str, begin: int, *, num_lost: int = 0, has_end: bool = True) -> Path:
+    """Write a take of ten frames as the gateway does; return its path."""
+    about = SourceDescription("lab", "MOCAP_LAB")
+    utime = START_UTIME + begin * 10_000
+    messages = [(channel.decode(), message) for channel, message in about.beginning(name, utime)]
+    messages += [markers(2, number) for number in range(begin, begin + 10)]
+    if has_end:
+        channel, message = about.end(utime + 100_000, num_lost)
+        messages.append((channel.decode(), message))
+    return write_take(folder / f"{name}.lcmlog", messages)
+
+
+@pytest.mark.parametrize(
+    ("num_lost", "has_end", "expected"),
+    [(0, True, (0, False, False)), (7, True, (7, False, True)), (0, False, (0, True, True))],
+)
+def test_a_take_says_what_its_recorder_lacks(
+    tmp_path: Path, num_lost: int, has_end: bool, expected: tuple[int, bool, bool]
+) -> None:
+    """Whoever analyses a take must be able to see that its end is missing."""
+    path = recorded(tmp_path, "a", 0, num_lost=num_lost, has_end=has_end)
+    take = open_take(path)
+    source = take.sources["lab"]
+    assert (source.num_lost, source.is_cut_off, take.was_cut_short) == expected
+    assert not open_take(path, to_s=0.05).sources["lab"].is_cut_off  # nobody has looked there
+    joined = open_take([recorded(tmp_path, "b", 20), path])
+    source = joined.sources["lab"]
+    assert (source.num_lost, source.is_cut_off, joined.was_cut_short) == expected
+
+
+@pytest.mark.parametrize("order", ["ab", "ba", "aa", "bab"])
+def test_takes_that_are_in_one_file_are_in_order_and_occur_once(tmp_path: Path, order: str) -> None:
+    """``cat b a > c`` is what people do; times must not go back, and no frame may count twice."""
+    paths = {"a": recorded(tmp_path, "a", 0), "b": recorded(tmp_path, "b", 3000)}
+    both = tmp_path / "c.lcmlog"
+    both.write_bytes(b"".join(paths[each].read_bytes() for each in order))
+    take = open_take(both)
+    found = take.sources["lab"].markers
+    assert found is not None
+    numbers = [*range(10), *(range(3000, 3010) if "b" in order else ())]
+    assert found.sequence.tolist() == numbers
+    assert found.seconds.tolist() == pytest.approx([number / 100 - 0.002 for number in numbers])
+    statistics = take_statistics(both)
+    assert statistics.start_utime == START_UTIME
+    component = statistics.sources["lab"].components["3d"]
+    assert component.last_utime - component.first_utime == (numbers[-1] - numbers[0]) * 10_000
+
+
+def test_segments_of_a_take_are_not_takes_of_their_own(tmp_path: Path) -> None:
+    """After a step of the clock, their times go back, and their order is still that of their names."""
+    folder = tmp_path / "take"
+    folder.mkdir()
+    recorded(folder, "a", 3000)
+    recorded(folder, "b", 0)
+    found = open_take(folder).sources["lab"].markers
+    assert found is not None
+    assert found.sequence.tolist() == [*range(3000, 3010), *range(10)]
+
+
+def test_summaries_are_short(tmp_path: Path) -> None:
+    """A take has thousands of labels and megabytes of XML, and consoles print what they are given."""
+    labels = [f"marker {number}" for number in range(500)]
+    messages = [parameters(labelled(*labels)), *(markers(500, number) for number in range(3))]
+    take = open_take(write_take(tmp_path / "a.lcmlog", messages))
+    source = take.sources["lab"]
+    assert source.markers is not None
+    for each in (take, source, source.parameters[0], source.markers, Reply("lab", (), bytes(10_000))):
+        assert len(repr(each)) < 100
+    assert "lab" in repr(take)
+    take.sources = {f"source {number}": source for number in range(1000)}
+    assert len(repr(take)) < 200
