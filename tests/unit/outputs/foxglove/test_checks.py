@@ -12,6 +12,7 @@ from gateway.outputs.findings import Finding, Result
 from gateway.outputs.foxglove import checks
 from gateway.outputs.foxglove.checks import check_foxglove
 from gateway.outputs.foxglove.settings import FOXGLOVE, FoxgloveSettings
+from tests.support.errors import names, raises
 from tests.support.networks import free_port
 from tests.unit.outputs.foxglove.live import serving
 
@@ -26,7 +27,7 @@ def test_a_free_port_passes(host: str) -> None:
     package, port = check(free_port(), host=host)
     assert (package.result, port.result) == (Result.PASSING, Result.PASSING)
     assert "foxglove-sdk" in package.found
-    assert "will be able to connect to ws://" in port.found
+    assert "ws://" in port.found
 
 
 async def test_a_gateway_that_is_running_passes_if_it_serves_all_sources() -> None:
@@ -61,13 +62,13 @@ def test_a_package_that_is_missing_is_named_with_what_to_do(monkeypatch: pytest.
     monkeypatch.setattr(checks, "version", version)
     package, port = check(free_port())
     assert (package.result, port.result) == (Result.FAILING, Result.NOT_TESTED)
-    assert "websockets is not installed" in package.found
-    assert "pip install 'rtc3d-gateway[foxglove]'" in package.remedy
+    assert names(package.found, "websockets")
+    assert names(package.remedy, "'rtc3d-gateway[foxglove]'")
     monkeypatch.setitem(sys.modules, "foxglove", None)
     for name in list(sys.modules):
         if name.startswith(("gateway.foxglove_schemas", "gateway.outputs.foxglove.")):
             monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(ConfigError, match=r"pip install 'rtc3d-gateway\[foxglove\]'"):
+    with raises(ConfigError, "'rtc3d-gateway[foxglove]'"):
         FOXGLOVE.create(FoxgloveSettings(enabled=True))
 
 

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import re
 import socket
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager
@@ -12,6 +11,7 @@ import pytest
 
 from gateway.outputs.foxglove.connections import LIMITS, MAX_FRAGMENTS, MAX_REQUEST_BYTES
 from gateway.rtc3d.components import ComponentType
+from tests.support.errors import names
 from tests.support.foxglove_viewer import (
     CONTINUATION,
     PING,
@@ -22,6 +22,7 @@ from tests.support.foxglove_viewer import (
     upgrade_request,
     viewing,
 )
+from tests.support.records import kinds
 from tests.support.waiting import wait_until_async
 from tests.unit.outputs.foxglove.live import LiveSource, frame_of, serving, watching
 
@@ -78,8 +79,7 @@ async def test_a_slow_viewer_loses_messages_which_are_counted_and_another_loses_
             assert messages == frames >= 100
             assert viewer.warnings == []
     # On a busy computer, the loss may seem to end in between, and is logged again when it goes on.
-    [warning] = {record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING}
-    assert warning.startswith("lab to foxglove: the viewer at 127.0.0.1:")
+    assert set(kinds(caplog)) == {("WARNING", "slow client")}
 
 
 async def test_a_slow_viewer_is_told_once_and_gets_the_messages_that_found_a_place() -> None:
@@ -110,7 +110,7 @@ async def test_a_viewer_that_reads_nothing_for_long_is_disconnected(
                 return not lab.wanted
 
             await wait_until_async(is_unwanted)
-    assert num_logged(caplog, "is disconnected: it has not read what waits for it for 0.1 s") == 1
+    assert num_logged(caplog, "for 0.1 s") == 1
 
 
 async def test_a_request_may_come_in_pieces() -> None:
@@ -143,12 +143,12 @@ async def test_one_viewer_too_many_is_refused_with_a_reason(
         async with AsyncExitStack() as stack:
             for _ in range(3):
                 await stack.enter_async_context(viewing(port))
-            with pytest.raises(HandshakeRefusedError, match=r"503(.|\n)*viewers are connected already"):
+            with pytest.raises(HandshakeRefusedError, match="503"):
                 await Viewer.open(port)
         async with viewing(port):
             pass
-    [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert re.fullmatch(r"foxglove: 127\.0\.0\.1:\d+ is refused: 3 viewers are connected; .*", warning)
+    assert kinds(caplog) == [("WARNING", "refused")]
+    assert names(caplog.messages[-1], "foxglove", "127.0.0.1", "3 viewers")
 
 
 async def test_handshakes_that_are_not_completed_end_in_favour_of_others() -> None:
@@ -172,17 +172,17 @@ EMPTY = piece(b"", CONTINUATION, is_last=False)
     [
         pytest.param(
             client_frame(b"ping" * 10, PING) * 50_000,
-            "is disconnected: it sends more than a viewer does",
+            "sends more",
             id="flood",
         ),
         pytest.param(
             client_frame(b"", PING) * 10_000,
-            "is disconnected: it sends more than a viewer does",
+            "sends more",
             id="flood of empty frames",
         ),
         pytest.param(
             piece(b"", TEXT, is_last=False) + EMPTY * (MAX_FRAGMENTS + 1),
-            "is disconnected: it sends a message in more than 1000 pieces",
+            "1000 pieces",
             id="pieces",  # each needs memory until the message is complete, even if it is empty
         ),
         pytest.param(client_frame(b'"' + b"x" * MAX_REQUEST_BYTES + b'"'), "", id="too large"),

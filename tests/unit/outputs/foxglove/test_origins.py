@@ -6,7 +6,9 @@ import socket
 import pytest
 
 from gateway.outputs.foxglove.settings import FoxgloveSettings
+from tests.support.errors import names
 from tests.support.foxglove_viewer import HandshakeRefusedError, Viewer
+from tests.support.records import kinds
 from tests.unit.outputs.foxglove.live import serving
 
 HOST = "127.0.0.1"
@@ -66,7 +68,5 @@ async def test_programs_may_connect_under_any_name_and_two_origins_are_refused(
     twice = ("Origin: https://evil.example", "Origin: https://app.foxglove.dev")
     assert not await is_accepted(settings, "Host: 127.0.0.1:8765", *twice)
     [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert warning.endswith(
-        " is refused: pages of 'https://evil.example' must not use this server; "
-        "if a viewer of yours is there, add it to foxglove.origins"
-    )
+    assert kinds(caplog) == [("WARNING", "foreign page")]
+    assert names(warning, "'https://evil.example'", "foxglove.origins")
