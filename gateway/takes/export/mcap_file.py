@@ -6,8 +6,10 @@ and written many at a time, because a few calls for each message would take seve
 
 import logging
 from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable
+from operator import itemgetter
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
@@ -27,6 +29,9 @@ from gateway.takes.files.take import Take, TakeSource
 
 _MAX_CHANNELS: Final = 1000
 """More can only come from labels that change all the time."""
+
+_MAX_LATE_US: Final = 5_000_000
+"""Messages that arrive in a take at the same time were captured within this."""
 
 # foxglove-sdk logs errors of the file, which McapFile raises. Without a handler, they would go to stderr.
 logging.getLogger("foxglove").addHandler(logging.NullHandler())
@@ -70,12 +75,14 @@ def export_to_mcap(
     _note_metres(job, take)
     exports: dict[str, SourceExport] = {}
     with McapFile(job.files.create(job.out), profile) as file:
-        for name, key, series in parts_of(job, take):
-            if name not in exports:
-                exports[name] = new_export(take.sources[name])
-            for run in series.runs():
-                for messages in exports[name].messages(key, run):
-                    file.write(messages)
+        for part in parts_of(job, take):
+            for name, key, series in part:
+                if name not in exports:
+                    exports[name] = new_export(take.sources[name])
+                for run in series.runs():
+                    for messages in exports[name].messages(key, run):
+                        file.add(messages)
+            file.write_most()
         for source in take.sources.values():
             file.describe(source)
     if not file.num_messages:
@@ -111,6 +118,7 @@ class McapFile:
 
     def __init__(self, file: IO[bytes], profile: str = "") -> None:
         self.num_messages = 0
+        self._waiting: list[tuple[int, Callable[..., None], bytes]] = []
         self._file = _WatchedFile(file)
         self._context = foxglove.Context()
         self._channels: dict[Topic, foxglove.Channel] = {}
@@ -124,18 +132,32 @@ class McapFile:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
+            if error is None:
+                self._waiting.sort(key=itemgetter(0))
+                self._write(len(self._waiting))
             self._writer.close()
         except Exception:
             if error is None and self._file.error is None:
                 raise
         self._file.raise_error()  # in place of foxglove-sdk's own
 
-    def write(self, messages: TopicMessages) -> None:
-        """Append messages."""
+    def add(self, messages: TopicMessages) -> None:
+        """Take messages, which are written later, in the order of time."""
         log = self._channel(messages.topic).base.log  # the method of the class takes half as long again
-        for utime, data in zip(messages.utimes, messages.messages, strict=True):
+        pairs = zip(messages.utimes, messages.messages, strict=True)
+        self._waiting += [(utime, log, data) for utime, data in pairs]
+
+    def write_most(self) -> None:
+        """Write the messages, except those of the last seconds: earlier ones of other topics may follow."""
+        self._waiting.sort(key=itemgetter(0))
+        newest = self._waiting[-1][0] if self._waiting else 0
+        self._write(bisect_left(self._waiting, newest - _MAX_LATE_US, key=itemgetter(0)))
+
+    def _write(self, count: int) -> None:
+        for utime, log, data in self._waiting[:count]:
             log(data, log_time=utime * 1000)
-        self.num_messages += len(messages.utimes)
+        del self._waiting[:count]
+        self.num_messages += count
         self._file.raise_error()
 
     def _channel(self, topic: Topic) -> foxglove.Channel:

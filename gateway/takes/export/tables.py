@@ -6,6 +6,7 @@ They are made while the take is read, so that its size does not matter.
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -39,7 +40,7 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
     take = job.open_take(components=())
     tables: dict[tuple[str, str, tuple[Column, ...]], Table] = {}
     numbers: Counter[tuple[str, str]] = Counter()
-    for name, key, series in parts_of(job, take):
+    for name, key, series in chain.from_iterable(parts_of(job, take)):
         source = take.sources[name]
         for run in series.runs():
             columns = value_columns(run)
@@ -73,11 +74,12 @@ def _note_columns(job: ExportJob, source: str, run: Series, columns: tuple[Colum
             job.note(f"the channel {label} of {source} is the column {column.name}")
 
 
-def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
-    """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
+def parts_of(job: ExportJob, take: Take) -> Iterator[list[tuple[str, str, Series]]]:
+    """Yield parts of the take of some MB: its components, each with the name of its source and its key."""
     reader = TakeReader(job.take)
     first_utime, end_utime = utime_range(take.start_utime, job.from_s, job.to_s)
     for batches in reader.batches(end_utime):
+        found = []
         for batch in batches:
             source = take.sources.get(batch.source)
             if source is None or batch.key not in COMPONENTS_BY_KEY:
@@ -92,6 +94,7 @@ def parts_of(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
             builder.add(rows)
             series = builder.build(source.parameters, take.start_utime)
             if series is not None:
-                yield source.name, batch.key, series
+                found.append((source.name, batch.key, series))
+        yield found
         job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)
     job.progress(f"writing {job.out.name}", reader.num_bytes, reader.num_bytes)

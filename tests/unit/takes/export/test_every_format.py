@@ -4,17 +4,19 @@ import csv
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from functools import partial
-from itertools import count, groupby
+from itertools import count, groupby, pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 import pytest
 import rtc3d
+from mcap.reader import make_reader
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, export_take
+from gateway.takes.files import reader
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -26,6 +28,7 @@ from tests.support.takes import (
     scene_messages,
     write_take,
 )
+from tests.unit.takes.export import exported
 from tests.unit.takes.export.exported import C3d, notes_of
 from tests.unit.takes.export.read_mcap import read_mcap
 from tests.unit.takes.export.test_opensim import read_storage
@@ -290,3 +293,22 @@ def test_an_interruption_at_any_time_leaves_nothing(take: Path, tmp_path: Path, 
             break
     assert number >= 3  # reading, writing, saving
     assert list(tmp_path.rglob("*")) != []
+
+
+@pytest.mark.parametrize("name", [".mcap", "ros2"])
+def test_messages_are_in_the_order_of_time(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Players read from the beginning, and need the index only to seek: chunks must not overlap."""
+    monkeypatch.setattr(reader, "_BATCH_BYTES", 50_000)
+    source = write_take(tmp_path / "take.lcmlog", exported.scene(300))
+    export_take(job_for(name, source, tmp_path / "out"))
+    with (tmp_path / "out/take.mcap").open("rb") as file:
+        found = make_reader(file)
+        times = [message.log_time for _, _, message in found.iter_messages(log_time_order=False)]
+        summary = found.get_summary()
+    assert len(times) > 3000
+    assert times == sorted(times)
+    assert summary is not None
+    chunks = summary.chunk_indexes
+    assert all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))

@@ -398,7 +398,7 @@ def test_a_full_disk_is_its_own_error_whatever_is_written() -> None:
     entry = ParametersEntry(START_UTIME, 1, Parameters(), bytes(2_000_000))
 
     uses: list[Callable[[McapFile], object]] = [
-        lambda file: file.write(messages),
+        lambda file: file.add(messages),
         lambda file: file.describe(TakeSource("lab", parameters=[entry])),
         lambda file: file.describe(TakeSource("lab", "192.0.2.20:3020")),
         lambda _file: None,
