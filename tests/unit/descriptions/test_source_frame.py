@@ -58,31 +58,27 @@ def test_up_and_angles_turn_about_fixed_axes(transform: dict[str, Any], axes: li
     assert [moved(frame, 1, 0, 0), moved(frame, 0, 1, 0), moved(frame, 0, 0, 1)] == axes
 
 
-NUMBER = "expected a number from -1000000 to 1000000"
-QUATERNION = "expected a list of four numbers, x y z w, such as [0, 0, 0, 1]"
-
-
 @pytest.mark.parametrize(
     ("transform", "key", "text"),
     [
-        ({"units": "feet"}, "units", "found 'feet'; expected m, dm, cm, mm, um, in or ft, or null for the"),
+        ({"units": "feet"}, "units", "found 'feet'; expected m, dm, cm, mm, um, in or ft"),
         ({"up": "x"}, "up", "found 'x'; expected y or z"),
-        ({"scale": 0}, "scale", "found 0; expected a number from 0.000001 to 1000000"),
-        ({"scale": "1e-3"}, "scale", "found '1e-3' (write it as 0.001); expected a number from 0.000001 to"),
-        ({"rotation_xyzw": [0, 0, 1, 1]}, "rotation_xyzw", "found [0, 0, 1, 1], whose squares do not add up"),
+        ({"scale": 0}, "scale", "found 0; expected "),
+        ({"scale": "1e-3"}, "scale", "found '1e-3' ("),
+        ({"rotation_xyzw": [0, 0, 1, 1]}, "rotation_xyzw", "found [0, 0, 1, 1]"),
         (
             {"rotation_xyzw": [0, 0, 0, 0]},
             "rotation_xyzw",
-            "found only zeros, which is no rotation; expected",
+            "found only zeros",
         ),
-        ({"rotation_xyzw": [0, 0, 1]}, "rotation_xyzw", f"found [0, 0, 1]; {QUATERNION}"),
-        ({"rotation_xyzw": [0, 0, math.nan, 1]}, "rotation_xyzw.2", f"found nan; {NUMBER}"),
-        ({"rotation_xyzw": {"w": 1}}, "rotation_xyzw", f"found a mapping; {QUATERNION}"),
-        ({"translation_m": [1, "2 m", 3]}, "translation_m.1", f"found '2 m'; {NUMBER}"),
+        ({"rotation_xyzw": [0, 0, 1]}, "rotation_xyzw", "found [0, 0, 1]; expected "),
+        ({"rotation_xyzw": [0, 0, math.nan, 1]}, "rotation_xyzw.2", "found nan; expected "),
+        ({"rotation_xyzw": {"w": 1}}, "rotation_xyzw", "found a mapping; expected "),
+        ({"translation_m": [1, "2 m", 3]}, "translation_m.1", "found '2 m'; expected "),
         (
             {"translation_m": [1, 2]},
             "translation_m",
-            "found [1, 2]; expected a list of three numbers of metres",
+            "found [1, 2]; expected ",
         ),
         (
             {"rotation_xyzw": [0, 0, 0, 1], "rotation_deg": {"yaw": 1}},
@@ -92,7 +88,7 @@ QUATERNION = "expected a list of four numbers, x y z w, such as [0, 0, 0, 1]"
         (
             {"rotation_deg": {"yaw": 361}},
             "rotation_deg.yaw",
-            "found 361; expected a number of degrees from -360",
+            "found 361; expected ",
         ),
     ],
 )

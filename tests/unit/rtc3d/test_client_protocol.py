@@ -30,6 +30,7 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.rtc3d.packets import Packet
+from tests.support.errors import names
 from tests.support.servers import error, ok, packet
 from tests.support.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING, ByteOrder
 
@@ -79,11 +80,9 @@ def test_a_command_that_cannot_be_sent_is_named_with_the_reason() -> None:
     protocol.end()
     with pytest.raises(ClosedError) as closed:
         protocol.send_recording(start=True)
-    assert [str(caught.value) for caught in (waiting, closing, closed)] == [
-        "SetByteOrder LittleEndian not sent: Version 1.0 has not been answered yet",
-        "Version 1.0 not sent: the connection is closing",
-        "recording control not sent: the connection is closed",
-    ]
+    assert names(str(waiting.value), "SetByteOrder LittleEndian", "Version 1.0")
+    assert names(str(closing.value), "Version 1.0", "closing")
+    assert names(str(closed.value), "recording control", "closed")
 
 
 # States ---------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from gateway.rtc3d.packets import (
     decode_text,
     encode_packet,
 )
+from tests.support.errors import names
 from tests.support.vectors import PACKETS
 
 
@@ -96,21 +97,19 @@ def test_the_default_limits_are_16_mib_and_256_mib() -> None:
 @pytest.mark.parametrize(
     ("size", "packet_type", "bound"),
     [
-        (7, 1, "less than the header's 8"),
-        (101, 3, "limit 100"),
-        (0x5353482D, 5, "limit 200"),  # "SSH-", the greeting of another protocol
+        (7, 1, 8),
+        (101, 3, 100),
+        (0x5353482D, 5, 200),  # "SSH-", the greeting of another protocol
     ],
 )
-def test_the_error_says_what_is_wrong_with_the_size_where(size: int, packet_type: int, bound: str) -> None:
+def test_the_error_says_what_is_wrong_with_the_size_where(size: int, packet_type: int, bound: int) -> None:
     """The user of a wrong port sees which program answers there; nothing more is read."""
     wrong = header(size, packet_type) + bytes(range(92))
     reader = reader_after()
     assert [each.type for each in reader.feed(PACKETS[1].packet + wrong)] == [1]
     error = error_of(reader)
-    assert str(error) == (
-        f"packet size {size} ({bound}), type {packet_type}, at byte 20 of the stream: "
-        "this is not an RTC3D server, or the connection is corrupt; check host and port"
-    )
+    assert (error.size, error.packet_type, error.offset) == (size, packet_type, 20)
+    assert names(str(error), size, bound, packet_type, 20)
     assert error.first_bytes == wrong[:60]
     assert reader.feed(PACKETS[1].packet) == []
     assert (reader.error, reader.buffered_bytes) == (error, 0)
@@ -131,7 +130,6 @@ def test_the_largest_packet_that_can_be_encoded_has_a_size_of_32_bits() -> None:
     body.length += 1
     with pytest.raises(PacketError) as caught:
         encode_packet(2, body)
-    assert str(caught.value) == "a packet of 4294967296 bytes does not fit its 32-bit size field"
     assert (caught.value.size, caught.value.packet_type, caught.value.offset) == (4294967296, 2, 0)
 
 

@@ -40,6 +40,7 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
+from tests.support.errors import raises
 from tests.support.statuses import amounts
 
 ALL = frozenset(WIRE_ORDER)
@@ -397,5 +398,5 @@ def test_a_closed_publisher_takes_nothing(publisher: Publisher) -> None:
     publisher.publisher.close()
     assert not publisher.prepare(markers(3))
     assert publisher.sent == []
-    with pytest.raises(OutputError, match="ask for a new publisher"):
+    with raises(OutputError, cause="closed"):
         publisher.publish(markers(3))

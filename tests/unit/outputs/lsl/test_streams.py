@@ -199,4 +199,4 @@ def test_streams_of_a_source_whose_name_begins_alike_are_not_those_of_this_one(
     opens, found, gateway = checks.check_lsl(settings, ["lab", "lab_2"], [], 20.0)
     assert (opens.result, found.result) == (Result.PASSING, Result.PASSING)
     assert gateway.result is Result.WARNING
-    assert gateway.found == "streams of lab_2 are offered, but none of lab"
+    assert "lab_2" in gateway.found

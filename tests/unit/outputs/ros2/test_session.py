@@ -106,13 +106,10 @@ ENDPOINTS = ("", "192.0.2.5:7447", "tcp/192.0.2.5", "tcp/:7447", "tcp/a:0", "tcp
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "expected"),
+    ("key", "value", "example"),
     [
-        *(("namespace", value, "a ROS namespace such as mocap or site/mocap") for value in NAMESPACES),
-        *(
-            ("connect", value, "the endpoint of a Zenoh router, such as tcp/127.0.0.1:7447")
-            for value in ENDPOINTS
-        ),
+        *(("namespace", value, "site/mocap") for value in NAMESPACES),
+        *(("connect", value, "tcp/127.0.0.1:7447") for value in ENDPOINTS),
         ("distribution", "jazy", ""),
         ("domain_id", -1, ""),
         ("domain_id", 233, ""),
@@ -121,8 +118,8 @@ ENDPOINTS = ("", "192.0.2.5:7447", "tcp/192.0.2.5", "tcp/:7447", "tcp/a:0", "tcp
         ("depth", 0, ""),
     ],
 )
-def test_mistakes(key: str, value: object, expected: str) -> None:
+def test_mistakes(key: str, value: object, example: str) -> None:
     [(place, text)] = mistakes(Ros2Settings, {key: value})
     assert place == key
     assert text.startswith(f"found {value!r}"[:50])
-    assert f"; expected {expected}" in text
+    assert example in text.partition("; expected ")[2]

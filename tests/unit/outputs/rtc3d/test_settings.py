@@ -13,6 +13,7 @@ from gateway.outputs.rtc3d.output import check_rtc3d
 from gateway.outputs.rtc3d.settings import RTC3D, Rtc3dSettings
 from gateway.simulator.simulator import Simulator
 from tests.support.configurations import mistakes
+from tests.support.errors import names
 from tests.support.networks import free_port
 from tests.support.waiting import wait_until_async
 from tests.unit.rtc3d_server.counting_scene import CountingScene
@@ -28,11 +29,11 @@ def test_by_default_it_is_off_and_listens_on_this_computer_only() -> None:
 @pytest.mark.parametrize(
     ("values", "place", "text"),
     [
-        ({"enabled": True}, "ports", "found nothing; expected a port for each source that is served"),
+        ({"enabled": True}, "ports", "found nothing; expected "),
         (
             {"ports": {"lab": 3120, "hall": 3120}},
             "ports.hall",
-            "found 3120, which lab has too; expected another",
+            "found 3120, which lab",
         ),
         ({"ports": {"lab": 0}}, "ports.lab", ""),
         ({"ports": {"a lab": 3120}}, "ports.a lab", ""),
@@ -59,14 +60,14 @@ def findings(sources: list[str], ports: dict[str, int], host: str = "127.0.0.1")
     ("sources", "port_of", "result", "text"),
     [
         (["lab"], "lab", Result.PASSING, ""),
-        (["lab", "hall"], "lap", Result.WARNING, "rtc3d.ports has a port for lap, which is no source"),
-        (["lab", "hall"], "lab", Result.NOTE, "RTC3D clients cannot connect to hall"),
+        (["lab", "hall"], "lap", Result.WARNING, "lap"),
+        (["lab", "hall"], "lab", Result.NOTE, "hall"),
     ],
 )
 def test_ports_are_those_of_the_sources(sources: list[str], port_of: str, result: Result, text: str) -> None:
-    names, ports = findings(sources, {port_of: free_port()})
-    assert (names.result, text in names.found, ports.result) == (result, True, Result.PASSING)
-    assert result is not Result.WARNING or names.remedy == "Correct the name; the sources are lab, hall."
+    named, ports = findings(sources, {port_of: free_port()})
+    assert (named.result, text in named.found, ports.result) == (result, True, Result.PASSING)
+    assert result is not Result.WARNING or names(named.remedy, "lab, hall")
 
 
 @pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
@@ -77,7 +78,7 @@ def test_a_port_of_another_program_fails(answer: bytes) -> None:
             accepted.sendall(answer)
             *_, finding = findings(["lab"], {"lab": port})
     assert finding.result is Result.FAILING
-    assert finding.found.startswith(f"cannot listen on 127.0.0.1, port {port} (for lab): ")
+    assert names(finding.found, f"127.0.0.1, port {port} (for lab)")
     assert "rtc3d.ports.lab" in finding.remedy
 
 
@@ -91,4 +92,4 @@ async def test_the_port_of_a_running_gateway_passes(caplog: pytest.LogCaptureFix
         *_, finding = await asyncio.to_thread(findings, ["lab"], {"lab": server.port})
         await wait_until_async(lambda: "disconnected" in caplog.text)
     assert "reset" not in caplog.text
-    assert (finding.result, "the gateway, if it runs" in finding.found) == (Result.PASSING, True)
+    assert (finding.result, "gateway" in finding.found) == (Result.PASSING, True)
