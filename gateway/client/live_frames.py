@@ -2,13 +2,13 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Final, cast
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 
 from gateway.client.queued_reception import Arrival, DescribedSource, QueuedReception, QueuedSeries
 from gateway.descriptions.labels import Description, describe
-from gateway.messages.host_time import now_utime
+from gateway.messages.host_time import STEP_US, clock_difference_us, now_steady_us, now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import HEAD, Array, Rows, decode_rows
@@ -22,27 +22,54 @@ class ClockDifference:
 
     No message arrives before it is sent: the least difference between both is at most the delay of the
     network. Up to 20 ms, it is taken for that, and both clocks for the same.
+
+    Arrivals are timed by a clock that nobody sets, so it does not matter if this host's clock is set. If
+    that of the gateway is set forward, the least difference becomes smaller at once; if it is set back, the
+    times of a key go back although its numbers do not, and what was known before no longer holds.
     """
 
     SAME_US: Final = 20_000
     _WINDOW_US: Final = 30_000_000
+    _LATE_US: Final = 1_000_000
+    """A message that was overtaken on the network by more is one of a gateway that has started again."""
 
     def __init__(self) -> None:
         self.offset_us = 0
-        """What to add to the gateway's times, in µs."""
+        """What to add to the gateway's times, in µs, for this host's."""
+        self.steady_offset_us = 0
+        """The same for this host's steady clock."""
         self._least_us: deque[tuple[int, int]] = deque(maxlen=2)  # begin of a window, least difference in it
+        self._newest: dict[str, Sent] = {}
 
-    def add(self, utime: int, arrived_utime: int) -> None:
-        """Take the time of a message, on the gateway's clock, and when it arrived, on this host's."""
-        difference_us = arrived_utime - utime
-        if not self._least_us or arrived_utime - self._least_us[-1][0] > self._WINDOW_US:
-            self._least_us.append((arrived_utime, difference_us))
+    def add(self, key: str, sent: "Sent") -> None:
+        """Take when a message of a key was sent and when it arrived."""
+        newest = self._newest.get(key)
+        if newest is not None and sent.utime < newest.utime - STEP_US:
+            is_before = sent.session == newest.session and sent.sequence < newest.sequence
+            if is_before and sent.steady_us - newest.steady_us < self._LATE_US:
+                return
+            self._least_us.clear()
+        self._newest[key] = sent
+        difference_us = sent.steady_us - sent.utime
+        if not self._least_us or sent.steady_us - self._least_us[-1][0] > self._WINDOW_US:
+            self._least_us.append((sent.steady_us, difference_us))
         elif difference_us < self._least_us[-1][1]:
             self._least_us[-1] = (self._least_us[-1][0], difference_us)
-        else:
-            return
-        least_us = min(least for _, least in self._least_us)
+
+    def follow(self, wall_us: int) -> None:
+        """Update the offsets: ``wall_us`` is this host's clock minus its steady clock."""
+        least_us = min((least for _, least in self._least_us), default=-wall_us) + wall_us
         self.offset_us = 0 if 0 <= least_us <= self.SAME_US else least_us
+        self.steady_offset_us = self.offset_us - wall_us
+
+
+class Sent(NamedTuple):
+    """When a message was sent, on the gateway's clock, its numbers, and when it arrived."""
+
+    utime: int
+    session: int
+    sequence: int
+    steady_us: int
 
 
 class LiveSource(DescribedSource):
@@ -104,7 +131,10 @@ class Frame:
     too slow. If components are joined, it is the sum.
     """
 
-    __slots__ = ("_head", "_offset_us", "_others", "_parts", "_source", "_start_utime", "gap", "key")
+    __slots__ = (
+        *("_head", "_offset_us", "_others", "_parts", "_source", "_start_utime", "_steady_offset_us"),
+        *("gap", "key"),
+    )
 
     def __init__(
         self, source: LiveSource, key: str, parts: Mapping[str, Sequence[Row]], gap: int, start_utime: int
@@ -112,6 +142,7 @@ class Frame:
         self._source = source
         self._start_utime = start_utime
         self._offset_us = source.clock.offset_us
+        self._steady_offset_us = source.clock.steady_offset_us
         self._parts = parts
         self._head = parts[key][-1].head
         self.key = key
@@ -191,7 +222,7 @@ class Frame:
     @property
     def age_s(self) -> float:
         """How long ago the server captured it, in s. It grows while the frame is kept."""
-        return now_utime() / 1e6 - self.capture_time
+        return (now_steady_us() - self.capture_utime - self._steady_offset_us) / 1e6
 
     @property
     def seconds(self) -> float:
@@ -267,7 +298,8 @@ def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Fra
     for series, message, *_ in arrivals:
         messages.setdefault(series, []).append(message)
     decoded = {series: _rows(series, each) for series, each in messages.items()}
-    for series, _, arrived_utime, gap, is_past in arrivals:
+    wall_us = clock_difference_us(now_utime, now_steady_us)
+    for series, _, _, gap, is_past, steady_us in arrivals:
         found = next(decoded[series])
         if found is None:
             series.num_malformed += 1
@@ -276,7 +308,8 @@ def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Fra
         head, items = found
         source = cast(LiveSource, series.source)
         if not is_past:
-            source.clock.add(head[1], arrived_utime)
+            source.clock.add(series.key, Sent(head[1], head[4], head[3], steady_us))
+        source.clock.follow(wall_us)
         component = COMPONENTS_BY_KEY[series.key]
         row = Row(component, head, items, *source.describe(component, head[5], head[1], items.shape[1]))
         total_gap, series.malformed_gap = gap + series.malformed_gap, 0

@@ -213,7 +213,7 @@ class Live:
         ]
         if not arrivals:
             return None
-        newest = max(arrivals, key=lambda arrival: arrival.arrived_utime)
+        newest = max(arrivals, key=lambda arrival: arrival.steady_us)  # a clock that nobody sets
         with self._taking:
             self._update_sources()
             frame = next(decode_frames([newest], self._reception.start_utime), None)

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 from gateway.client.reception import Reception, Series, Source
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
-from gateway.messages.host_time import now_utime
+from gateway.messages.host_time import now_steady_us, now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory
 
@@ -57,8 +57,9 @@ class QueuedSeries(Series):
 class Arrival(NamedTuple):
     """A message of a component.
 
-    ``arrived_utime`` is when it arrived, on this host's clock; ``gap`` is how many are missing before it. One
-    that ``is_past`` was published before the subscriber began, or has waited for such messages.
+    ``arrived_utime`` is when it arrived, on this host's clock, and ``steady_us`` the same on the clock that
+    nobody sets; ``gap`` is how many are missing before it. One that ``is_past`` was published before the
+    subscriber began, or has waited for such messages.
     """
 
     series: QueuedSeries
@@ -66,6 +67,7 @@ class Arrival(NamedTuple):
     arrived_utime: int
     gap: int
     is_past: bool = False
+    steady_us: int = 0
 
 
 class DescribedSource(Source):
@@ -83,6 +85,7 @@ class DescribedSource(Source):
         self.unread: deque[bytes] = deque(maxlen=_MAX_ENTRIES)
         """What has arrived since the last ``update_parameters``."""
         self._history = ParametersHistory()
+        self._arrived: deque[ParametersEntry] = deque(maxlen=_MAX_ENTRIES)  # times can be set back
         self._entries_by_version: dict[int, list[ParametersEntry]] = {}
 
     @property
@@ -101,7 +104,8 @@ class DescribedSource(Source):
             if entry is None:
                 continue
             self.num_unreadable += not self._history.is_readable
-            self.entries = sorted([*self.entries, entry], key=lambda each: each.utime)[-_MAX_ENTRIES:]
+            self._arrived.append(entry)
+            self.entries = sorted(self._arrived, key=lambda each: each.utime)
             self._entries_by_version = {}
             for each in self.entries:
                 self._entries_by_version.setdefault(each.version, []).append(each)
@@ -205,7 +209,7 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         if series.key not in COMPONENTS_BY_KEY:
             return
         gap = series.new_losses()
-        series.newest = arrival = Arrival(series, message, now_utime(), gap, series.is_past)
+        series.newest = arrival = Arrival(series, message, now_utime(), gap, series.is_past, now_steady_us())
         if not self.is_queueing:
             return
         self._waiting.append(arrival)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.client import queued_reception
+from gateway.client import live_frames, queued_reception
 from gateway.client.client import GatewayAddress
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.live_frames import ClockDifference, Frame
+from gateway.client.live_frames import ClockDifference, Frame, Sent
 from gateway.client.live_join import MAX_WAIT_S
 from gateway.client.live_stream import Live, live
 from gateway.errors import SelectionError
@@ -223,6 +223,30 @@ def test_the_newest_frame_needs_no_queue() -> None:
     assert not data._reception.take_waiting()
 
 
+def test_the_newest_frame_is_that_of_the_newest_arrival_although_the_clock_was_set_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of several keys. Its age is right whether it is decoded before the clock was set or after."""
+    data = Fed("lab")
+    steady_us, wall_us = 0, START_UTIME
+    monkeypatch.setattr(queued_reception, "now_steady_us", lambda: steady_us)
+    monkeypatch.setattr(queued_reception, "now_utime", lambda: steady_us + wall_us)
+    monkeypatch.setattr(live_frames, "now_steady_us", lambda: steady_us)
+    monkeypatch.setattr(live_frames, "now_utime", lambda: steady_us + wall_us)
+    data.feed([ones(TOOLS, 0, version=0, utime=START_UTIME)])
+    kept = data.latest()
+    steady_us, wall_us = 50_000, START_UTIME - 10_000_000
+    data.feed([ones(MARKERS, 5, version=0, utime=START_UTIME + 50_000)])
+    newest = data.latest()
+    assert kept is not None
+    assert newest is not None
+    assert (kept.key, newest.key) == ("6d", "3d")
+    assert kept.age_s == pytest.approx(0.052)
+    assert newest.age_s == pytest.approx(0.002)
+    assert newest.capture_time == pytest.approx((steady_us + wall_us) / 1e6 - newest.age_s)
+    assert data.latest("6d", max_age_s=0.01) is None
+
+
 def test_a_frame_waits_for_its_parameters() -> None:
     data = Fed()
     data.feed([ones(MARKERS, 0, version=1)])
@@ -338,8 +362,77 @@ def _numbers(data: Live) -> Iterator[int]:
 def test_the_clock_of_another_computer_is_taken_out(differences_us: list[int], offset_us: int) -> None:
     clock = ClockDifference()
     for number, difference_us in enumerate(differences_us):
-        clock.add(START_UTIME + number, START_UTIME + number + difference_us)
+        clock.add("3d", Sent(START_UTIME + number, 1, number, number + difference_us))
+    clock.follow(START_UTIME)
     assert clock.offset_us == offset_us
+    assert clock.steady_offset_us == offset_us - START_UTIME
+
+
+def test_a_gateway_that_starts_again_after_its_clock_was_set_back_is_not_taken_for_late_messages() -> None:
+    """It may have the same session, and lower numbers and times, as messages that were overtaken have."""
+    clock = ClockDifference()
+    clock.add("3d", Sent(START_UTIME, 1, 100, 0))
+    for number in range(40):
+        arrived_us = (number + 1) * 100_000
+        clock.add("3d", Sent(START_UTIME - 3_600_000_000 + arrived_us, 1, number, arrived_us))
+    clock.follow(START_UTIME)
+    assert clock.offset_us == 3_600_000_000
+
+
+_STEPS = st.sampled_from([0, 0, 0, 0, -86_400_000_000, -3_000_000, 60_000, 3_000_000, 86_400_000_000])
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["3d", "analog"]),
+            *(_STEPS, _STEPS),
+            st.integers(0, 9_000),
+            st.sampled_from(["next", "next", "next", "late", "restart"]),
+        ),
+        max_size=60,
+    )
+)
+def test_the_difference_of_two_clocks_is_right_whichever_is_set(
+    messages: list[tuple[str, int, int, int, str]],
+) -> None:
+    """A model: two keys, delays below 9 ms, late messages, restarts of the gateway, and steps of both clocks.
+
+    The difference is right as soon as each key that has come before the step has come after it.
+    """
+    clock, now_us, gateway_us, host_us = ClockDifference(), 0, START_UTIME, START_UTIME + 40_000_000
+    session, numbers, stale = 1, {"3d": 0, "analog": 0}, set[str]()
+    for key, gateway_step_us, host_step_us, delay_us, what in messages:
+        now_us += 10_000
+        if gateway_step_us < 0:
+            stale = {each for each, number in numbers.items() if number}
+        gateway_us, host_us = gateway_us + gateway_step_us, host_us + host_step_us
+        if what == "restart":
+            session += 1
+            numbers = dict.fromkeys(numbers, 1)
+        if what == "late" and numbers[key] and gateway_step_us == 0 and key not in stale:
+            late = Sent(gateway_us + now_us - 15_000, session, numbers[key] - 1, now_us)
+            clock.add(key, late)
+        numbers[key] += 1
+        clock.add(key, Sent(gateway_us + now_us, session, numbers[key], now_us + delay_us))
+        stale.discard(key)
+        clock.follow(host_us)
+        if not stale:
+            assert abs(clock.offset_us - (host_us - gateway_us)) <= ClockDifference.SAME_US
+
+
+@pytest.mark.parametrize("num_before", [1, 15, 16, 17, 40])
+def test_the_newest_parameters_are_kept_when_the_clock_was_set_back(num_before: int) -> None:
+    """Only 16 are kept of a source: the oldest go, by their arrival and not by their times."""
+    data = Fed("lab")
+    for version in range(1, num_before + 1):
+        data.feed([parameters(xml(f"m{version}"), version, utime=START_UTIME + version)])
+        data.parameters()
+    for version in range(num_before + 1, num_before + 4):
+        data.feed([parameters(xml(f"m{version}"), version, utime=START_UTIME - 3_600_000_000 + version)])
+        data.parameters()
+        data.feed([ones(MARKERS, version, 1, version=version)])
+        assert data.frames(1)[0].markers.labels == (f"m{version}",)
 
 
 def test_an_unknown_component_is_refused() -> None:
