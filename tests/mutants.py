@@ -1,4 +1,4 @@
-"""Mutation tests: change what the code means in about 150 ways, and count what no test notices.
+"""Mutation tests: change what the code means in about 200 ways, and count what no test notices.
 
     .venv/bin/python -m tests.mutants
     .venv/bin/python -m tests.mutants stream outputs/zenoh --jobs 4
@@ -34,10 +34,19 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "messages": ("unit/messages/test_*",),
     "client": ("unit/client/test_*",),
     "gateway": ("unit/test_*",),  # the modules that are in no package
+    "takes/replay": ("unit/takes/replay/test_*",),
+    "descriptions": ("unit/descriptions/test_*",),
+    "doctor": ("unit/doctor/test_*",),
+    "display": ("unit/display/test_* unit/display/*/test_*",),
+    "rtc3d_server": ("unit/rtc3d_server/test_*",),
+    "c3d_files": ("unit/c3d_files/test_*",),
+    "config": ("unit/config/test_* property/*_config_*",),
+    "cli": ("unit/cli/test_*",),
+    "service/monitoring": ("unit/service/monitoring/test_*",),
     "takes/files": ("unit/takes/files/test_* property/*takes* property/*_components_*",),
 } | {
     f"outputs/{name}": (f"unit/outputs/{name}/test_* unit/outputs/test_*", f"contract/test_* -k {name}")
-    for name in ("zenoh", "ros2", "rtc3d", "takes", "lcm")
+    for name in ("zenoh", "ros2", "rtc3d", "takes", "lcm", "vrpn", "lsl", "foxglove")
 }
 """The nearest tests of each package, in tests/: patterns of files for one pytest after the other."""
 

@@ -3,6 +3,8 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gateway.config.settings import SourceSettings
 from gateway.config.values import TransformSettings, Unit
@@ -56,6 +58,17 @@ def test_all_units_of_the_settings_are_known() -> None:
 def test_up_and_angles_turn_about_fixed_axes(transform: dict[str, Any], axes: list[list[float]]) -> None:
     frame = frame_of("m", **transform)
     assert [moved(frame, 1, 0, 0), moved(frame, 0, 1, 0), moved(frame, 0, 0, 1)] == axes
+
+
+@given(st.tuples(*[st.integers(-180, 180)] * 3), st.tuples(*[st.integers(-3, 3)] * 3))
+def test_a_rotation_turns_what_up_has_made_upright(
+    angles: tuple[int, int, int], position: tuple[int, int, int]
+) -> None:
+    """The axes of ``rotation_deg`` are those of the frame in which poses are published."""
+    rotation = dict(zip(("roll", "pitch", "yaw"), angles, strict=True))
+    upright = moved(frame_of("m", up="y"), *position)
+    expected = moved(frame_of("m", rotation_deg=rotation), *upright)
+    assert moved(frame_of("m", up="y", rotation_deg=rotation), *position) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

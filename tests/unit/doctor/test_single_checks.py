@@ -18,6 +18,7 @@ from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.stream.state import StreamState
 from tests.support.errors import names
 
 
@@ -128,6 +129,9 @@ def rate_finding(
         ({MARKERS: 100}, {MARKERS: 89.9}, AllFrames(), Result.FAILING),
         ({MARKERS: 100}, {MARKERS: 110}, AllFrames(), Result.PASSING),
         ({MARKERS: 100}, {MARKERS: 110.2}, AllFrames(), Result.FAILING),
+        ({MARKERS: 100, TOOLS: 100}, {MARKERS: 100, TOOLS: 120}, AllFrames(), Result.FAILING),
+        ({MARKERS: 100, TOOLS: 100}, {MARKERS: 120, TOOLS: 100}, AllFrames(), Result.FAILING),
+        ({MARKERS: 100, TOOLS: 100}, {MARKERS: 100, TOOLS: 80}, AllFrames(), Result.FAILING),
         ({MARKERS: 100}, {MARKERS: 100}, Frequency(200), Result.PASSING),
         ({MARKERS: 100}, {MARKERS: 50}, Frequency(50), Result.PASSING),
         ({}, {MARKERS: 50}, Frequency(50), Result.PASSING),
@@ -143,6 +147,45 @@ def test_the_limits_of_a_rate(
 ) -> None:
     """A tenth more or less than announced or requested passes; a divisor counts from the slowest rate."""
     assert rate_finding(monkeypatch, announced_hz, measured_hz, rate).result is result
+
+
+@pytest.mark.parametrize(
+    ("rates_hz", "silence_s", "result"),
+    [
+        ({MARKERS: 100}, 0.5, Result.PASSING),
+        ({MARKERS: 100}, 0.6, Result.FAILING),
+        ({MARKERS: 5}, 0.9, Result.PASSING),
+        ({MARKERS: 5}, 1.1, Result.FAILING),
+        ({MARKERS: 5, ANALOG: 1000}, 0.6, Result.FAILING),
+        ({MARKERS: 5, ComponentType.EVENT: 1}, 0.9, Result.PASSING),
+        ({ComponentType.EVENT: 100}, 60, Result.PASSING),
+        ({MARKERS: 0}, 0.6, Result.FAILING),
+    ],
+)
+def test_frames_have_stopped_after_half_a_second_and_five_frames_of_the_fastest_component(
+    rates_hz: Rates, silence_s: float, result: Result
+) -> None:
+    observed = {
+        component: SimpleNamespace(rate_hz=hz, message_load=SimpleNamespace(largest_bytes=100))
+        for component, hz in rates_hz.items()
+    }
+    status = SimpleNamespace(
+        frames_in=500,
+        losses=SimpleNamespace(frames=lambda _cause: 0),
+        state=StreamState.STREAMING,
+        last_error="",
+    )
+    stream: Any = SimpleNamespace(
+        observed=observed,
+        silence_s=silence_s,
+        settings=SimpleNamespace(components=tuple(rates_hz)),
+        status=status,
+        session=SimpleNamespace(is_open=True),
+        requests_all=True,
+        component_keys="",
+    )
+    finding = frame_checks.check_frames(Check("lab", "frames"), stream, None, others_receive=False)
+    assert finding.result is result
 
 
 @pytest.mark.parametrize(

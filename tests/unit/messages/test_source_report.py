@@ -1,5 +1,6 @@
 """What a ``status_t`` says, in the words of the status line, and within limits whatever it contains."""
 
+import itertools
 from typing import Any
 
 import pytest
@@ -45,6 +46,15 @@ def test_every_state_of_the_gateway_has_a_level_and_a_text(
     [found] = source_report(a_status(stream(state=state.value, frame_rate_hz=199.96, tries=tries))).streams
     is_waiting = state in {StreamState.WAITING, StreamState.CONNECTING}
     assert (found.level, found.text) == (level, text + counted if is_waiting else text)
+
+
+@pytest.mark.parametrize("num_streams", [0, 1, 2, 3])
+def test_a_source_is_as_good_as_its_worst_stream(num_streams: int) -> None:
+    """Lists have one mark per source: a dead stream beside others that are fine must show."""
+    for states in itertools.product(StreamState, repeat=num_streams):
+        found = source_report(a_status(*(stream(state=state.value) for state in states))).level
+        levels = [TEXTS[state][0] for state in states] or [Level.WAITING]
+        assert found is max(levels, key=[Level.GOOD, Level.WAITING, Level.BAD].index), states
 
 
 def test_a_problem_or_the_state_of_another_version_is_the_text() -> None:

@@ -266,6 +266,30 @@ def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
     assert [event[0] for event in events.items] == [143]
 
 
+@given(
+    st.lists(st.tuples(st.integers(0, 40), st.sampled_from(["StreamFrames 3D Events", "StreamFrames Stop"])))
+)
+def test_each_event_while_a_client_streams_is_sent_once_and_no_other(steps: list[tuple[int, str]]) -> None:
+    """Against a plain model: an event each 70 ms, and frames each 10 ms from a request until it ends."""
+    client = ScriptedClient()
+    sent: list[float] = []
+    expected: list[int] = []
+    elapsed_us = 5_000  # never the time of a frame
+    from_us: int | None = None
+    for wait, command in [*steps, (10, "StreamFrames Stop")]:
+        until_us = elapsed_us + 10_000 * wait
+        for frame in client.frames_until(until_us):
+            sent += [event[0] for component in frame if component.type == EVENT for event in component.items]
+        if from_us is not None:
+            expected += [
+                n for n in range(1, 10_000) if from_us < 70_000 * n <= until_us and n not in expected
+            ]
+        elapsed_us = until_us
+        client.send(command)
+        from_us = elapsed_us if command != "StreamFrames Stop" else None
+    assert sent == expected
+
+
 def test_a_stream_of_events_alone_loses_none_while_the_client_does_not_read(client: ScriptedClient) -> None:
     """Its frames exist only if there are events, and these come with the next frame."""
     client.send("StreamFrames Events")

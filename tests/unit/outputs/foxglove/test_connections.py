@@ -1,15 +1,23 @@
-"""The messages of Foxglove's WebSocket protocol, worked out by hand from its description."""
+"""Foxglove's WebSocket protocol: its messages, worked out by hand from its description, and slow viewers."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gateway.errors import QueryError
 from gateway.foxglove_schemas.topics import Topic
+from gateway.outputs.foxglove import connections
 from gateway.outputs.foxglove.connections import (
     ERROR,
+    LIMITS,
     WARNING,
     Subscription,
+    Viewer,
     advertise,
     channel_text,
     message_data,
@@ -77,3 +85,37 @@ def one(subscription: str) -> str:
 def test_anything_else_is_refused_with_a_reason(message: str | bytes) -> None:
     with pytest.raises(QueryError, match=r"\w"):
         parse_request(message)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0, 1, 6, 3600]), st.booleans())))
+def test_a_viewer_is_disconnected_after_one_long_stall_and_not_after_many_short_ones(
+    steps: list[tuple[int, bool]],
+) -> None:
+    """Against a plain model: what counts is the time since the first message that found no place."""
+    now_s = 1000.0
+    stalled_s: float | None = None
+    reasons: list[str] = []
+    num_expected = 0
+    queued: list[bytes] = []
+    viewer: Any = SimpleNamespace(
+        _max_waiting_bytes=10,
+        _stalled_s=None,
+        _was_slow=False,
+        _limits=replace(LIMITS, unread_s=5.0),
+        _queue=queued.append,
+        disconnect=reasons.append,
+        send_control=lambda _message: None,
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(connections, "time", SimpleNamespace(monotonic=lambda: now_s))
+        for wait_s, is_full in steps:
+            now_s += wait_s
+            viewer._waiting_bytes = 11 if is_full else 10
+            assert Viewer.send_message(viewer, 1, 0, b"") is not is_full
+            if not is_full:
+                stalled_s = None
+            elif stalled_s is None:
+                stalled_s = now_s
+            num_expected += stalled_s is not None and now_s - stalled_s > 5
+            assert len(reasons) == num_expected
+    assert len(queued) == sum(not is_full for _, is_full in steps)

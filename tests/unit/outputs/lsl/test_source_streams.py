@@ -275,6 +275,28 @@ def test_a_component_that_comes_twice_is_two_samples_at_their_own_times(lab: Str
         assert (values_of(second), times_of(second)) == ([[2]], [time_s])
 
 
+@pytest.mark.parametrize(
+    ("apart_us", "used_us"),
+    [
+        (0, 0),
+        (1_000_000, 1_000_000),
+        (-1_000_000, -1_000_000),
+        (1_000_001, 0),
+        (-1_000_001, 0),
+        (10**15, 0),
+    ],
+)
+def test_an_event_with_a_time_of_another_clock_is_at_its_frame(
+    lab: Streams, apart_us: int, used_us: int
+) -> None:
+    """Some servers count events from the start of a trial, or since 1970."""
+    lab.set_parameters(Parameters(events=BUTTON))
+    frame_us = 5_000_000
+    message = lab.push(events(7, timestamp_us=frame_us, own_us=frame_us + apart_us))[-1]
+    [time_s], _ = json.loads(message.content)
+    assert time_s == pytest.approx(CAPTURED_S + used_us / 1e6, abs=1e-6)
+
+
 def test_events_are_texts_at_their_own_time_or_at_that_of_their_frame(lab: Streams) -> None:
     lab.set_parameters(Parameters(events=BUTTON))
     [message] = lab.push(events(7, 8, timestamp_us=100_000, own_us=97_000))

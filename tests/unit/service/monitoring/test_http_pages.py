@@ -2,9 +2,13 @@
 
 import asyncio
 import contextlib
+import errno
+import os
+import socket
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from http import HTTPStatus
+from typing import Any
 
 import pytest
 import pytest_asyncio
@@ -72,7 +76,7 @@ async def test_a_page_is_built_once_for_requests_that_follow_each_other(site: Si
 async def test_a_page_is_built_again_once_it_is_old(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http_pages, "MAX_PAGE_AGE_S", 0)
     for _ in range(2):
-        assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+        assert status_of(await site.send(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")) == 200
     assert site.served == 2
 
 
@@ -125,7 +129,7 @@ async def test_a_request_that_is_too_large_or_never_ends_is_disconnected(site: S
 
 async def test_one_connection_too_many_disconnects_the_oldest(site: Site) -> None:
     connections = [await site.connect() for _ in range(LIMITS.clients + 10)]
-    assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+    assert status_of(await site.send(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")) == 200
     assert len(site.pages._connections) <= LIMITS.clients
     for reader, _ in connections[:10]:
         with contextlib.suppress(ConnectionError):
@@ -143,7 +147,7 @@ async def test_a_client_that_disconnects_early_is_not_an_error(
     _, writer = await site.connect()
     writer.write(b"GET /pa")
     writer.transport.abort()
-    assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+    assert status_of(await site.send(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")) == 200
     assert not caplog.records
 
 
@@ -154,7 +158,44 @@ async def test_an_exception_in_a_page_is_logged_once_and_ends_only_that_request(
     for _ in range(3):
         assert status_of(await site.send(b"GET /defect HTTP/1.1\r\n\r\n")) == 500
     assert len(caplog.records) == 1
-    assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+    assert status_of(await site.send(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")) == 200
+
+
+class WithoutFiles:
+    """A listening socket for which the process has no file descriptor the first few times."""
+
+    def __init__(self, listening: socket.socket, num_failures: int) -> None:
+        self._listening = listening
+        self.num_failures = num_failures
+
+    def fileno(self) -> int:
+        return self._listening.fileno()
+
+    def close(self) -> None:
+        self._listening.close()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        if self.num_failures:
+            self.num_failures -= 1
+            raise OSError(errno.EMFILE, "Too many open files")
+        return self._listening.accept()
+
+
+async def test_requests_are_answered_again_once_there_are_file_descriptors(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever looks at /healthz because of that must not have to restart the gateway."""
+    monkeypatch.setattr(http_pages, "_ACCEPT_PAUSE_S", 0.0)
+    monkeypatch.setattr(http_pages, "_RESERVED_FILES", 0)
+    [real] = site.pages._listening
+    while site.pages._reserved:
+        os.close(site.pages._reserved.pop())
+    asyncio.get_running_loop().remove_reader(real)
+    listening: Any = WithoutFiles(real, 3)
+    site.pages._listening = [listening]
+    site.pages._resume(listening)
+    assert status_of(await site.send(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")) == 200
+    assert listening.num_failures == 0
 
 
 async def test_closing_disconnects_clients_and_frees_the_port(site: Site) -> None:

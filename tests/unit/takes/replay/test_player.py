@@ -194,6 +194,19 @@ async def test_poses_are_published_under_the_labels_of_the_tools(replayed: Repla
     assert replayed.publication.num_messages == {"parameters": 1, "6d/tool": 2}
 
 
+async def test_a_source_that_is_not_chosen_is_not_announced_from_the_middle_either(
+    replayed: Replayed,
+) -> None:
+    """The parameters before the beginning come first, but not those of other sources."""
+    messages = [parameters(XML, source=source) for source in ("hall", "lab")]
+    for number in range(20):
+        messages += [markers(2, number, source=source) for source in ("hall", "lab")]
+    for start_us in (0, 50_000):
+        found = await replayed.play(messages, sources=frozenset({"lab"}), start_us=start_us)
+        assert {key.partition("/")[0] for key, _ in found} == {"lab"}
+        assert found[0][0] == "lab/parameters"
+
+
 async def test_the_first_message_of_a_key_waits_until_the_output_can_send_it(replayed: Replayed) -> None:
     """Otherwise the first pose of each tool is refused: Zenoh declares their keys in a thread."""
     output = replayed.output
