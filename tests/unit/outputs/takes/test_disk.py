@@ -46,6 +46,14 @@ def files_of_at_most(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
+@contextlib.contextmanager
+def short_limit() -> Iterator[None]:
+    """Let nobody wait for the disk for long: only around what the test keeps waiting for ever."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(disk_calls, "_TIMEOUT_S", 0.05)
+        yield
+
+
 async def test_a_full_disk_costs_nothing_if_it_has_room_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -91,8 +99,7 @@ async def test_a_save_that_nobody_waits_for_leaves_nothing_behind(
                 await task
         else:
             lab.output.storage.started_writer().call(free.wait)
-            monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.01)
-            with pytest.raises(QueryError, match="did not respond"):
+            with short_limit(), pytest.raises(QueryError, match="did not respond"):
                 await lab.takes.save(60, 600, "fall")
         free.set()
         await lab.output.storage.written()
@@ -201,28 +208,26 @@ async def test_a_take_without_its_file_gets_a_new_one(
     assert any("was removed while it was recorded" in each for each in caplog.messages)
 
 
-async def test_stopping_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_stopping_on_a_full_disk_says_so(tmp_path: Path) -> None:
     """The segments wait before the take does; the peer learns the reason instead of "no answer"."""
-    monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path, keep_last_s=60) as lab:
         await lab.takes.start("walk")
         with files_of_at_most(100_000):
             for _ in range(100):
                 lab.publish(size=1000)
             await wait_until_async(lambda: not lab.output.health().connected)
-            with pytest.raises(QueryError, match="cannot be written: File too large"):
+            with short_limit(), pytest.raises(QueryError, match="cannot be written: File too large"):
                 await lab.takes.stop()
         await wait_until_async(lambda: lab.output.health().connected)
 
 
-async def test_a_disk_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_disk_that_hangs_is_reported(tmp_path: Path) -> None:
     """The event loop goes on, and the take that was not started does not appear later."""
-    monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
         responds = threading.Event()
         lab.output.storage.started_writer().call(responds.wait)
-        with pytest.raises(QueryError, match="did not respond") as refused:
+        with short_limit(), pytest.raises(QueryError, match="did not respond") as refused:
             await lab.takes.start("walk")
         assert refused.value.code == "disk"
         assert not lab.publishers["3d"].wanted
@@ -236,7 +241,6 @@ async def test_messages_on_a_disk_that_hangs_are_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who asks for them may ask again; nobody waits for long, and nothing is read for those who gave up."""
-    monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     responds = threading.Event()
     num_reads = 0
 
@@ -251,7 +255,8 @@ async def test_messages_on_a_disk_that_hangs_are_not_lost(
         message = lab.publish()
         await lab.output.storage.written()
         ask = partial(lab.output.recorded_messages, "lab", "3d", WantedMessages(0, None, 0))
-        refused = await asyncio.gather(*(ask() for _ in range(20)), return_exceptions=True)
+        with short_limit():
+            refused = await asyncio.gather(*(ask() for _ in range(20)), return_exceptions=True)
         assert [getattr(each, "code", None) for each in refused] == ["busy"] * 20
         late = [each for each in refused if "did not respond" in str(each)]
         assert len(late) == disk_calls.MAX_HISTORY_READS
@@ -261,10 +266,11 @@ async def test_messages_on_a_disk_that_hangs_are_not_lost(
         await wait_until_async(lambda: lab.output.storage._num_history_reads == 0)
         found = await ask()
         assert found is not None
-        assert (found.messages, num_reads) == ([message], 2)
+        assert found.messages == [message]
+        assert num_reads <= 2  # of those who gave up, one has begun, or none
         lab.output.storage.started_writer().call(responds.clear)
         lab.output.storage.started_writer().call(responds.wait)
-        with pytest.raises(QueryError, match="did not respond") as refusal:
+        with short_limit(), pytest.raises(QueryError, match="did not respond") as refusal:
             await lab.output.recorded_messages("lab", "3d", WantedMessages(0))
         assert refusal.value.code == "busy"
         responds.set()
