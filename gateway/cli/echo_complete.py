@@ -11,7 +11,7 @@ from typing import Final, TextIO
 
 from gateway.cli.echo_output import MAX_WAITING, json_line, text_line, too_fast_text
 from gateway.cli.echo_sources import EchoSources
-from gateway.cli.record_output import missing_texts
+from gateway.cli.record_output import missing_texts, unknown_texts
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE, Reception, Series, Source
 from gateway.client.refill import Refill
 from gateway.client.transport import GatewaySubscriber, close_in_time
@@ -71,7 +71,7 @@ class CompleteMessages(Reception[Source, Series]):
         return self.wants(series) and not self.is_ending and super()._completes(series)
 
     def _new_source(self, name: str, channels: str) -> Source:
-        return Source(name, channels)
+        return Source(name, channels, self.monotonic)
 
     def _new_series(self, source: Source, key: str, channel: str) -> Series:
         return Series(source, key, channel)
@@ -175,7 +175,7 @@ def _report(messages: CompleteMessages) -> Iterator[str]:
         end = "INCOMPLETE" if problems else "no gaps"
         yield f"{num_refilled} messages came from the gateway's history: {end}"
     yield from problems
-    reasons = {(each.source.name, each.completion.problem) for each in wanted if each.completion is not None}
+    reasons = {(each.source.name, each.completion.last_problem) for each in wanted if each.completion}
     for source, problem in sorted(reasons)[:_MAX_NOTES]:
         if problem:
             yield f"{source}: gaps are not filled: {problem}"
@@ -187,7 +187,9 @@ def _report(messages: CompleteMessages) -> Iterator[str]:
 
 
 def _problems(messages: CompleteMessages) -> Iterator[str]:
-    yield from missing_texts([series for series in messages.all_series if messages.wants(series)])
+    wanted = [series for series in messages.all_series if messages.wants(series)]
+    yield from missing_texts(wanted)
+    yield from unknown_texts(wanted)
     if messages.num_dropped:
         yield too_fast_text(messages.num_dropped)
     if messages.num_beyond:

@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from gateway.client.completion import Unknown
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE, Series
 from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
@@ -273,6 +274,7 @@ def _problems(recording: TakeRecording, file: FileWriter) -> Iterator[str]:
 def _losses(recording: TakeRecording) -> Iterator[str]:
     all_series = [series for series in recording.all_series if series.is_recorded]
     yield from missing_texts(all_series)
+    yield from unknown_texts(all_series)
     for source in recording.sources_now:
         if any(series.check.has_two_publishers for series in source.series):
             yield (
@@ -295,6 +297,35 @@ def missing_texts(all_series: Sequence[Series]) -> Iterator[str]:
         yield f"… and {len(incomplete) - _MAX_NOTES} other keys"
 
 
+_UNKNOWN_TEXTS: Final = {
+    Unknown.RESTART: "its gateway was started again ({}), and it is not known what is missing before that",
+    Unknown.TWO_GATEWAYS: "two gateways published it for a while ({}): it is not known what is missing then",
+    Unknown.BEGINNING: "it is not known what is missing before the first message of {} keys, because the "
+    "gateway's history has not answered",
+    Unknown.END: "it is not known what is missing at the end of {} keys, because the gateway's history has "
+    "not answered",
+}
+
+
+def unknown_texts(all_series: Sequence[Series]) -> Iterator[str]:
+    """Yield of which parts of the sources it is not known whether something is missing."""
+    names = dict.fromkeys(series.source.name for series in all_series)
+    texts = []
+    for name in names:
+        series = [each for each in all_series if each.source.name == name]
+        for unknown, text in _UNKNOWN_TEXTS.items():
+            counts = [each.completion.unknown[unknown] for each in series if each.completion is not None]
+            if unknown is Unknown.RESTART:
+                counts += [each.check.num_restarts for each in series]
+            is_of_keys = unknown in {Unknown.BEGINNING, Unknown.END}
+            count = sum(map(bool, counts)) if is_of_keys else max(counts, default=0)
+            if count:
+                texts.append(f"{name}: {text.format(count if is_of_keys else _times(count))}")
+    yield from texts[:_MAX_NOTES]
+    if len(texts) > _MAX_NOTES:
+        yield f"… and {len(texts) - _MAX_NOTES} such notes on other sources"
+
+
 def _missing_text(series: Series) -> str:
     """Return which messages of a series are missing, and why, if that is known."""
     gaps = series.check.gaps
@@ -304,7 +335,7 @@ def _missing_text(series: Series) -> str:
     ]
     more = series.check.num_gaps - len(ranges)
     others = f" and {more} other places" if more else ""
-    problem = series.completion.problem if series.completion is not None else ""
+    problem = series.completion.last_problem if series.completion is not None else ""
     reason = f" ({problem})" if problem else ""
     return f"{series.source.name} {series.key}: the messages {', '.join(ranges)}{others} are missing{reason}"
 
@@ -320,9 +351,12 @@ def _notes(recording: TakeRecording) -> Iterator[str]:
         yield f"the disk did not accept what was written for a while ({_times(recording.file.num_errors)})"
     for source in recording.sources_now:
         checks = [series.check for series in source.series]
-        restarts = max((check.num_restarts for check in checks), default=0)
-        if restarts:
-            yield f"{source.name}: its gateway was started again ({_times(restarts)})"
+        damaged = sum(each.completion.num_damaged for each in source.series if each.completion is not None)
+        if damaged:
+            yield (
+                f"{source.name}: {damaged} messages were left out, because the gateway has not published "
+                "their numbers; does another program publish there?"
+            )
         late = sum(check.num_late for check in checks if not check.has_two_publishers)
         if late:
             yield f"{source.name}: {late} messages came in another order than they were sent"

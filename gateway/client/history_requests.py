@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.errors import ProtocolError
+from gateway.messages.history import sequence_of, utime_of
 
 REPLY_S: Final = 2.0
 """How long an answer may take. The gateway drops those to a peer that reads too slowly."""
@@ -32,25 +33,55 @@ COMPLETE: Final = Completeness(is_complete=True)
 
 
 class HistoryRequest(NamedTuple):
-    """A request for messages from ``first`` to ``last`` (None: the newest), or of ``last_s`` seconds.
+    """A request for messages from ``first`` to ``last`` (None: the newest).
 
-    ``known`` is the number and the time of a message that was handed on, if it should be among them. ``run``
-    is which run of the gateway the numbers belong to.
+    It begins with the message that was handed on last, if ``asks_known``, or instead of ``first`` at a time
+    (``since_utime``) or ``last_s`` seconds ago. ``number`` is its own number: only the answer to the newest
+    request counts.
     """
 
-    run: int
+    number: int
     first: int = 0
     last: int | None = None
     last_s: float | None = None
+    since_utime: int | None = None
     known: tuple[int, int] | None = None
+    """The number and the time of a message that the gateway has published, if one is known."""
+    asks_known: bool = False
 
     @property
     def options(self) -> Mapping[str, str]:
         """The options of the query."""
         if self.last_s is not None:
             return {"last_s": f"{self.last_s:.3f}"}
-        first = self.first if self.known is None else self.known[0]
-        return {"from": str(first)} | ({} if self.last is None else {"to": str(self.last)})
+        end = {} if self.last is None else {"to": str(self.last)}
+        if self.since_utime is not None:
+            return {"since_utime": str(self.since_utime)} | end
+        first = self.known[0] if self.asks_known and self.known is not None else self.first
+        return {"from": str(first)} | end
+
+    def is_contradicted_by(self, answer: "HistoryAnswer") -> bool:
+        """Whether an answer is of a gateway that has not published the known message with its number."""
+        if self.known is None:
+            return False
+        number, utime = self.known
+        if answer.newest < number:
+            return True
+        return any(sequence_of(each) == number and utime_of(each) != utime for each in answer.messages)
+
+    def fits(self, answer: "HistoryAnswer") -> bool:
+        """Whether an answer shows that it is of the gateway that has published the known message, if any."""
+        if self.known is None:
+            return True
+        if self.since_utime is not None:
+            return bool(answer.messages) and utime_of(answer.messages[0]) == self.known[1]
+        return self.is_confirmed_by(answer) if self.asks_known else not self.is_contradicted_by(answer)
+
+    def is_confirmed_by(self, answer: "HistoryAnswer") -> bool:
+        """Whether an answer has the known message."""
+        return self.known is not None and any(
+            (sequence_of(each), utime_of(each)) == self.known for each in answer.messages
+        )
 
 
 class HistoryAnswer(NamedTuple):

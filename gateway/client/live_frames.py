@@ -1,7 +1,8 @@
 """What ``live`` gives: frames in numpy, decoded from messages that have arrived."""
 
+import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -75,8 +76,8 @@ class Sent(NamedTuple):
 class LiveSource(DescribedSource):
     """A source that ``live`` receives."""
 
-    def __init__(self, name: str, channels: str) -> None:
-        super().__init__(name, channels)
+    def __init__(self, name: str, channels: str, monotonic: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(name, channels, monotonic)
         self.clock = ClockDifference()
         self._described: dict[tuple[str, int, int], tuple[Parameters, Description]] = {}
         self._described_by: list[ParametersEntry] = []
@@ -116,7 +117,7 @@ class LiveReception(QueuedReception[LiveSource]):
         return self._start_utime
 
     def _new_source(self, name: str, channels: str) -> LiveSource:
-        return LiveSource(name, channels)
+        return LiveSource(name, channels, self.monotonic)
 
 
 class Frame:

@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -76,8 +77,8 @@ class DescribedSource(Source):
     ``update_parameters`` and what it changes belong to one thread.
     """
 
-    def __init__(self, name: str, channels: str) -> None:
-        super().__init__(name, channels)
+    def __init__(self, name: str, channels: str, monotonic: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(name, channels, monotonic)
         self.entries: list[ParametersEntry] = []
         """The newest parameters, in the order of their times."""
         self.num_unreadable = 0
@@ -135,8 +136,8 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
     If that takes too long, the oldest are left out and counted.
     """
 
-    def __init__(self, *, is_queueing: bool = True) -> None:
-        super().__init__()
+    def __init__(self, *, is_queueing: bool = True, monotonic: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(monotonic)
         self.num_dropped = 0
         """How many messages were left out, because too many waited."""
         self.is_queueing = is_queueing

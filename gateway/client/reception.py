@@ -36,6 +36,10 @@ _AGAIN_S: Final = 0.3
 
 _MAX_AGAIN_S: Final = 10.0
 
+_LATE_KEY_US: Final = 1_000_000
+"""A key whose first message comes later than that after its source may have had others: each has a status
+every second."""
+
 POSE: Final = "6d/"
 """What the keys of tool poses begin with."""
 
@@ -104,7 +108,7 @@ class Series:
 class Source:
     """A source of which something was received. ``channels`` is the beginning of its channels."""
 
-    def __init__(self, name: str, channels: str) -> None:
+    def __init__(self, name: str, channels: str, monotonic: Callable[[], float] = time.monotonic) -> None:
         self.name = name
         self.channels = channels
         self.has_known_name = False
@@ -124,7 +128,8 @@ class Source:
         self.has_answer = False
         """Whether a gateway has answered the query for the parameters, or published them."""
         self.series_by_key: dict[str, Any] = {}
-        self.found_s = time.monotonic()
+        self.found_s = monotonic()
+        self._monotonic = monotonic
         self._queried_s = -math.inf
 
     @property
@@ -137,7 +142,7 @@ class Source:
 
         If a gateway does not reply, the queries become rarer: from every 0.3 s to every 10 s.
         """
-        now_s = time.monotonic()
+        now_s = self._monotonic()
         again_s = min(max(_AGAIN_S, (now_s - self.found_s) / 10), _MAX_AGAIN_S)
         if now_s - self._queried_s < again_s:
             return False
@@ -198,7 +203,9 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
     ``_lock``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self.monotonic = monotonic
+        """The clock of everything here; seconds."""
         self.sources: dict[str, SourceT] = {}
         """By the beginning of their channels."""
         self.num_foreign = 0
@@ -277,11 +284,21 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             if completion is not None:
                 utime, _, sequence, session = _FIELDS.unpack_from(message, FINGERPRINT_BYTES)
                 if sequence >= 0:
+                    if not completion.has_begun:
+                        self._begin_late(series, completion, sequence, utime, now_s)
                     completion.receive(message, sequence, utime, session, now_s, has_room=not self.is_full)
                     if completion.due_s < math.inf and self.refill is not None:
                         self.refill.check(series)
                     return
             self._hand_on(series, message)
+
+    def _begin_late(
+        self, series: SeriesT, completion: Completion, sequence: int, utime: int, now_s: float
+    ) -> None:
+        """Request what a key had since its source is heard, if its first message comes later than others."""
+        first_utime = series.source.first_utime
+        if sequence and first_utime is not None and utime - first_utime > _LATE_KEY_US:
+            completion.begin_since(first_utime, now_s)
 
     def _hand_on(self, series: SeriesT, message: bytes) -> None:
         if not self._is_closed:
@@ -290,7 +307,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
 
     def complete(self, ask: Ask, find: FindSeries, completeness: Completeness) -> None:
         """Complete all series from now on, with what ``ask`` returns; see Refill."""
-        self.refill = Refill(self, self._lock, ask, find, completeness)
+        self.refill = Refill(self, self._lock, ask, find, completeness, self.monotonic)
 
     def ignore(self, *, beyond_limit: bool) -> None:
         """Count a message that is left out."""
@@ -356,7 +373,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         source.running_take = str(running[0]) if running else ""
 
     def _hear(self, source: Source) -> float:
-        source.heard_s = now_s = time.monotonic()
+        source.heard_s = now_s = self.monotonic()
         if self.first_heard_s is None:
             self.first_heard_s = now_s
         return now_s
@@ -406,7 +423,7 @@ class Messages(Reception[Source, Series]):
         self._receive = receive
 
     def _new_source(self, name: str, channels: str) -> Source:
-        return Source(name, channels)
+        return Source(name, channels, self.monotonic)
 
     def _new_series(self, source: Source, key: str, channel: str) -> Series:
         return Series(source, key, channel)

@@ -5,10 +5,18 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from gateway.client.completion import RETRY_S, Completion, HeldBytes
-from gateway.client.history_requests import BUSY_CODES, REPLY_S, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.arrived_run import HeldBytes
+from gateway.client.completion import RETRY_S, Completion
+from gateway.client.history_requests import (
+    BUSY_CODES,
+    REPLY_S,
+    RETRY_CODES,
+    Completeness,
+    HistoryAnswer,
+    HistoryRequest,
+)
 from gateway.errors import QueryError
 from gateway.workers import thread_starts
 
@@ -21,12 +29,18 @@ Ask = Callable[[Any, HistoryRequest, float], HistoryAnswer]
 It blocks. Raises QueryError.
 """
 
-FindSeries = Callable[[Any, float, float], "list[Any]"]
+FindSeries = Callable[[Any, float, float], "list[KeptSeries]"]
 """Returns the series of a source of which the gateway has messages of the last seconds, and that are wanted.
 
 The arguments are the source, the number of these seconds, and how many seconds it may take. It blocks. Raises
 QueryError.
 """
+
+_LOOK_S: Final = 2.0
+"""How often the keys are looked up of which a first message may be missing: each time costs a query."""
+
+_MARGIN_S: Final = 1.0
+"""How much longer than it is known a source may have been heard."""
 
 _SILENT_S: Final = 2.5
 """If nothing of a source has arrived for so long, not even its status, the connection is lost."""
@@ -35,11 +49,20 @@ _WAIT_S: Final = 0.05
 """When to look again whether the program can take more messages."""
 
 
+class KeptSeries(NamedTuple):
+    """A series of which the gateway keeps messages, with the number and the time of the newest one."""
+
+    series: Any
+    newest: int
+    newest_utime: int
+
+
 class Refill:
     """Completes the series of a reception; its ``lock`` protects everything here.
 
-    Requests are made with ``ask``. If the last seconds are wanted, ``find`` finds the series that nothing
-    arrives of now.
+    Requests are made with ``ask``. ``find`` finds the series that nothing arrives of: those with messages in
+    the last seconds, if these are wanted; and after an outage, and at the end, those whose first or last
+    message may have fallen into it. ``monotonic`` is the clock of the reception.
     """
 
     def __init__(
@@ -49,8 +72,10 @@ class Refill:
         ask: Ask,
         find: FindSeries,
         completeness: Completeness,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.completeness = completeness
+        self._monotonic = monotonic
         self._reception = reception
         self._ask = ask
         self._find = find
@@ -58,7 +83,9 @@ class Refill:
         self._changed = threading.Condition(lock)
         self._completions: dict[Series, Completion] = {}
         self._due: dict[Source, dict[Series, Completion]] = {}
-        self._is_closed = False
+        self._look_s: dict[Source, float] = {}  # when to look for series of which nothing has arrived
+        self._looked_s: dict[Source, float] = {}
+        self._is_ending = self._is_closed = False
 
     # Under the lock, which the caller holds.
 
@@ -101,17 +128,22 @@ class Refill:
 
     @property
     def num_incomplete(self) -> int:
-        """How many series miss messages now."""
+        """How many series miss messages now, or may do so."""
         with self._changed:
-            return sum(each.due_s < math.inf for each in self._completions.values())
+            num_looks = len(self._look_s) if self._is_ending else 0
+            return num_looks + sum(each.due_s < math.inf for each in self._completions.values())
 
     def end(self) -> None:
         """Take nothing more that is published, and request everything until now."""
         with self._changed:
+            self._is_ending = True
             for series, completion in self._completions.items():
-                completion.end(time.monotonic())
+                completion.end(self._monotonic())
                 if completion.due_s < math.inf:
                     self.check(series)
+                    if self.completeness.is_complete:
+                        self._look_s[series.source] = -math.inf
+            self._changed.notify_all()
 
     def close(self) -> None:
         """Hand on what is held, and request nothing more."""
@@ -130,33 +162,45 @@ class Refill:
             while not (self._reception.has_room or self._is_closed):
                 time.sleep(_WAIT_S)
             with self._changed:
-                series = self._wait(due)
-                if series is None:
+                series = self._wait(source, due)
+                if self._is_closed:
                     return
-                completion = due[series]
-                request, reply_s = completion.request(), completion.reply_s(time.monotonic())
-            answer: HistoryAnswer | None = None
-            code = text = ""
-            try:
-                answer = self._ask(series, request, reply_s)
-            except QueryError as error:
-                code, text = error.code, str(error)
-            except Exception as defect:  # noqa: BLE001 - what arrives is handed on
-                self._reception.failed(defect)
-                code = text = "defect"
-            with self._changed:
-                now_s = time.monotonic()
-                if answer is None:
-                    is_connected = now_s - (series.source.heard_s or now_s) <= _SILENT_S
-                    completion.fail(request, code, text, now_s, is_connected=is_connected)
-                else:
-                    completion.answer(request, answer, now_s)
+            if series is None:
+                self._look(source)
+            else:
+                self._request(series, due[series])
+
+    def _request(self, series: "Series", completion: Completion) -> None:
+        """Request what a series misses, and give it the answer."""
+        source = series.source
+        with self._changed:
+            if completion.due_s == math.inf:
+                return  # it has arrived
+            request, reply_s = completion.request(), completion.reply_s(self._monotonic())
+            if self.completeness.is_complete:
+                self._look_s.setdefault(source, self._looked_s.get(source, -math.inf) + _LOOK_S)
+        answer: HistoryAnswer | None = None
+        code = text = ""
+        try:
+            answer = self._ask(series, request, reply_s)
+        except QueryError as error:
+            code, text = error.code, str(error)
+        except Exception as defect:  # noqa: BLE001 - what arrives is handed on
+            self._reception.failed(defect)
+            code = text = "defect"
+        with self._changed:
+            now_s = self._monotonic()
+            if answer is None:
+                is_connected = now_s - (source.heard_s or now_s) <= _SILENT_S
+                completion.fail(request, code, text, now_s, is_connected=is_connected)
+            else:
+                completion.answer(request, answer, now_s)
 
     def _begin_silent(self, source: "Source", last_s: float) -> None:
         """Begin the series of a source that had messages in the last seconds, and may have none now."""
-        end_s = time.monotonic() + min(REPLY_S, self.completeness.patience_s or REPLY_S)
-        found: list[Series] = []
-        while (left_s := end_s - time.monotonic()) > 0 and not self._is_closed:
+        end_s = self._monotonic() + min(REPLY_S, self.completeness.patience_s or REPLY_S)
+        found: list[KeptSeries] = []
+        while (left_s := end_s - self._monotonic()) > 0 and not self._is_closed:
             try:
                 found = self._find(source, last_s, left_s)
                 break
@@ -168,16 +212,47 @@ class Refill:
                 return
             time.sleep(RETRY_S)
         with self._changed:
-            for series in found:
+            for series, *_ in found:
                 completion = self._completions.get(series)
                 if completion is not None:
-                    completion.begin(time.monotonic())
+                    completion.begin(self._monotonic())
                     self.check(series)
 
-    def _wait(self, due: "dict[Series, Completion]") -> "Series | None":
-        """Wait until there is something to request, and return of which series; None at the end."""
+    def _look(self, source: "Source") -> None:
+        """Look for messages of a source that nothing which arrives shows: the first of a key, or the last."""
+        begin_s = self._monotonic()
+        found: list[KeptSeries] = []
+        is_over = True
+        try:
+            found = self._find(source, begin_s - source.found_s + _MARGIN_S, REPLY_S)
+        except QueryError as error:
+            is_over = error.code not in RETRY_CODES or error.code == "no-gateway"
+        except Exception as defect:  # noqa: BLE001 - as in _run
+            self._reception.failed(defect)
+        with self._changed:
+            now_s = self._monotonic()
+            self._looked_s[source] = begin_s
+            if is_over or not self._is_ending:  # the next gap looks again
+                self._look_s.pop(source, None)
+            else:
+                self._look_s[source] = now_s + RETRY_S
+            first_utime = source.first_utime
+            for series, newest, utime in found:
+                completion = self._completions.get(series)
+                if completion is None or first_utime is None or utime < first_utime:
+                    continue
+                if not completion.has_begun:
+                    completion.begin_since(first_utime, now_s)
+                    if self._is_ending:
+                        completion.end(now_s)
+                completion.notice(newest, utime, now_s)
+                if completion.due_s < math.inf:
+                    self.check(series)
+
+    def _wait(self, source: "Source", due: "dict[Series, Completion]") -> "Series | None":
+        """Wait until there is something to request, and return of which series; None to look for some."""
         while not self._is_closed:
-            now_s = time.monotonic()
+            now_s = self._monotonic()
             for completion in due.values():
                 completion.expire(now_s)
             for series in [each for each, completion in due.items() if completion.due_s == math.inf]:
@@ -185,6 +260,9 @@ class Refill:
             ready = [series for series in due if due[series].due_s <= now_s]
             if ready:  # so no series is far ahead of the others
                 return min(ready, key=lambda series: due[series].reached_utime)
-            first_s = min((completion.due_s for completion in due.values()), default=None)
-            self._changed.wait(None if first_s is None else first_s - now_s)
+            look_s = self._look_s.get(source, math.inf)
+            if look_s <= now_s:
+                return None
+            first_s = min([look_s, *(completion.due_s for completion in due.values())])
+            self._changed.wait(None if first_s == math.inf else first_s - now_s)
         return None

@@ -10,6 +10,7 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from gateway.client.history_requests import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SERIES, POSE, TYPES_BY_KEY, Reception, Series, Source
+from gateway.client.refill import KeptSeries
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
@@ -265,11 +266,16 @@ class GatewaySubscriber(ABC):
     def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
         """Request messages of a series, and return the answer. Raises QueryError."""
 
-    def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[Series]:
+    def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[KeptSeries]:
         """Return the wanted series of which the gateway has messages of the last seconds; see FindSeries."""
-        keys = recent_keys(self._history_overview(source, timeout_s), self._components, last_s)
-        found = [self._kept_series(source, key) for key in keys]
-        return [series for series in found if series is not None]
+        overview = self._history_overview(source, timeout_s)
+        found = []
+        for key in recent_keys(overview, self._components, last_s):
+            newest, utime = (overview["keys"][key].get(name) for name in ("newest", "newest_utime"))
+            series = self._kept_series(source, key)
+            if series is not None and isinstance(newest, int):
+                found.append(KeptSeries(series, newest, int(utime)))
+        return found
 
     @abstractmethod
     def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:

@@ -5,7 +5,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 from urllib.parse import unquote
@@ -300,11 +300,20 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         """See GatewaySubscriber."""
         options = ";".join(f"{name}={value}" for name, value in request.options.items())
         selector = f"{zenoh_key(self._prefix, series.source.name)}/{series.key}?{options}"
-        sample = self._first_reply(selector, timeout_s)
-        try:
-            return history_answer(attached_facts(sample), unpack_messages(sample.payload.to_bytes()))
-        except ProtocolError as problem:
+        first: HistoryAnswer | None = None
+        problem: ProtocolError | None = None
+        for sample in self._replies(selector, timeout_s):
+            try:
+                answer = history_answer(attached_facts(sample), unpack_messages(sample.payload.to_bytes()))
+            except ProtocolError as error:
+                problem = error
+                continue
+            if request.fits(answer):  # another gateway, or a program that is none, may answer, too
+                return answer
+            first = first or answer
+        if first is None:
             raise QueryError(str(problem), code="zenoh") from problem
+        return first
 
     def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
         """See GatewaySubscriber."""
@@ -322,19 +331,26 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
 
     def _first_reply(self, selector: str, timeout_s: float) -> zenoh.Sample:
         """Return the first reply that is no error. Raises QueryError if there is none."""
+        return next(self._replies(selector, timeout_s))
+
+    def _replies(self, selector: str, timeout_s: float) -> Iterator[zenoh.Sample]:
+        """Yield the replies that are no errors. Raises QueryError if there are none."""
         error = QueryError("no gateway keeps these messages", code="no-gateway")
+        has_any = False
         try:
             for reply in self._session.get(
                 selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s
             ):
                 if reply.ok is not None:
-                    return reply.ok
-                if reply.err is not None:
+                    has_any = True
+                    yield reply.ok
+                elif reply.err is not None:
                     text = reply.err.payload.to_bytes().decode("utf-8", "replace")
                     error = QueryError(text, code=error_code(reply.err) or "timeout")
         except zenoh.ZError as problem:
             error = QueryError(str(problem), code="zenoh")
-        raise error
+        if not has_any:
+            raise error
 
     def _query(self, source: Source) -> None:
         def take_parameters(reply: zenoh.Reply) -> None:

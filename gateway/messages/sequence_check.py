@@ -94,6 +94,7 @@ class SequenceCheck:
         self._listed: list[Gap] = []
         self._largest: Gap | None = None
         self._current: _Numbering | None = None
+        self._begins_at: int | None = None  # what is missing from here to the first message is lost
         self._former: deque[_Numbering] = deque(maxlen=_NUM_FORMER)
         self._recent: deque[tuple[int, int]] = deque(maxlen=_NUM_RECENT)  # number and time
 
@@ -119,7 +120,7 @@ class SequenceCheck:
         """Take the next message, by its number, its time, and its session if sessions can show a restart."""
         current = self._current
         if current is None:
-            self._current = _Numbering(sequence, utime, 1, deque(maxlen=_NUM_RECENT))
+            self._begin(sequence, utime)
         elif sequence == current.newest + 1:
             current.newest = sequence
             current.utime = utime
@@ -150,15 +151,40 @@ class SequenceCheck:
     def end(self, stop: int) -> None:
         """Take what follows the newest message, before number ``stop``, as missing: nothing follows it."""
         current = self._current
-        if current is not None and stop > current.newest + 1:
+        if current is None:
+            if self._begins_at is not None and stop > self._begins_at:
+                self._begin(stop, 0).newest = stop - 1
+        elif stop > current.newest + 1:
             self._add_gap(Gap(current.utime, stop - current.newest - 1, stop), current.gaps)
             current.newest = stop - 1
+
+    def begin_at(self, number: int, *, is_restart: bool = False) -> None:
+        """Expect a numbering that begins with a number: what is missing from there on is lost.
+
+        The caller knows whether the gateway has restarted; the next numbers do not always show it.
+        """
+        self.num_restarts += is_restart
+        self._current, self._begins_at = None, number
+        self._former.clear()
+
+    def _begin(self, sequence: int, utime: int) -> _Numbering:
+        self._current = current = _Numbering(sequence, utime, 1, deque(maxlen=_NUM_RECENT))
+        if self._begins_at is not None and sequence > self._begins_at:
+            self._add_gap(Gap(utime, sequence - self._begins_at, sequence), current.gaps)
+        self._begins_at = None
+        return current
 
     def skip(self, stop: int) -> None:
         """Go on before number ``stop``: what is between the newest message and that is not missing."""
         current = self._current
         if current is not None and stop > current.newest + 1:
             current.newest = stop - 1
+
+    def correct(self, number: int) -> None:
+        """Take ``number`` as that of the newest message: the one that it had was damaged."""
+        self.num_implausible += 1
+        if self._current is not None:
+            self._current.newest = number
 
     def _fill_gap(self, current: _Numbering, sequence: int, utime: int) -> bool:
         """Return whether a message was missing, and was only overtaken by others."""

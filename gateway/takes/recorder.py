@@ -49,8 +49,8 @@ class RecordedSeries(Series):
 class RecordedSource(Source):
     """A source of the recording. ``channels`` is the beginning of its channels in the file."""
 
-    def __init__(self, name: str, channels: str) -> None:
-        super().__init__(name, channels)
+    def __init__(self, name: str, channels: str, monotonic: Callable[[], float]) -> None:
+        super().__init__(name, channels, monotonic)
         self.first_parameters: bytes | None = None
         """The first one, which belongs to the description."""
         self.has_made_first = False
@@ -64,7 +64,7 @@ class RecordedSource(Source):
     def is_waiting(self) -> bool:
         """Whether something that the description needs is still to come."""
         is_complete = self.heard_s is not None and not super().is_waiting
-        is_late = time.monotonic() - self.found_s > _WAIT_S
+        is_late = self._monotonic() - self.found_s > _WAIT_S
         return self.description is None and not (is_complete or is_late)
 
     @property
@@ -89,8 +89,9 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         components: Collection[str] | None = None,
         start_s: float = 0.0,
         details: TakeDetails = NO_DETAILS,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__()
+        super().__init__(monotonic)
         self.file: FileWriter | None = None
         """The file, after it was created."""
         self.is_moved = False
@@ -104,7 +105,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         self._num_early = 0  # so far
         self._early_bytes = 0
         self._is_starting = True
-        self._start_end_s = time.monotonic() + start_s
+        self._start_end_s = monotonic() + start_s
 
     @property
     def queued_bytes(self) -> int:
@@ -132,7 +133,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
         return series.is_recorded and super()._completes(series)
 
     def _new_source(self, name: str, channels: str) -> RecordedSource:
-        return RecordedSource(name, channels)
+        return RecordedSource(name, channels, self.monotonic)
 
     def _new_series(self, source: RecordedSource, key: str, channel: str) -> RecordedSeries:
         is_wanted = self._components is None or key.partition("/")[0] in {*self._components, "parameters"}
@@ -203,7 +204,7 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
             for source in self.sources.values():
                 self._put_early(source)
             if self._is_starting:
-                if not heard or time.monotonic() < self._start_end_s:
+                if not heard or self.monotonic() < self._start_end_s:
                     return
                 if any(source.is_waiting for source in self.sources.values()):
                     return

@@ -33,7 +33,7 @@ class Gateway:
         self._newest = frames - 1
 
     def subscribe(self, messages: CompleteMessages) -> Mock:
-        messages.complete(self.answer, Mock(), COMPLETE)
+        messages.complete(self.answer, lambda *_: [], COMPLETE)
         source = messages.source("lab", "MOCAP_LAB", is_known=True)
         assert source is not None
         series = messages.series(source, "3d", "MOCAP_LAB_3D")
@@ -106,7 +106,7 @@ def test_only_the_component_is_printed_and_requested(
     """The subscriber gets more than that, because one subscription is for all poses."""
     for is_lcm, wanted in ((False, zenoh), (True, lcm)):
         messages = CompleteMessages(component, None, is_lcm=is_lcm)
-        messages.complete(Mock(), Mock(), COMPLETE)
+        messages.complete(Mock(), lambda *_: [], COMPLETE)
         source = messages.source("lab", "MOCAP_LAB", is_known=True)
         assert source is not None
         labels = ("TOOL_1", "TOOL_2") if is_lcm else ("Tool%201", "Tool%202")

@@ -8,9 +8,19 @@ import pytest
 from hypothesis import given, note, settings
 from hypothesis import strategies as st
 
-from gateway.client.completion import GRACE_S, NOBODY_S, PATIENCE_S, Completion, HeldBytes
+from gateway.client.arrived_run import HeldBytes
+from gateway.client.completion import (
+    GRACE_S,
+    NOBODY_S,
+    PASSING_S,
+    PATIENCE_S,
+    TWO_GATEWAYS_S,
+    Completion,
+    Unknown,
+)
 from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.messages.encode import PREFIX
+from gateway.messages.history import utime_of
 from gateway.messages.sequence_check import SequenceCheck
 
 SIZE: Final = len(bytes(8) + PREFIX.pack(0, 0, 0, 0, 0))
@@ -79,7 +89,14 @@ class Network:
             return None
         options = request.options
         numbers = [PREFIX.unpack_from(message, 8)[2] for message in self.history]
-        first = int(options["from"]) if "from" in options else max(numbers[0], numbers[-1] - 5)
+        if "since_utime" in options:
+            since_utime = int(options["since_utime"])
+            times = [
+                (number, utime_of(message)) for number, message in zip(numbers, self.history, strict=True)
+            ]
+            first = next((number for number, utime in times if utime >= since_utime), numbers[-1] + 1)
+        else:
+            first = int(options["from"]) if "from" in options else max(numbers[0], numbers[-1] - 5)
         last = min(int(options.get("to", numbers[-1])), numbers[-1])
         found = [
             (number, message)
@@ -260,6 +277,7 @@ def test_a_restart_after_which_the_clock_was_set_back_is_one() -> None:
     network.restart()
     network._utime = -1000
     network.arrives(0)
+    network.ask_all()
     assert network.handed_on == [(0, 5000), (1, 0)]
 
 
@@ -349,6 +367,154 @@ def test_of_two_gateways_everything_is_passed_on() -> None:
     assert network.room.used == 0
 
 
+def test_when_a_second_gateway_has_ended_gaps_are_filled_again() -> None:
+    """One that published for a second must not cost what is missed an hour later, and that time is not known."""
+    network, other = Network(), Network()
+    other._number, other._utime = 5000, 10**6
+    other.completion, network._runs = network.completion, other._runs
+    for _ in range(20):
+        network._utime = other._utime
+        network.arrive(network.publish())
+        other._utime = network._utime
+        other.arrive(other.publish())
+    assert network.completion.problem
+    network._utime = other._utime
+    network.now_s += TWO_GATEWAYS_S
+    network.arrive(network.publish())
+    assert not network.completion.problem
+    network.arrives(30)
+    network.ask_all()
+    assert network.numbers[-11:] == [*range(20, 31)]
+    assert network.completion.unknown[Unknown.TWO_GATEWAYS] == 1
+
+
+def test_copies_that_come_long_after_are_no_second_gateway() -> None:
+    """A network of two paths delivers each message twice, the second time up to a second later."""
+    network = Network()
+    messages = [network.publish() for _ in range(60)]
+    for number, message in enumerate(messages):
+        network.arrive(message)
+        if number >= 40:
+            network.arrive(messages[number - 40])
+    network.ask_all()
+    assert network.numbers == [*range(60)]
+    assert not network.completion.last_problem
+
+
+@pytest.mark.parametrize("code", ["refused", "unreadable", "defect", "disabled"])
+def test_a_refusal_is_over_after_a_while(code: str) -> None:
+    """One garbled answer must not switch refilling off until the subscriber is started again."""
+    network = Network()
+    network.arrives(0)
+    network.arrives(9)
+    network.completion.fail(network.completion.request(), code, "no", network.now_s)
+    network.arrives(11)
+    assert network.numbers == [0, 9, 11]
+    network.now_s += PASSING_S
+    network.arrives(20)
+    network.ask_all()
+    assert network.numbers == [0, 9, 11, *range(12, 21)]
+    assert network.completion.last_problem == "no"
+
+
+def test_what_came_before_the_first_message_that_arrives_is_requested() -> None:
+    """The first event of a source may fall into an outage; the second one shows that there was one."""
+    network = Network()
+    messages = [network.publish() for _ in range(3)]
+    network.completion.begin_since(1, network.now_s)
+    network.arrive(messages[2])
+    network.ask_all()
+    assert network.numbers == [0, 1, 2]
+    assert not network.completion.unknown.total()
+
+
+def test_what_came_before_the_first_message_is_unknown_if_nobody_says_it() -> None:
+    network = Network()
+    messages = [network.publish() for _ in range(3)]
+    network.completion.begin_since(1, network.now_s)
+    network.arrive(messages[2])
+    end_s = network.now_s + 2 * PATIENCE_S
+    while network.completion.due_s < end_s:
+        network.now_s = network.completion.due_s
+        network.completion.fail(network.completion.request(), "timeout", "", network.now_s)
+    assert network.numbers == [2]
+    assert network.completion.unknown[Unknown.BEGINNING] == 1
+
+
+@pytest.mark.parametrize("has_restarted", [False, True])
+def test_the_last_messages_before_a_pause_are_requested_when_the_history_is_looked_up(
+    has_restarted: bool,
+) -> None:
+    """Nothing later arrives that would show them: the end of a trial in an outage, or a whole second one."""
+    network = Network()
+    network.arrives(3)
+    if has_restarted:
+        network.restart()
+    newest = [network.publish() for _ in range(3)][-1]
+    _, _, number, _, _ = PREFIX.unpack_from(newest, 8)
+    network.completion.notice(number, network._utime, network.now_s)
+    network.ask_all()
+    expected = [(1, number) for number in range(3)] if has_restarted else [(0, 4), (0, 5), (0, 6)]
+    assert network.handed_on == [(0, 3), *expected]
+    assert network.completion.unknown[Unknown.RESTART] == has_restarted
+
+
+def test_what_is_held_does_not_wait_for_a_gateway_that_has_restarted() -> None:
+    """Its history will never have what was missing before: 60 s for each gap would be in vain."""
+    network = Network()
+    network.arrives(0)
+    network.arrives(9)
+    network.arrives(12)
+    start_s = network.now_s
+    network.restart()
+    network.publish()
+    while len(network.handed_on) < 4:
+        network.ask()
+        assert network.now_s < start_s + 1.0
+    assert network.handed_on == [(0, 0), (0, 9), (0, 12), (1, 0)]
+    assert network.check.num_lost == 8 + 2
+
+
+def test_messages_of_a_restarted_gateway_without_room_come_once() -> None:
+    """What is let go of two runs must not be taken for each other."""
+    network = Network()
+    network.arrives(3)
+    for _ in range(2):
+        for _ in range(3):
+            message = network.publish()
+            utime, _, number, session, _ = PREFIX.unpack_from(message, 8)
+            network.completion.receive(message, number, utime, session, network.now_s, has_room=False)
+        network.restart()
+    network.publish()
+    network.arrive(network.publish())
+    network.ask_all()
+    assert network.handed_on == [(0, 3), (2, 0), (2, 1)]
+    assert network.check.num_lost == 3 + 3
+    assert network.completion.unknown[Unknown.RESTART] == 2
+
+
+@pytest.mark.parametrize("number", [5000, 2**62, 1])
+@pytest.mark.parametrize("is_first", [False, True])
+def test_a_copy_with_a_false_number_brings_nothing_twice(number: int, is_first: bool) -> None:
+    """A robot would repeat the last minute, and a recording would have it twice."""
+    network = Network()
+    for _ in range(20):
+        message = network.publish()
+        if not is_first:
+            network.arrive(message)
+    utime = network._utime
+    false = bytes(8) + PREFIX.pack(utime, 0, 19 + number, 1, 0)
+    network.arrive(false)
+    for _ in range(10):
+        network.arrive(network.publish())
+    network.ask_all()
+    genuine = [each for each in network.numbers if each < 30]
+    assert sorted(genuine)[-10:] == [*range(20, 30)]
+    assert len(genuine) - len(set(genuine)) == (number == 1)  # the copy had the next number
+    assert network.check.num_lost == 0
+    assert not network.completion.unknown.total()
+
+
 def test_at_the_end_everything_until_then_is_requested_and_nothing_later() -> None:
     """What was lost last, no later message shows."""
     network = Network()
@@ -364,13 +530,43 @@ def test_at_the_end_everything_until_then_is_requested_and_nothing_later() -> No
     assert network.completion.num_refilled == 0  # nothing that arrived shows that they were missed
 
 
-@pytest.mark.parametrize("code", ["no-gateway", "timeout", "nothing-yet"])
-def test_the_end_does_not_wait_for_a_gateway_that_has_ended(code: str) -> None:
+def test_one_lost_reply_does_not_give_up_the_end() -> None:
+    """LCM may lose the datagram; then the end comes with the next reply."""
+    network = Network()
+    network.arrives(0)
+    network.publish()
+    network.completion.end(network.now_s)
+    network.completion.fail(network.completion.request(), "timeout", "", network.now_s)
+    network.ask_all()
+    network.completion.abandon()
+    assert network.numbers == [0, 1]
+    assert not network.completion.unknown.total()
+
+
+@pytest.mark.parametrize(
+    ("code", "is_connected", "is_known"),
+    [
+        ("nothing-yet", True, True),  # nothing has been published for longer than it is kept
+        ("disabled", True, True),  # a gateway without a history says nothing about its end
+        ("no-gateway", True, True),  # one of an earlier version neither
+        ("no-gateway", False, False),
+        ("timeout", True, False),
+        ("unreadable", True, False),
+    ],
+)
+def test_an_end_that_nobody_knows_is_called_unknown(code: str, is_connected: bool, is_known: bool) -> None:
+    """What was lost last, no later message shows."""
     network = Network()
     network.arrives(0)
     network.completion.end(network.now_s)
-    network.completion.fail(network.completion.request(), code, "", network.now_s)
-    assert network.completion.due_s == math.inf
+    end_s = network.now_s + 5.0
+    while network.completion.due_s <= end_s:
+        network.now_s = network.completion.due_s
+        network.completion.fail(
+            *(network.completion.request(), code, "", network.now_s), is_connected=is_connected
+        )
+    network.completion.abandon()
+    assert network.completion.unknown[Unknown.END] == (not is_known)
 
 
 def test_what_is_missing_at_the_end_is_counted() -> None:

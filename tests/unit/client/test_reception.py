@@ -1,9 +1,8 @@
 """The messages of one key, counted, and when gateways are queried about their sources."""
 
-import pytest
-
 from gateway.client.reception import Series, Source
 from gateway.messages.encode import NOT_PUBLISHED, PREFIX
+from tests.support.clocks import Clock
 
 
 def test_messages_without_a_number_are_counted_and_show_no_loss() -> None:
@@ -15,13 +14,13 @@ def test_messages_without_a_number_are_counted_and_show_no_loss() -> None:
     assert (series.first_utime, series.last_utime, series.check.session) == (10, 30, 3)
 
 
-def test_queries_without_a_reply_become_rarer(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s = 1000.0
-    monkeypatch.setattr("gateway.client.reception.time.monotonic", lambda: now_s)
-    source = Source("lab", "MOCAP_LAB")
+def test_queries_without_a_reply_become_rarer() -> None:
+    """Many recorders of a gateway of an earlier version must not load the network for ever."""
+    clock = Clock()
+    source = Source("lab", "MOCAP_LAB", clock)
     due_s = []
     for tick in range(36_000):  # an hour
-        now_s = 1000.0 + tick / 10
+        clock.now_s = 1000.0 + tick / 10
         if source.begin_query():
             due_s.append(tick / 10)
     assert sum(time_s < 1 for time_s in due_s) >= 3

@@ -22,6 +22,8 @@ class Source:
     """The source of a subscriber, of which something has arrived just now, or at another time."""
 
     heard_s: float | None = None
+    found_s = 0.0
+    first_utime = 1000
 
 
 class Series:

@@ -9,6 +9,7 @@ import pytest
 from gateway.client.history_requests import Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.queued_reception import QueuedSeries
 from gateway.client.reception import Source
+from gateway.client.refill import KeptSeries
 from gateway.display import live as live_module
 from gateway.display.live import LiveSource
 from gateway.messages.host_time import now_utime
@@ -60,11 +61,14 @@ class PastLab(Lab):
         messages = self.kept[series.key]
         first = 0 if request.last_s is not None else request.first
         last = min(first + 299, len(messages) - 1)
-        return HistoryAnswer(messages[first : last + 1], first, last, len(messages) - 1)
+        newest = NUM_MARKERS if series.key == "3d" else 0  # the one that has arrived, too
+        return HistoryAnswer(messages[first : last + 1], first, last, newest)
 
     def _find(self, source: Source, _last_s: float, _timeout_s: float) -> list[Any]:
         found: Any = source
-        return [self.live.series(found, key, f"MOCAP_LAB_{key.upper()}") for key in self.silent]
+        return [
+            KeptSeries(self.live.series(found, key, f"MOCAP_LAB_{key.upper()}"), 0, 0) for key in self.silent
+        ]
 
 
 @pytest.fixture

@@ -3,12 +3,12 @@
 import re
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import rtc3d
 
 from gateway.client import reception
+from gateway.client.completion import GRACE_S
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
 from gateway.errors import TakeError
@@ -49,7 +49,12 @@ class Recorded:
     """A recording on a file in a folder."""
 
     def __init__(
-        self, folder: Path, *components: str, start_s: float = 0.0, details: TakeDetails = NO_DETAILS
+        self,
+        folder: Path,
+        *components: str,
+        clock: Clock,
+        start_s: float = 0.0,
+        details: TakeDetails = NO_DETAILS,
     ) -> None:
         self.path = folder / "walk.lcmlog"
         target = Target(self.path)
@@ -59,7 +64,7 @@ class Recorded:
             self.opened.append(sources)
             return FileWriter(target.open(sources))
 
-        self.recording = TakeRecording(open_file, components or None, start_s, details)
+        self.recording = TakeRecording(open_file, components or None, start_s, details, clock)
 
     def source(self, name: str) -> RecordedSource:
         source = self.recording.source(name, f"MOCAP_{name.upper().replace('-', '_')}", is_known=True)
@@ -104,7 +109,7 @@ class Recorded:
 
 
 def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
-    recorded: Recorded,
+    recorded: Recorded, clock: Clock
 ) -> None:
     """Otherwise, a replay would take the refilled messages for a clock that was set back."""
     may_answer = threading.Event()
@@ -123,6 +128,7 @@ def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
         if number not in range(2, 7):
             recorded.receive("lab", "3d", markers(number))
             recorded.receive("lab", "event", events(number))
+    clock.now_s += GRACE_S
     may_answer.set()
     wait_until(lambda: recorded.recording.num_messages >= 21)
     numbers = [
@@ -134,18 +140,15 @@ def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
     assert [number for number, _ in numbers] == sorted(number for number, _ in numbers)
 
 
-@pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+@pytest.fixture
+def clock() -> Clock:
     """The monotonic clock of everything that is received and recorded."""
-    clock = Clock()
-    for module in (recorder, reception):
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=clock))
-    return clock
+    return Clock()
 
 
 @pytest.fixture
-def recorded(clock: Clock, tmp_path: Path) -> Recorded:  # noqa: ARG001 - the clock comes first
-    return Recorded(tmp_path)
+def recorded(clock: Clock, tmp_path: Path) -> Recorded:
+    return Recorded(tmp_path, clock=clock)
 
 
 def test_the_file_begins_with_the_description_although_messages_came_first(recorded: Recorded) -> None:
@@ -167,10 +170,10 @@ def test_the_file_begins_with_the_description_although_messages_came_first(recor
     assert (parameters.parameters_version, parameters.session, parameters.xml) == (7, 1, "<b/>")
 
 
-def test_each_source_has_what_the_recording_is_about(tmp_path: Path) -> None:
+def test_each_source_has_what_the_recording_is_about(tmp_path: Path, clock: Clock) -> None:
     """The file can be split by source, as exports do."""
     about = TakeDetails("S01", "baseline", "left knee")
-    recorded = Recorded(tmp_path, details=about)
+    recorded = Recorded(tmp_path, clock=clock, details=about)
     for name in ("lab", "hall"):
         recorded.describe(name)
     messages = dict(recorded.events())
@@ -242,7 +245,7 @@ def test_a_source_without_answers_is_recorded_soon(recorded: Recorded, clock: Cl
 
 def test_the_file_is_created_after_the_time_in_which_sources_are_found(tmp_path: Path, clock: Clock) -> None:
     """Its name has the names of all sources, so it waits for those that answer later."""
-    recorded = Recorded(tmp_path, start_s=2.0)
+    recorded = Recorded(tmp_path, clock=clock, start_s=2.0)
     recorded.describe("lab")
     clock.now_s += 1.9
     recorded.describe("robot")
@@ -289,9 +292,9 @@ def test_sources_whose_channels_are_equal_are_kept_apart(recorded: Recorded) -> 
     assert found == {"a-b", "a_b"}
 
 
-def test_only_the_chosen_components_are_recorded(tmp_path: Path) -> None:
+def test_only_the_chosen_components_are_recorded(tmp_path: Path, clock: Clock) -> None:
     """The parameters are always recorded: they say what the rest means."""
-    recorded = Recorded(tmp_path, "6d")
+    recorded = Recorded(tmp_path, "6d", clock=clock)
     recorded.describe("lab")
     recorded.receive("lab", "3d", markers(1))
     recorded.receive("lab", "6d/Tool 1", FINGERPRINTS["6d/"] + PREFIX.pack(UTIME, UTIME, 0, 1, 1) + bytes(45))
