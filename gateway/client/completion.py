@@ -19,6 +19,7 @@ from gateway.client.history_requests import (
     HistoryAnswer,
     HistoryRequest,
 )
+from gateway.client.publisher_watch import PublisherWatch
 from gateway.messages.history import sequence_of, utime_of
 from gateway.messages.sequence_check import SequenceCheck
 
@@ -37,13 +38,8 @@ NOBODY_S: Final = 3.0
 PASSING_S: Final = 10.0
 """After a refusal, gaps are not filled for so long: a reload of the gateway may end its reason."""
 
-TWO_GATEWAYS_S: Final = 2.0
-"""Two gateways publish while their numbers alternate this often. Each has a status every second."""
-
 _KEEPS_NOTHING: Final = frozenset({"disabled", "bad-request"})
 """The codes of a gateway without a history."""
-
-_MANY_ALTERNATIONS: Final = 10
 
 _MIN_REPLY_S: Final = 0.05
 
@@ -130,7 +126,7 @@ class Completion:
         self._held_bytes = held_bytes
         self._fills_gaps = completeness.is_complete
         self._state = State.BEGINNING
-        self._arrivals = SequenceCheck()  # of what arrives, in that order
+        self._watch = PublisherWatch()
         self._run = ArrivedRun(held_bytes)
         self._next = -1  # the number to hand on next; -1 if the history is to say where to begin
         self._reached: tuple[int, int] | None = None  # the message of this run that was handed on last
@@ -150,10 +146,8 @@ class Completion:
         # CHECKING: what has arrived since the numbers went back, and whether the time is asked.
         self._later_runs: list[ArrivedRun] = []
         self._checks_time = False
-        # PASSING: until when, and how often two numberings have alternated.
+        # PASSING: until when.
         self._passes_until_s = math.inf
-        self._num_alternations = 0
-        self._alternated_s = -math.inf
         # The end: nothing that arrives is taken, and the number to end with may not be known yet.
         self._is_ending = self._knows_end = False
         # The past: when to give it up, and how many messages of it have come.
@@ -186,16 +180,21 @@ class Completion:
         is_next_run = not run.is_continued_by(sequence, utime, session) or (
             run is self._run and self._recent.contradict(sequence, utime)
         )
-        if self._state is State.PASSING:
-            if is_next_run and self.problem and not self._has_two_gateways(now_s):
-                self._check.begin_at(0, is_restart=True)
-                self._run = ArrivedRun(self._held_bytes)
-                self._resume(now_s)  # the gateway that has restarted may keep messages
-            else:
-                self._pass_on(run, message, sequence, utime, session)
-                return
-        elif is_next_run:
+        if is_next_run and self._state is not State.PASSING:
             self._suspect_restart(now_s)
+        elif is_next_run and self.problem and not self._watch.sees_two(now_s):
+            self._check.begin_at(0, is_restart=True)
+            self._run = ArrivedRun(self._held_bytes)
+            self._resume(now_s)  # the gateway that has restarted may keep messages
+        if self._state is State.PASSING:
+            self._pass_on(run, message, sequence, utime, session)
+        else:
+            self._keep(message, sequence, utime, session, now_s, has_room=has_room)
+
+    def _keep(
+        self, message: bytes, sequence: int, utime: int, session: int, now_s: float, *, has_room: bool
+    ) -> None:
+        """Hand a message on if it is the next one, or hold it, or let it go."""
         run = self._later_runs[-1] if self._later_runs else self._run
         run.note(sequence, utime, session)
         self._newest_since = max(self._newest_since, sequence)
@@ -262,26 +261,17 @@ class Completion:
             self._suspect_restart(now_s, has_arrived=False)
             self._look(now_s)
 
-    # Two gateways.
+    # Only passing on.
 
     def _watch_publishers(self, sequence: int, utime: int, session: int, now_s: float) -> None:
         """Pass messages on while two gateways publish: the numbers of neither say what is missing."""
-        former = self._arrivals.num_alternations
-        self._arrivals.add(sequence, utime, session)
-        if self._arrivals.num_alternations > former:
-            self._num_alternations = self._num_alternations + 1 if self._has_alternated(now_s) else 1
-            self._alternated_s = now_s
-            if self._has_two_gateways(now_s) and self._state is not State.PASSING:
-                self.unknown[Unknown.TWO_GATEWAYS] += 1
-                self._pass_on_only("two gateways publish it", now_s)
-        if self.problem and now_s >= self._passes_until_s and not self._has_two_gateways(now_s):
+        self._watch.add(sequence, utime, session, now_s)
+        has_two = self._watch.sees_two(now_s)
+        if has_two and self._state is not State.PASSING:
+            self.unknown[Unknown.TWO_GATEWAYS] += 1
+            self._pass_on_only("two gateways publish it", now_s)
+        elif self.problem and now_s >= self._passes_until_s and not has_two:
             self._resume(now_s)
-
-    def _has_alternated(self, now_s: float) -> bool:
-        return now_s - self._alternated_s < TWO_GATEWAYS_S
-
-    def _has_two_gateways(self, now_s: float) -> bool:
-        return self._num_alternations >= _MANY_ALTERNATIONS and self._has_alternated(now_s)
 
     def _pass_on_only(self, problem: str, until_s: float) -> None:
         """Hand on what is held, and then each message when it arrives."""

@@ -14,11 +14,11 @@ from gateway.client.completion import (
     NOBODY_S,
     PASSING_S,
     PATIENCE_S,
-    TWO_GATEWAYS_S,
     Completion,
     Unknown,
 )
 from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.publisher_watch import TWO_GATEWAYS_S
 from gateway.messages.encode import PREFIX
 from gateway.messages.history import utime_of
 from gateway.messages.sequence_check import SequenceCheck
@@ -368,7 +368,7 @@ def test_of_two_gateways_everything_is_passed_on() -> None:
 
 
 def test_when_a_second_gateway_has_ended_gaps_are_filled_again() -> None:
-    """One that published for a second must not cost what is missed an hour later, and that time is not known."""
+    """One that published for a second must not cost what is missed an hour later."""
     network, other = Network(), Network()
     other._number, other._utime = 5000, 10**6
     other.completion, network._runs = network.completion, other._runs
