@@ -467,13 +467,13 @@ class Completion:
         if request.number != self._requested:
             return
         if code in RETRY_CODES:
-            is_nobody = code == "no-gateway" and is_connected
+            is_nobody = code == "no-gateway" and (is_connected or self._begin_utime is not None)
             if (
                 not self._repeat(
                     now_s,
                     has_helped=False,
                     patience_s=self._nobody_s if is_nobody else PATIENCE_S,
-                    knows_end=is_nobody,
+                    knows_end=is_nobody and is_connected,
                 )
                 and code == "no-gateway"
             ):
