@@ -467,7 +467,9 @@ class Completion:
         if request.number != self._requested:
             return
         if code in RETRY_CODES:
-            is_nobody = code == "no-gateway" and (is_connected or self._begin_utime is not None)
+            # What has just arrived shows that there is a connection, however long nothing follows.
+            has_arrived = self._state is State.CHECKING or self._begin_utime is not None
+            is_nobody = code == "no-gateway" and (is_connected or has_arrived)
             if (
                 not self._repeat(
                     now_s,

@@ -389,8 +389,12 @@ class _Connection:
     def _run(self) -> None:
         start_s = time.monotonic()
         is_silent = True
+        problems: set[tuple[str, str]] = set()
         while not self._closed.wait(_TICK_S):
             self._subscriber.tick()
+            former, problems = problems, self._reception.refill_problems()
+            for source, problem in sorted(problems - former):
+                logger.warning("%s: gaps are not filled: %s", safe_text(source), safe_text(problem))
             is_silent = is_silent and self._reception.first_heard_s is None
             if is_silent and time.monotonic() - start_s > _SILENCE_S:
                 is_silent = False

@@ -309,6 +309,11 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         """Complete all series from now on, with what ``ask`` returns; see Refill."""
         self.refill = Refill(self, self._lock, ask, find, completeness, self.monotonic)
 
+    def refill_problems(self) -> set[tuple[str, str]]:
+        """Return why gaps are not filled now, by the names of the sources."""
+        found = {(each.source.name, each.completion.problem) for each in self.all_series if each.completion}
+        return {each for each in found if each[1]}
+
     def ignore(self, *, beyond_limit: bool) -> None:
         """Count a message that is left out."""
         with self._lock:
