@@ -353,8 +353,11 @@ lock:
 	build/lock-venv/bin/python -c '$(BUILD_REQUIRES)' | $(UV_COMPILE) --output-file release/build-requirements.txt -
 	$(UV_COMPILE) --group release --constraint release/build-requirements.txt --output-file release/tool-requirements.txt
 
-# Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
+# Coverage-guided fuzzing, FUZZ_SECONDS for each target, and FUZZ_EXAMPLES new random examples and schedules for each
+# property, of which `make test` tries 100; not part of the check.
 FUZZ_SECONDS ?= 60
+FUZZ_EXAMPLES ?= 2000
+FUZZ_TESTS ?= $(shell grep --recursive --files-with-matches 'from hypothesis' tests/property tests/unit --include='test_*.py')
 FUZZ_TARGETS ?= packets frames connection commands parameters configuration messages take
 
 fuzz: .venv/installed
@@ -364,6 +367,7 @@ fuzz: .venv/installed
 		(cd build/fuzz && PYTHONPATH=../.. ../../$(BIN)/python ../../tests/fuzz/fuzz.py $$target corpus-$$target \
 			-max_total_time=$(FUZZ_SECONDS) -print_final_stats=1 -verbosity=0); \
 	done
+	MAKEFLAGS= FUZZ_EXAMPLES=$(FUZZ_EXAMPLES) $(BIN)/python tests/run.py --hypothesis-profile=fuzz --timeout=0 $(FUZZ_TESTS)
 
 # Random faults and attacks for SOAK_MINUTES, then a report; not part of the check.
 SOAK_MINUTES ?= 30

@@ -15,7 +15,8 @@ from typing import Any, Final
 
 import pytest
 import uvloop
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
+from hypothesis.database import DirectoryBasedExampleDatabase
 from xdist.scheduler import LoadScopeScheduling, Scheduling
 
 from gateway.logs.failures import HOLD_S
@@ -27,7 +28,15 @@ os.register_at_fork(before=gc.disable, after_in_parent=gc.enable)
 
 # A deadline would fail on a busy machine. The same examples in each run: `make fuzz` looks for new ones.
 settings.register_profile("gateway", deadline=None, derandomize=True, database=None)
-settings.load_profile("gateway")
+settings.register_profile(
+    "fuzz",
+    settings.get_profile("gateway"),
+    max_examples=int(os.environ.get("FUZZ_EXAMPLES", "2000")),
+    derandomize=False,
+    database=DirectoryBasedExampleDatabase("build/fuzz/examples"),  # what failed comes first in the next run
+    suppress_health_check=list(HealthCheck),
+)
+settings.load_profile("gateway")  # the option --hypothesis-profile loads another one after this
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 

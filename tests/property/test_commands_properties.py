@@ -21,6 +21,7 @@ from gateway.rtc3d.commands import (
 )
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
+from tests.support.examples import examples
 from tests.support.strategies import damaged
 
 digits = st.text(string.digits, min_size=1, max_size=4)
@@ -65,7 +66,7 @@ def test_case_and_ending_do_not_change_a_command(body: bytes, data: st.DataObjec
     assert parse_command((mixed + end).encode("ascii")) == parse_command(body)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(st.binary(max_size=200) | damaged(bodies) | word_lists | damaged(word_lists))
 def test_any_bytes_are_a_command_or_raise_an_error_with_a_short_ascii_text(body: bytes) -> None:
     try:

@@ -17,6 +17,7 @@ from gateway.rtc3d.components import (
     encode_component,
 )
 from gateway.rtc3d.frames import Frame, FrameReader, detect_byte_order, encode_frame, split_frame
+from tests.support.examples import examples
 from tests.support.strategies import damaged
 from tests.support.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
@@ -185,7 +186,7 @@ def assert_consistent(component: Component, order: ByteOrder) -> None:
     assert len(big_endian_content(component)) == len(content)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(any_bodies, orders)
 def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, order: ByteOrder) -> None:
     split = split_or_none(body, order)
@@ -201,7 +202,7 @@ def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, orde
         assert known_bytes + split.layout.num_extra_bytes == len(body)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(any_bodies, orders)
 def test_any_bytes_make_sense_in_the_detected_byte_order_or_raise_frame_error(
     body: bytes, expected: ByteOrder
@@ -216,7 +217,7 @@ def test_any_bytes_make_sense_in_the_detected_byte_order_or_raise_frame_error(
         assert found == expected or not makes_sense[expected]
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(any_bodies, st.data(), orders)
 def test_earlier_frames_do_not_change_how_a_frame_is_read(
     body: bytes, data: st.DataObject, order: ByteOrder

@@ -13,6 +13,7 @@ from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from tests.property.test_config_properties import PIECES, SETTINGS
 from tests.support.configurations import load
+from tests.support.examples import examples
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def test_a_variable_has_the_effect_of_the_same_value_in_a_file(
     assert load(file, {variable_name(location): as_text(value)}) == configuration
 
 
-@settings(max_examples=50)  # each has some thirty variables
+@settings(max_examples=examples(50))  # each has some thirty variables
 @given(configuration=SETTINGS)
 def test_variables_can_set_everything_that_a_file_can(configuration: Settings) -> None:
     """A container needs no file."""

@@ -23,6 +23,7 @@ from gateway.stream.ingest import Ingest
 from gateway.stream.rate_check import RateWatch
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from tests.support.examples import examples
 from tests.support.memory_output import MemoryOutput
 
 EDGES = [edge + near for edge in (-(2**63), -(2**32), 0, 2**31, 2**32, 2**53, 2**62) for near in (-1, 0, 1)]
@@ -124,7 +125,7 @@ def _no_log() -> Iterator[None]:
 
 
 @example([(None, 2**58, None, 0, 33, 0)], "all")  # time stamps that wrap around
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(st.lists(steps, min_size=1, max_size=8), st.sampled_from(("all", "latest")))
 def test_any_time_stamps_can_be_published(
     phases: list[tuple[int | None, int, int | None, int, int, int]], backlog: str

@@ -4,6 +4,7 @@ from hypothesis.strategies import SearchStrategy
 
 from gateway.errors import PacketError
 from gateway.rtc3d.packets import FilePiece, Packet, PacketReader, decode_text
+from tests.support.examples import examples
 from tests.support.strategies import damaged, pieces_of
 
 LIMIT = 64
@@ -78,7 +79,7 @@ any_streams = (
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(pieces(any_streams))
 def test_the_packets_read_from_any_bytes_are_those_in_the_bytes(stream: list[bytes]) -> None:
     reader = new_reader()
@@ -100,7 +101,7 @@ def test_the_packets_read_from_any_bytes_are_those_in_the_bytes(stream: list[byt
         assert reader.error.offset == len(stream_of(complete))
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(pieces(any_streams))
 def test_a_split_of_the_stream_changes_neither_packets_nor_error(stream: list[bytes]) -> None:
     whole, split = new_reader(), new_reader()

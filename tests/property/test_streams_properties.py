@@ -17,6 +17,7 @@ from hypothesis.stateful import (
 
 from gateway.stream.state import StreamState
 from tests.support.automatic_streams import STALL_TIMEOUT_S, ScriptedStream, StreamsLab, announcing
+from tests.support.examples import examples
 
 THREE = {"3d": 200.0, "force": 1000.0, "analog": 2000.0}
 TWO = {"3d": 200.0, "analog": 2000.0}
@@ -312,4 +313,4 @@ class Streams(RuleBasedStateMachine):
 
 
 def test_the_connections_follow_the_rules_in_any_order_of_events() -> None:
-    run_state_machine_as_test(Streams, settings=settings(max_examples=100, stateful_step_count=30))
+    run_state_machine_as_test(Streams, settings=settings(max_examples=examples(100), stateful_step_count=30))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from gateway.outputs.takes.disk import FolderWatch, Host
 from gateway.outputs.takes.folder_clock import STEP_S
 from tests.support.clocks import Clock
+from tests.support.examples import examples
 from tests.support.recording_output import NoThread, settings_in
 
 DAY_S = 86_400.0
@@ -128,14 +129,14 @@ def run(actions: list[tuple[str, float]], max_bytes: int) -> Lab:
         return lab
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.lists(ACTIONS, min_size=8, max_size=25))
 def test_no_take_is_deleted_by_age_before_its_time(actions: list[tuple[str, float]]) -> None:
     """What was recorded last week must be there, whatever the clock has shown since then."""
     run(actions, 10**9)
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.lists(ACTIONS, min_size=8, max_size=25))
 def test_a_new_take_always_finds_room(actions: list[tuple[str, float]]) -> None:
     """Takes from the future or from 1970 can be deleted as others."""

@@ -29,6 +29,7 @@ from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.replay.play_list import Entry, SeekIndex, Selection, play_list
 from gateway.takes.replay.timeline import ReplayTimeline
+from tests.support.examples import examples
 from tests.support.recording_output import events as recorded_events
 from tests.support.recording_output import still_lab
 from tests.support.strategies import damaged
@@ -129,7 +130,7 @@ def test_arrays_have_the_values_of_lcms_own_decoder(log: list[bytes]) -> None:
                 assert series.items.shape == (len(series), len(series.labels))
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(damaged(events.map(b"".join)))
 def test_damage_is_reported_and_never_raises_another_error(log: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -183,7 +184,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(steps=STEPS)
 def test_a_take_is_what_was_published(steps: list[tuple[str, int]]) -> None:
     """However starts, stops, frames and parameters follow each other."""
@@ -243,7 +244,7 @@ def entries(reader: TakeReader, start_us: int, index: SeekIndex | None) -> list[
     return list(play_list(reader, Selection(), ReplayTimeline(), start_us, index))
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(
     st.lists(steps, min_size=15, max_size=60),
     st.integers(1, 3),

@@ -22,6 +22,7 @@ from gateway.client.publisher_watch import TWO_GATEWAYS_S
 from gateway.messages.encode import PREFIX
 from gateway.messages.history import utime_of
 from gateway.messages.sequence_check import SequenceCheck
+from tests.support.examples import examples
 
 SIZE: Final = len(bytes(8) + PREFIX.pack(0, 0, 0, 0, 0))
 ENTRY: Final = SIZE + 128
@@ -136,7 +137,7 @@ EVENTS: Final = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 @given(
     st.lists(EVENTS, max_size=60),
     st.sampled_from([10**9, 10**9, 4, 15]),

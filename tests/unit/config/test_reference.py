@@ -34,6 +34,7 @@ from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.property.test_config_properties import SETTINGS
 from tests.support.configurations import MODEL
+from tests.support.examples import examples
 
 REFERENCE = (Path(__file__).parents[3] / "docs/reference/configuration.md").read_text(encoding="utf-8")
 
@@ -139,7 +140,7 @@ def test_shipped_configurations_name_and_match_the_schema(path: Path) -> None:
     VALIDATOR.validate(yaml.safe_load(text))
 
 
-@hypothesis_settings(max_examples=20)  # the validator takes 15 ms for each
+@hypothesis_settings(max_examples=examples(20))  # the validator takes 15 ms for each
 @given(SETTINGS)
 def test_valid_settings_match_the_schema(configuration: Settings) -> None:
     """An editor must not mark what the gateway accepts."""

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items, described_labels, num_described_items
 from gateway.simulator.synthetic import BUTTON_EVENT, SyntheticScene
+from tests.support.examples import examples
 
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -159,7 +160,7 @@ def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) ->
     assert all(times_us[0] <= event[1] < times_us[-1] for event in whole)
 
 
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(*[st.integers(0, most) for most in (30, 12, 5, 3, 99)])
 def test_parameters_describe_any_scene(markers: int, tools: int, analog: int, plates: int, seed: int) -> None:
     """Clients allocate by the parameters; labels have a word and a number, and tools name their markers."""

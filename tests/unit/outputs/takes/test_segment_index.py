@@ -13,6 +13,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.takes import segment_index
 from gateway.takes.files import event_log
 from tests.support.clocks import Clock
+from tests.support.examples import examples
 from tests.support.recording_output import RecordingLab, still_lab
 
 
@@ -45,7 +46,9 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(
+    max_examples=examples(40), suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(STEPS, st.integers(0, 200), st.none() | st.integers(0, 200), st.booleans())
 async def test_a_range_has_every_message_of_its_key_in_order(
     tmp_path_factory: pytest.TempPathFactory,
