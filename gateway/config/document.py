@@ -112,17 +112,65 @@ def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
     try:
         root = loader.get_single_node()
     except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or loader.get_mark()
+        if wrong := _wrong_space(text, mark.line):
+            raise reader.position(*wrong.place).error((), wrong.text) from None
+        if error.problem in _INDENTATION:
+            raise reader.position_of(mark).error((), _INDENTATION_TEXT) from None
         problem = f"not YAML: {error.problem}"
         if error.context and error.context_mark:
             problem = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
         if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
             problem += "; check indentation, colons, quotes and brackets here"
-        raise reader.position_of(error.problem_mark or loader.get_mark()).error((), problem) from None
+        raise reader.position_of(mark).error((), problem) from None
     except (ValueError, OverflowError):  # raised by chr() and int() in PyYAML
         position = reader.position_of(loader.get_mark())
         raise position.error((), "not YAML: a number here is out of range") from None
     values = None if root is None else reader.value(root, ())
     return Document(values, reader.positions, reader.key_positions)
+
+
+_INDENTATION: Final = frozenset(
+    {
+        "mapping values are not allowed here",
+        "could not find expected ':'",
+        "expected <block end>, but found '<block mapping start>'",
+        "expected <block end>, but found '<block sequence start>'",
+        "expected <block end>, but found '<scalar>'",
+        "expected <block end>, but found '-'",
+        "expected <block end>, but found '?'",
+        "sequence entries are not allowed here",
+    }
+)
+"""What PyYAML says where a line begins in the wrong column, or lacks a colon."""
+
+_INDENTATION_TEXT: Final = (
+    "this line does not fit those above it: keys that belong together begin in the same column, those below "
+    "a key two columns further right, and each has a colon and a space; quote a text that contains ': '"
+)
+
+_LOOKS_LIKE_SPACE: Final = re.compile("[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000\ufeff]")
+_QUOTED_OR_COMMENT: Final = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'|(?:^|\s)#.*')
+
+
+class _WrongSpace(NamedTuple):
+    """A character that looks like a space and is none: line and column, and what to do."""
+
+    place: tuple[int, int]
+    text: str
+
+
+def _wrong_space(text: str, line: int) -> _WrongSpace | None:
+    """Return the first such character in a line, counted from 0, or in the one before it."""
+    lines = re.split("\r\n|[\r\n]", text)
+    for number in (line - 1, line):
+        if 0 <= number < len(lines):
+            bare = _QUOTED_OR_COMMENT.sub(lambda found: "x" * len(found[0]), lines[number])
+            if found := _LOOKS_LIKE_SPACE.search(bare):
+                name = "a tab" if found[0] == "\t" else f"the character U+{ord(found[0]):04X}"
+                what = f"found {name}, which looks like spaces; replace it with spaces"
+                return _WrongSpace((number + 1, found.start() + 1), what)
+    return None
 
 
 class _Reader:
@@ -164,6 +212,9 @@ class _Reader:
                 raise position.error(location, "found a list or mapping as a key")
             key = self._text(key_node, location)
             here = (*location, key)
+            if found := _LOOKS_LIKE_SPACE.search(key):
+                text = f"found the character U+{ord(found[0]):04X} in a key; it looks like a space: delete it"
+                raise position.error(location, text)
             if key in values:
                 raise position.error(here, f"the same key as in line {self.key_positions[here].line}")
             if key_node.tag == f"{_YAML}merge":

@@ -1,7 +1,7 @@
 """The base class of all parts of the configuration: frozen, and with the gateway's error texts."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from typing import Any, Final, NamedTuple, Self
 
@@ -69,6 +69,12 @@ class Section(BaseModel):
 def validation_error(text: str, *location: str | int) -> ValidationError:
     """Return the error for a validator to raise; ``location`` is relative to the value that it validates."""
     return ValidationError.from_exception_data("configuration", [_line_error(text, location, _MISTAKE)])
+
+
+def validation_errors(mistakes: Sequence[tuple[str, tuple[str | int, ...]]]) -> ValidationError:
+    """Return the error for several mistakes: their texts, and their locations as in ``validation_error``."""
+    details = [_line_error(text, location, _MISTAKE) for text, location in mistakes]
+    return ValidationError.from_exception_data("configuration", details)
 
 
 def expects(what: str) -> WrapValidator:

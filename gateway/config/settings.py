@@ -24,7 +24,7 @@ from pydantic import (
 from pydantic.json_schema import SkipJsonSchema
 
 from gateway.config import values
-from gateway.config.section import Effective, Section, expects, validation_error
+from gateway.config.section import Effective, Section, expects, validation_error, validation_errors
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES, FIRST_PRINCIPLES_PORT
@@ -337,6 +337,7 @@ class Settings(Section):
         lcm = self.outputs.get("lcm")
         has_channels = lcm is not None and lcm.enabled
         owners: dict[str, int] = {}
+        mistakes: list[tuple[str, tuple[str | int, ...]]] = []
         for index, source in enumerate(self.sources):
             # gateway.messages.topics builds channels in the same way: upper case, and one '_' for the rest.
             identity = "_".join(re.findall("[A-Z0-9]+", source.name.upper())) if has_channels else source.name
@@ -351,7 +352,9 @@ class Settings(Section):
                     f"(sources[{other}]); expected a name that differs in letters or digits, ignoring case, "
                     "or lcm.enabled: false"
                 )
-            raise validation_error(text, "sources", index, "name")
+            mistakes.append((text, ("sources", index, "name")))
+        if mistakes:
+            raise validation_errors(mistakes)
         return self
 
     @model_validator(mode="after")
@@ -367,16 +370,18 @@ class Settings(Section):
     def _check_ports_differ(self) -> Self:
         sections: dict[str, MetricsSettings | OutputSettings] = {"metrics": self.metrics, **self.outputs}
         used: dict[str, ListenAddress] = {}
+        mistakes: list[tuple[str, tuple[str | int, ...]]] = []
         for name, section in sections.items():
             for address in section.listens_on if section.enabled else ():
                 for other_key, other in used.items():
                     hosts = {address.host, other.host}
                     if address.port == other.port and (len(hosts) == 1 or hosts & _ALL_ADDRESSES):
-                        raise validation_error(
-                            f"found {address.port}, which {other_key} has too; expected another port",
-                            *(name, *address.key),
-                        )
+                        text = f"found {address.port}, which {other_key} has too; expected another port"
+                        mistakes.append((text, (name, *address.key)))
+                        break
                 used[".".join((name, *address.key))] = address
+        if mistakes:
+            raise validation_errors(mistakes)
         return self
 
 

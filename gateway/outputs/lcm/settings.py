@@ -1,18 +1,19 @@
 """The section ``lcm`` of the configuration, and the output in the registry."""
 
+import ipaddress
 import os
 from typing import Annotated, Final
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
 
 from pydantic import AfterValidator, TypeAdapter
 
-from gateway.config.section import Effective, expects
+from gateway.config.section import Effective, expects, validation_error
 from gateway.config.settings import OutputSettings
 from gateway.config.values import ByteLimit, ChannelPrefix, Host, MaxRates, QueryRate, Switch
-from gateway.config.words import join_or
+from gateway.config.words import describe, join_or, spelling_hint
 from gateway.messages.topics import DEFAULT_LCM_PREFIX
 from gateway.outputs.kind import OutputKind, imported_late
-from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
+from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT, MULTICAST_SCHEMES
 
 DEFAULT_LCM_URL: Final = f"udpm://{DEFAULT_GROUP}:{DEFAULT_PORT}?ttl=0"
 """LCM's own default, which stays on this host."""
@@ -38,12 +39,48 @@ def _lcm_url(text: str) -> str:
     return text
 
 
+_UDPM_PARAMETERS: Final = ("ttl", "recv_buf_size", "transmit_only")
+"""Those that LCM knows. It ignores others, so that a misspelt ttl leaves messages on this computer."""
+
+_MAX_TTL: Final = 255
+_MAX_BUFFER_BYTES: Final = 2**31 - 1
+
+
+def _check_multicast(url: str) -> str:
+    """Return a URL. Raises ValidationError for a multicast URL that LCM refuses, or takes for another one."""
+    parts = urlsplit(url)
+    if parts.scheme not in MULTICAST_SCHEMES:
+        return url
+    found = f"found {describe(url)}; expected"
+    try:
+        is_multicast = ipaddress.IPv4Address(parts.hostname or DEFAULT_GROUP).is_multicast
+    except ValueError:
+        is_multicast = False
+    if not is_multicast:
+        raise validation_error(f"{found} a multicast address, 224.0.0.0 to 239.255.255.255, as the host")
+    try:
+        is_port = parts.port != 0
+    except ValueError:
+        is_port = False
+    if not is_port:
+        raise validation_error(f"{found} a port from 1 to 65535")
+    for name, value in parse_qsl(parts.query, keep_blank_values=True):
+        most = {"ttl": _MAX_TTL, "recv_buf_size": _MAX_BUFFER_BYTES}.get(name)
+        if most is not None and not (value.isascii() and value.isdecimal() and int(value[:20]) <= most):
+            raise validation_error(f"{found} a whole number from 0 to {most} as {name}")
+        if parts.scheme == "udpm" and name not in _UDPM_PARAMETERS:
+            hint = spelling_hint(name, _UDPM_PARAMETERS)
+            raise validation_error(f"{found} only {join_or(_UDPM_PARAMETERS)} after the ?, not {name}{hint}")
+    return url
+
+
 LcmUrl = Annotated[
     str,
     AfterValidator(_lcm_url),
     expects(
         f"a URL that begins with {join_or(f'{scheme}://' for scheme in LCM_SCHEMES)}, without a user name"
     ),
+    AfterValidator(_check_multicast),
 ]
 
 

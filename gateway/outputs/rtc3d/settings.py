@@ -5,7 +5,7 @@ from typing import Annotated, Final, Self
 
 from pydantic import Field, PlainSerializer, model_validator
 
-from gateway.config.section import expects, validation_error
+from gateway.config.section import expects, validation_error, validation_errors
 from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
 from gateway.config.values import Host, Port, SourceName, Switch
 from gateway.outputs.kind import OutputKind, imported_late
@@ -48,10 +48,13 @@ class Rtc3dSettings(OutputSettings):
     @model_validator(mode="after")
     def _check_ports(self) -> Self:
         owners: dict[int, str] = {}
+        mistakes: list[tuple[str, tuple[str | int, ...]]] = []
         for source, port in self.ports.items():
             if (owner := owners.setdefault(port, source)) != source:
                 text = f"found {port}, which {owner} has too; expected another port for each source"
-                raise validation_error(text, "ports", source)
+                mistakes.append((text, ("ports", source)))
+        if mistakes:
+            raise validation_errors(mistakes)
         if self.enabled and not self.ports:
             raise validation_error(
                 "found nothing; expected a port for each source that is served, as in {lab: 3120}", "ports"

@@ -115,10 +115,80 @@ MISTAKES = [
     ("lcm: &it [*it]", "4:6: more than 5000 values"),
     ("lcm: " + "[" * 2000, "4:36: not YAML: found more than 32"),
     ("lcm: [1", "5:1: not YAML: while parsing"),
-    ("\tlcm: {}", r"4:1: not YAML: found character '\t'"),
+    ("\tlcm: {}", "4:1: found a tab"),
+    ("lcm:\n\tenabled: true", "5:1: found a tab"),
+    ("lcm: # with a\ttab\n  \tenabled: true", "5:3: found a tab"),
+    ("lcm:\n\u00a0\u00a0enabled: true", "5:1: found the character U+00A0"),
+    ("\u00a0lcm: {}", "4:1: found the character U+00A0"),
+    ("lcm:\n  enabled: true\n \u00a0url: memq://", "6:2: found the character U+00A0"),
+    ("lcm: {\u00a0enabled: true}", "4:7: lcm: found the character U+00A0"),
+    ("   lcm: {}", "4:4: this line does not fit"),
+    ("      port: 3030", "4:11: this line does not fit"),
+    ("lcm:\n    enabled: true\n   url: memq://", "6:4: this line does not fit"),
+    ("lcm: enabled: true", "4:13: this line does not fit"),
+    ("lcm\nmetrics: {}", "5:1: this line does not fit"),
     ("---\n{}", "4:1: not YAML: expected a single document"),
     ("lcm: \x07", "4:6: found the character U+0007"),
 ]
+
+
+def test_every_one_of_several_equal_ports_and_names_is_reported(file: Path) -> None:
+    """Whoever corrects one pair must not find the next one at the next start."""
+    ports = (
+        "metrics: {port: 4000}\nfoxglove: {enabled: true, port: 4000}\nvrpn: {enabled: true, port: 4000}\n"
+    )
+    assert len(refused(file, SERVER + ports)) == 2
+    clients = "rtc3d: {enabled: true, ports: {lab: 4001, hall: 4001, gym: 4001}}\n"
+    assert len(refused(file, SERVER + clients)) == 2
+    assert len(refused(file, SERVER + "  - {name: LAB, host: x}\n  - {name: Lab, host: x}\n")) == 2
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("udpm://239.255.76.67:7667?ttl=300", ["ttl", "255"]),
+        ("udpm://239.255.76.67:7667?ttl=-1", ["ttl", "255"]),
+        ("udpm://239.255.76.67:7667?ttl=", ["ttl", "255"]),
+        ("udpm://239.255.76.67:7667?ttl=²", ["ttl", "255"]),
+        ("mpudpm://239.255.76.67:7667?ttl=300", ["ttl", "255"]),
+        ("udpm://239.255.76.67:7667?ttl=1&recv_buf_size=2MB", ["recv_buf_size"]),
+        ("udpm://239.255.76.67:7667?tttl=1", ["tttl", "'ttl'"]),
+        ("udpm://239.255.76.67:7667?TTL=1", ["TTL", "'ttl'"]),
+        ("udpm://192.0.2.20:7667?ttl=1", ["multicast", "239.255.255.255"]),
+        ("udpm://lab-pc:7667", ["multicast"]),
+        ("mpudpm://192.0.2.20:7667", ["multicast"]),
+        ("udpm://239.255.76.67:0", ["65535"]),
+        ("udpm://239.255.76.67:70000", ["65535"]),
+        ("udpm://239.255.76.67:lcm", ["65535"]),
+    ],
+)
+@pytest.mark.parametrize("key", ["url", "queries_url"])
+def test_a_multicast_url_that_lcm_does_not_use_as_written_is_refused(
+    file: Path, key: str, url: str, words: list[str]
+) -> None:
+    """LCM ignores a misspelt ttl, so that messages stay on the computer, and only prints what it refuses."""
+    [found] = refused(file, f"{SERVER}lcm: {{{key}: '{url}'}}\n")
+    assert found.startswith(f"4:{9 + len(key)}: lcm.{key}: ")
+    assert names(found, *words)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "udpm://",
+        "udpm://?ttl=1&recv_buf_size=2000000",
+        "udpm://239.1.2.3",
+        "udpm://224.0.0.9:65535?ttl=255",
+        "udpm://:7667?transmit_only=true",
+        "mpudpm://239.255.76.67:7667?ttl=1&nports=4",
+        "memq://",
+        "tcpq://192.0.2.20:7700",
+        "file:///tmp/lcm.log?mode=w",
+    ],
+)
+def test_urls_that_lcm_accepts_are_accepted(url: str) -> None:
+    """Of other schemes, and with every parameter of LCM."""
+    assert LcmSettings(url=url).url == url
 
 
 @pytest.mark.parametrize(("line", "error"), MISTAKES, ids=[line[:30] for line, _ in MISTAKES])

@@ -17,7 +17,7 @@ LOADS = (MessageLoad(rate_hz=100.0, largest_bytes=8000), MessageLoad(rate_hz=50.
 URL = "udpm://239.255.76.67:7667?ttl=0"
 
 
-def found(url: str, *loads: MessageLoad) -> tuple[Finding, Finding]:
+def found(url: str | None, *loads: MessageLoad) -> tuple[Finding, Finding]:
     route, _, buffers = check_lcm(LcmSettings(url=url), ("lab",), loads, 0.1)
     return route, buffers
 
@@ -56,9 +56,11 @@ def test_multicast_that_works_passes_with_its_reach(query: str, ttl: str) -> Non
 
 
 @pytest.mark.netns
-def test_a_url_that_lcm_rejects_fails() -> None:
-    route, _ = found("udpm://not-an-address:7667")
+def test_a_url_that_lcm_rejects_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The configuration does not check the environment variable."""
     url = "udpm://not-an-address:7667"
+    monkeypatch.setenv("LCM_DEFAULT_URL", url)
+    route, _ = found(None)
     assert is_finding(route, "lcm", "route", Result.FAILING, url, remedy=["lcm.url"])
 
 
