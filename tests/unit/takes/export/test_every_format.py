@@ -16,7 +16,6 @@ from mcap.reader import make_reader
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, export_take
-from gateway.takes.files import reader
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -296,13 +295,18 @@ def test_an_interruption_at_any_time_leaves_nothing(take: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", [".mcap", "ros2"])
-def test_messages_are_in_the_order_of_time(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Players read from the beginning, and need the index only to seek: chunks must not overlap."""
-    monkeypatch.setattr(reader, "_BATCH_BYTES", 50_000)
-    source = write_take(tmp_path / "take.lcmlog", exported.scene(300))
-    export_take(job_for(name, source, tmp_path / "out"))
+def test_messages_are_in_the_order_of_time(name: str, tmp_path: Path) -> None:
+    """Players read from the beginning, and need the index only to seek: chunks must not overlap.
+
+    New parameters end a part of the take that is read at once; some messages are overtaken by them.
+    """
+    messages = exported.scene(300)
+    half = len(messages) // 2
+    overtaken, early = messages[half - 20 : half], messages[half : half + 20]
+    changed = exported.labelled("head", version=2)
+    messages[half - 20 : half + 20] = [*early, changed, *overtaken]
+    take = write_take(tmp_path / "take.lcmlog", messages)
+    export_take(job_for(name, take, tmp_path / "out"))
     with (tmp_path / "out/take.mcap").open("rb") as file:
         found = make_reader(file)
         times = [message.log_time for _, _, message in found.iter_messages(log_time_order=False)]
