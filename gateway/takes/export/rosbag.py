@@ -1,6 +1,7 @@
 """Export to a bag of ROS 2: an MCAP file with the messages that the output ``ros2`` publishes live."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -56,7 +57,11 @@ def export_rosbag(job: ExportJob) -> None:
     def new_export(source: TakeSource) -> SourceExport:
         name = unique_name(ros_name(source.name, "source"), taken, MAX_PART_CHARS)
         taken.add(name)
-        return _RosExport(source.name, name)
+        if source.frame and not source.frame.only_scales:
+            job.note(
+                f"positions of {source.name} are in the frame {source.frame.frame_id} of its newest status"
+            )
+        return _RosExport(source, name)
 
     export_to_mcap(job, new_export, "markers, tools, analog channels or forces", _PROFILE)
 
@@ -64,11 +69,15 @@ def export_rosbag(job: ExportJob) -> None:
 class _RosExport(SourceExport):
     """One source: what its frames become. ``name`` is the part of its topics that stands for it."""
 
-    def __init__(self, source: str, name: str) -> None:
+    def __init__(self, source: TakeSource, name: str) -> None:
         super().__init__()
-        self._source = source
+        self._source = source.name
+        self._frame = source.frame or CoordinateFrame(source.name, None)
+        unit = source.parameters[-1].parameters.length_unit if source.parameters else ""
+        metres, of_unit = self._frame.metres_per_unit, metres_per_unit(unit)
+        self._scale = metres / of_unit if metres and of_unit else 1.0
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
-        self._stamped = StampedEncoder(source)
+        self._stamped = StampedEncoder(self._frame.frame_id)
         self._topics: dict[tuple[str, RosType], Topic] = {}
 
     def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
@@ -85,27 +94,32 @@ class _RosExport(SourceExport):
                 return self._forces(run, rows)
         return ()
 
-    def _markers(self, run: Series, rows: Array) -> list[TopicMessages]:
+    def _frame_of(self, run: Series) -> CoordinateFrame:
+        """Return the coordinate frame with the unit of a run, and the scale of the settings."""
         metres = metres_per_unit(run.unit)
-        if metres is None:
+        return replace(self._frame, metres_per_unit=None if metres is None else metres * self._scale)
+
+    def _markers(self, run: Series, rows: Array) -> list[TopicMessages]:
+        frame = self._frame_of(run)
+        if frame.metres_per_unit is None:
             self.count(f"markers with the unknown unit {run.unit!r}", rows >= 0)
             return []
         utimes, markers = run.capture_utime[rows], run.values[rows]
-        encoder = CloudEncoder(self._source, markers.shape[1])
-        positions = markers[..., :3].astype(np.float64) * metres
+        encoder = CloudEncoder(frame.frame_id, markers.shape[1])
+        positions = frame.points(markers[..., :3])
         encoded = encoder.encode_rows(ros_stamps(utimes), positions, markers[..., 3])
         return [self._messages(MARKERS, POINT_CLOUD, utimes, encoded)]
 
     def _tools(self, run: Series, rows: Array) -> list[TopicMessages]:
         """Return the pose of each tool, and /tf with all tools that are in view in a frame."""
-        frame = CoordinateFrame(self._source, metres_per_unit(run.unit))
+        frame = self._frame_of(run)
         if frame.metres_per_unit is None:
             self.count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
             return []
         tools = unique_ros_names(run.labels, "tool")
         if [*tools] != [*run.labels]:
             self.notes["labels of tools changed to names of topics"] = None
-        names = [TransformNames(self._source, f"{self._source}/{tool}") for tool in tools]
+        names = [TransformNames(frame.frame_id, f"{self._source}/{tool}") for tool in tools]
         topics = [self._topic(f"{self._base}/{pose_topic(tool)}", POSE_STAMPED) for tool in tools]
         found = [TopicMessages(topic, [], []) for topic in topics]
         tf = TopicMessages(self._topic(TF, TF_MESSAGE), [], [])
@@ -130,7 +144,8 @@ class _RosExport(SourceExport):
         for index in range(run.values.shape[1]):
             newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
             loads = run.values[rows, index] * np.array([newtons] * 3 + [newton_metres] * 3)
-            is_known = ~np.isnan(loads).any(axis=1)
+            loads = self._frame.vectors(loads.reshape(-1, 2, 3)).reshape(-1, 6)
+            is_known = ~np.asarray(np.isnan(loads).any(axis=1))
             self.count("forces with NaN", ~is_known)
             utimes = run.capture_utime[rows][is_known]
             encoded = self._stamped.encode_rows(ros_stamps(utimes), loads[is_known])

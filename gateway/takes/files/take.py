@@ -11,6 +11,7 @@ import numpy as np
 
 from gateway.errors import ProtocolError, SelectionError, TakeError
 from gateway.logs.safe_text import quoted
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.files.component_rows import decode_rows
@@ -53,6 +54,9 @@ class TakeSource:
         """Return a summary."""
         rows = [f"{len(series)} rows of {key}" for key, series in self.series.items()]
         return f"<TakeSource {self.name}: {', '.join(rows) or 'nothing'}>"
+
+    frame: CoordinateFrame | None = None
+    """That of the gateway's poses, by its newest status; None if the take has none."""
 
     @property
     def series(self) -> dict[str, Series]:
@@ -232,6 +236,7 @@ def _join_sources(parts: Sequence[TakeSource]) -> TakeSource:
         parameters=[entry for part in parts for entry in part.parameters],
         malformed=sum((part.malformed for part in parts), Counter()),
         recorded=set().union(*(part.recorded for part in parts)),
+        frame=next((part.frame for part in reversed(parts) if part.frame), None),
         num_lost=sum(part.num_lost for part in parts),
         is_cut_off=any(part.is_cut_off for part in parts),
     )
@@ -239,6 +244,26 @@ def _join_sources(parts: Sequence[TakeSource]) -> TakeSource:
         found = [part.series[key] for part in parts if key in part.series]
         setattr(joined, name, join_series(found) if found else None)
     return joined
+
+
+def _frame_of(message: bytes) -> CoordinateFrame | None:
+    """Return the coordinate frame in a status; None if it cannot be read or its numbers are no frame."""
+    try:
+        status = decode(message)
+    except ProtocolError:
+        return None
+    x, y, z, w = status.rotation_xyzw
+    tx, ty, tz = status.translation_m
+    numbers = (x, y, z, w, tx, ty, tz)
+    length = math.sqrt(x * x + y * y + z * z + w * w) if all(map(math.isfinite, numbers)) else 0.0
+    if not status.frame_id or abs(length - 1) > _MAX_LENGTH_ERROR:
+        return None
+    metres = status.metres_per_unit if 0 < status.metres_per_unit < math.inf else None
+    return CoordinateFrame(status.frame_id, metres, (x, y, z, w), (tx, ty, tz))
+
+
+_MAX_LENGTH_ERROR: Final = 1e-3
+"""How much the length of a rotation's quaternion may differ from 1."""
 
 
 class TakeLoader:
@@ -252,6 +277,7 @@ class TakeLoader:
     ) -> None:
         self._wanted, self._components, self._spool_folder = sources, components, spool_folder
         self._sources: dict[str, TakeSource] = {}
+        self._statuses: dict[str, bytes] = {}  # the newest, by source
         self._histories: dict[str, ParametersHistory] = {}  # by source
         self._builders: dict[tuple[str, str, int], SeriesBuilder] = {}  # by source, component and recording
         self.earliest_utime = math.inf
@@ -277,9 +303,14 @@ class TakeLoader:
                 source.malformed[batch.key] += rows.malformed
             self._builder(batch).add(rows)
         elif batch.key in ("take", "details", "end", "status", "parameters"):
-            for message in batch.messages:
-                if batch.key != "status" or not source.server:
-                    self._describe(source, batch.key, message)
+            self._describe_all(source, batch)
+
+    def _describe_all(self, source: TakeSource, batch: MessageBatch) -> None:
+        if batch.key == "status":
+            self._statuses[source.name] = batch.messages[-1]
+        for message in batch.messages:
+            if batch.key != "status" or not source.server:
+                self._describe(source, batch.key, message)
 
     def _builder(self, batch: MessageBatch) -> SeriesBuilder:
         identity = (batch.source, batch.key, batch.recording)
@@ -306,6 +337,8 @@ class TakeLoader:
                 parts.setdefault((name, key), []).append(series)
         for (name, key), found in parts.items():
             setattr(self._sources[name], _FIELDS[key], join_series(found))
+        for name, message in self._statuses.items():
+            self._sources[name].frame = _frame_of(message)
         return self._sources
 
     def _describe(self, source: TakeSource, key: str, message: bytes) -> None:

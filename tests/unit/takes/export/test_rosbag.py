@@ -6,15 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rtc3d
 from rosbags.highlevel import AnyReader
 
 from gateway.errors import SelectionError, TakeError
+from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, Parameters6D, ParametersForce, Plate, Tool
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
 from gateway.takes.export.job import ExportJob, Note
-from tests.support.takes import START_UTIME, frame, parameters, scene_messages
+from tests.support.takes import START_UTIME, Message, frame, parameters, scene_messages
 from tests.unit.takes.export.exported import NAN, export_messages, labelled, notes_of
 
 SCENE = SyntheticScene(markers=3, tools=2, analog=3, plates=2, rate_hz=100, analog_rate_hz=200)
@@ -134,3 +136,32 @@ def test_a_bag_of_another_format_or_of_nothing_is_refused(tmp_path: Path) -> Non
     with pytest.raises(TakeError, match="has no markers, tools, analog channels or forces"):
         export_messages(tmp_path, [labelled("a")], "out.mcap", format="ros2")
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_the_frame_and_the_transform_are_those_of_the_newest_status(tmp_path: Path) -> None:
+    """A bag has what the output published live, with x and y turned, moved and twice as large."""
+    turned = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
+    statuses = [status("old", (0.0, 0.0, 0.0, 1.0), 1e-3), status("world", turned, 2e-3)]
+    bag, _ = export(tmp_path, *statuses, parameters(SCENE.parameters), *scene_messages(SCENE, 20))
+    lab = open_take(tmp_path / "take.lcmlog").sources["lab"]
+    assert lab.markers is not None
+    assert lab.forces is not None
+    _, cloud = bag.messages["/mocap/lab/markers"][0]
+    x, y, z = np.frombuffer(cloud.data, "<f4").reshape(-1, 5)[:, :3].T
+    expected = lab.markers.positions[0].T / 500
+    for found, values in zip((x, y, z), (1 - expected[1], 2 + expected[0], 3 + expected[2]), strict=True):
+        assert np.allclose(found, values, rtol=1e-5, atol=1e-5, equal_nan=True)
+    _, wrench = bag.messages["/mocap/lab/force_1/wrench"][0]
+    fx, fy, fz = lab.forces.values[0, 0, :3]
+    assert np.allclose(triple(wrench.wrench.force), (-fy, fx, fz), atol=1e-4)
+    _, pose = bag.messages["/mocap/lab/Tool_1/pose"][0]
+    assert {cloud.header.frame_id, wrench.header.frame_id, pose.header.frame_id} == {"world"}
+
+
+def status(frame_id: str, rotation: tuple[float, ...], metres_per_unit: float) -> Message:
+    """Return a ``status_t`` whose frame is turned and moved."""
+    message = rtc3d.status_t()
+    message.utime, message.source, message.server = START_UTIME, "lab", "192.0.2.20:3020"
+    message.frame_id, message.metres_per_unit = frame_id, metres_per_unit
+    message.rotation_xyzw, message.translation_m = [*rotation], [1.0, 2.0, 3.0]
+    return lcm_channel("MOCAP", "lab", "status"), message.encode()
