@@ -1,8 +1,6 @@
 """What tests check of an error: its class, its fields, and the values in its text; not the sentence."""
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TypeVar
 
 import pytest
@@ -10,13 +8,15 @@ import pytest
 Error = TypeVar("Error", bound=BaseException)
 
 
-@contextmanager
-def raises(kind: type[Error], *values: object, **fields: object) -> Iterator[pytest.ExceptionInfo[Error]]:
-    """Check that an exception of this class comes with these fields, and that its text names these values."""
-    with pytest.raises(kind) as caught:
-        yield caught
-    assert {name: getattr(caught.value, name) for name in fields} == fields
-    assert names(str(caught.value), *values), f"{caught.value} does not name {values}"
+def raises(kind: type[Error], *values: object, **fields: object) -> pytest.RaisesExc[Error]:
+    """Expect an exception of this class with these fields, whose text names these values."""
+
+    def check(error: Error) -> bool:
+        assert {name: getattr(error, name) for name in fields} == fields
+        assert names(str(error), *values), f"{error} does not name {values}"
+        return True
+
+    return pytest.raises(kind, check=check)
 
 
 def names(text: str, *values: object) -> bool:

@@ -14,6 +14,7 @@ from gateway.errors import ClosedError, LinkError, PacketError, ReplyTimeoutErro
 from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
 from gateway.stream.state import StreamState
 from tests.support.clocks import settle
+from tests.support.errors import names, raises
 from tests.support.servers import error, markers_frame, ok, packet
 from tests.support.statuses import amounts
 from tests.support.vectors import STOP_RECORDING
@@ -64,7 +65,7 @@ async def test_commands_are_sent_one_at_a_time(silent: Lab) -> None:
 
 async def test_an_unanswered_command_times_out_and_its_late_reply_answers_no_other(silent: Lab) -> None:
     asked_s = now_s()
-    with pytest.raises(ReplyTimeoutError, match=r"did not answer Version 1\.0 within 2 s"):
+    with raises(ReplyTimeoutError, "Version 1.0", "2 s"):
         await silent.session.ask(Version())
     assert now_s() - asked_s == pytest.approx(2)
     assert silent.session.is_open
@@ -152,7 +153,8 @@ async def test_frames_in_another_byte_order_are_a_limitation(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send(markers_frame(1, (0.0, 0.0, 0.0), order="<"))
     assert lab.status.byte_order == "little"
-    assert lab.status.limitations == ["the server sends little-endian frames, not the byte order agreed"]
+    [limitation] = lab.status.limitations
+    assert names(limitation, "little-endian")
 
 
 async def test_the_control_of_a_recording_goes_out_at_once(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,7 +222,7 @@ async def test_a_file_that_takes_long_is_no_silence(lab: Lab) -> None:
     async with lab.monitored() as monitoring:
         await send_slowly(lab, 2.9)  # the server is silent after 3 s
         assert not monitoring.done()
-        with pytest.raises(SilenceError, match="no frame from"):
+        with raises(SilenceError, "no frame"):
             await monitoring
 
 
@@ -263,9 +265,9 @@ async def test_packets_above_the_configured_limits_end_the_session(packet_type: 
 @pytest.mark.parametrize(
     ("end", "reason"),
     [
-        (lambda lab: lab.connection.end(), "the connection to 192.0.2.20:3020 was closed by the server"),
-        (lambda lab: lab.connection.end(OSError("reset by peer")), "192.0.2.20:3020 broke: reset by peer"),
-        (lambda lab: asyncio.create_task(lab.session.close()), "closed by the gateway"),
+        (lambda lab: lab.connection.end(), "by the server"),
+        (lambda lab: lab.connection.end(OSError("reset by peer")), "reset by peer"),
+        (lambda lab: asyncio.create_task(lab.session.close()), "by the gateway"),
     ],
     ids=["closed by the server", "broken", "closed by the gateway"],
 )
@@ -283,7 +285,7 @@ async def test_the_end_is_raised_by_every_waiting_call_at_once(
     await settle()
     for task in tasks:
         assert task.done()
-        assert reason in str(task.exception())
+        assert names(str(task.exception()), "192.0.2.20:3020", reason)
     assert (now_s(), silent.session.is_open) == (began_s, False)
     if ending is not None:
         await ending
@@ -297,9 +299,9 @@ async def test_the_first_error_wins(lab: Lab) -> None:
     lab.session.data_received(NO_DATA)
     assert lab.status.state is not StreamState.NO_MEASUREMENT
     for late_call in (lab.session.monitor(lab.check_silence), lab.session.ask(Version())):
-        with pytest.raises(ClosedError, match="this is not an RTC3D server"):
+        with raises(ClosedError, "RTC3D"):
             await late_call
-    with pytest.raises(ClosedError, match="this is not an RTC3D server"):
+    with raises(ClosedError, "RTC3D"):
         lab.session.control_recording(start=True)
     assert not lab.connection.is_open
 
@@ -336,7 +338,7 @@ async def test_a_connection_that_is_lost_while_closing_does_not_change_the_reaso
     lab.connection.end(OSError("Connection reset by peer"))
     await closing
     assert now_s() == began_s  # it does not wait for the rest of the half second
-    with pytest.raises(ClosedError, match="closed by the gateway"):
+    with raises(ClosedError, "by the gateway"):
         await lab.session.ask(Version())
 
 
@@ -354,5 +356,5 @@ async def test_a_connection_lost_before_connect_returns_ends_the_session(lab: La
     lab.connection.end()
     await connecting
     await settle()
-    with pytest.raises(LinkError, match="was closed by the server"):
+    with raises(LinkError, "by the server"):
         await lab.session.ask(Version())

@@ -9,6 +9,7 @@ from gateway.errors import SilenceError
 from gateway.rtc3d.commands import StopStreaming, Version
 from gateway.stream.state import StreamState
 from tests.support.clocks import stop_process
+from tests.support.errors import raises
 from tests.support.servers import ok, packet
 from tests.unit.stream.scripted_server import BROKEN_FRAME, obliging, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, now_s
@@ -27,7 +28,7 @@ async def test_silence_while_a_measurement_runs_ends_the_session(
 ) -> None:
     caplog.set_level(logging.INFO)
     since_s = now_s()
-    with pytest.raises(SilenceError, match=r"no frame from 192\.0\.2\.20:3020 for 3 s although"):
+    with raises(SilenceError, "no frame", "192.0.2.20:3020", "3 s"):
         await lab.session.monitor(lab.check_silence)
     assert now_s() - since_s == pytest.approx(3)
     assert lab.status.state is StreamState.STALLED
@@ -41,7 +42,7 @@ async def test_frames_that_are_all_rejected_are_not_called_silence(lab: Lab, bef
     asyncio.get_running_loop().call_later(2, lab.connection.send, before + BROKEN_FRAME)
     if before:
         asyncio.get_running_loop().call_later(4, lab.connection.send, BROKEN_FRAME)
-    with pytest.raises(SilenceError, match=r"all frames from 192\.0\.2\.20:3020 are rejected: component"):
+    with raises(SilenceError, "rejected", "192.0.2.20:3020", "component"):
         await lab.session.monitor(lab.check_silence)
 
 
@@ -101,7 +102,7 @@ async def test_a_stop_of_this_process_is_not_the_servers_silence(lab: Lab, stop_
         asyncio.get_running_loop().call_later(0.05, lab.connection.send_frames, 2, 3)
         await asyncio.sleep(2.9)
         assert (monitoring.done(), lab.numbers) == (False, [1, 2, 3])
-        with pytest.raises(SilenceError, match="no frame from"):  # what is silent then is the server
+        with raises(SilenceError, "no frame"):  # what is silent then is the server
             await monitoring
 
 

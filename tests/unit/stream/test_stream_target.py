@@ -13,6 +13,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.stream.state import StreamState
 from gateway.stream.stream_requests import DEMAND_POLL_S, MAX_RESUMES
 from tests.support.clocks import settle
+from tests.support.errors import names, raises
 from tests.unit.stream.scripted_server import obliging, refusing, silent_to
 from tests.unit.stream.session_lab import Lab
 
@@ -74,11 +75,9 @@ async def test_an_on_demand_stream_stops_once_without_subscribers_and_resumes_wi
     lab.has_subscribers = False
     await asyncio.sleep(60)
     assert requests(lab) == [STOP, START, STOP]
-    assert [record.getMessage() for record in records(caplog)] == [
-        "lab (3d): no subscribers; the stream is stopped",
-        "lab (3d): a subscriber appeared; frames are requested again",
-        "lab (3d): no subscribers; the stream is stopped",
-    ]
+    messages = [record.getMessage() for record in records(caplog)]
+    said = [names(each, "lab (3d)", "stopped") for each in messages]
+    assert said == [True, False, True]
 
 
 async def test_a_short_absence_of_subscribers_does_not_stop_an_on_demand_stream() -> None:
@@ -105,10 +104,10 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
     assert lab.status.rate == "AllFrames"
     assert [record.levelname for record in records(caplog)] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
     first, second, third, last = [record.getMessage() for record in records(caplog)]
-    assert first == "lab (3d): frames arrive 300 ms late; asked the server for FrequencyDivisor:2"
-    assert second.endswith("asked the server for FrequencyDivisor:4 (failure 2 in a row)")
-    assert third == "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2"
-    assert last.startswith("lab (3d): frames arrive in time again; asked the server for AllFrames, after ")
+    assert names(first, "lab (3d)", "300 ms late", "FrequencyDivisor:2")
+    assert names(second, "lab (3d)", "FrequencyDivisor:4", "failure 2")
+    assert names(third, "lab (3d)", "in time", "FrequencyDivisor:2")
+    assert names(last, "lab (3d)", "in time", "AllFrames")
 
 
 async def test_a_reduced_rate_is_requested_again_with_other_components() -> None:
@@ -133,8 +132,8 @@ async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCapt
     assert requests(lab) == []
     assert [record.levelname for record in records(caplog)] == ["WARNING", "INFO"]
     late, in_time = [record.getMessage() for record in records(caplog)]
-    assert late == "lab (3d): frames arrive 300 ms late"
-    assert in_time.startswith("lab (3d): frames arrive in time again, after ")
+    assert names(late, "lab (3d)", "300 ms late")
+    assert names(in_time, "lab (3d)", "in time")
 
 
 async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:
@@ -142,11 +141,10 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
     lab = await started(adapt_rate=True)
     for halvings, lag_s in ((1, 0.05), (2, 0.051), (3, 2.0)):
         await change(lab, halvings, lag_s)
-    assert [record.getMessage() for record in records(caplog)] == [
-        "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2",
-        "lab (3d): frames arrive 51 ms late; asked the server for FrequencyDivisor:4",
-        "lab (3d): frames arrive 2000 ms late; asked the server for FrequencyDivisor:8 (failure 2 in a row)",
-    ]
+    in_time, late, later = [record.getMessage() for record in records(caplog)]
+    assert names(in_time, "in time", "FrequencyDivisor:2")
+    assert names(late, "51 ms late", "FrequencyDivisor:4")
+    assert names(later, "2000 ms late", "FrequencyDivisor:8", "failure 2")
 
 
 async def test_a_request_for_the_default_rate_is_logged_as_such(caplog: pytest.LogCaptureFixture) -> None:
@@ -154,7 +152,7 @@ async def test_a_request_for_the_default_rate_is_logged_as_such(caplog: pytest.L
     lab.server.answer = refusing("StreamFrames")
     lab.status.rate = ""
     await change(lab, 1, 0.3)
-    assert "lab (3d): frames arrive 300 ms late; asked the server for its default rate" in caplog.messages
+    assert any(names(each, "lab (3d)", "300 ms late", "default rate") for each in caplog.messages)
 
 
 async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:
@@ -164,9 +162,9 @@ async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.Lo
     await change(lab, 1)
     lab.server.connection.end()
     await settle()
-    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
-        ("DEBUG", "lab (3d): the connection to 192.0.2.20:3020 was closed by the server")
-    ]
+    [record] = caplog.records
+    assert record.levelname == "DEBUG"
+    assert names(record.getMessage(), "lab (3d)", "192.0.2.20:3020")
     assert lab.status.rate == "AllFrames"
 
 
@@ -246,7 +244,7 @@ async def test_a_refused_stop_is_repeated_ever_later_and_not_once_frames_are_wan
 async def test_a_defect_ends_the_session() -> None:
     lab = await started(on_demand=True)
     lab.has_defect = True
-    with pytest.raises(DefectError, match="defect in the gateway: ZeroDivisionError: "):
+    with raises(DefectError, "ZeroDivisionError"):
         await lab.session.monitor(lab.check_silence)
 
 

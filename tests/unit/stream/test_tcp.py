@@ -5,6 +5,7 @@ Connections over real sockets; each error says what happened and what to check.
 
 import asyncio
 import errno
+import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from gateway.errors import ConnectError
 from gateway.stream import tcp
 from gateway.stream.process_clock import RunningTimeout
 from gateway.stream.tcp import MAX_ADDRESSES, is_address, look_up, open_connection, set_socket_options
+from tests.support.errors import names
 from tests.support.networks import free_port
 from tests.unit.stream.conftest import Resolver
 
@@ -102,9 +104,6 @@ def test_the_end_of_a_loop_does_not_wait_for_a_look_up(resolver: Resolver) -> No
     assert not resolver.answers.is_set()
 
 
-CHECK_DNS = "check the name server (DNS), or use an IP address in sources.host"
-
-
 @contextmanager
 def full_server() -> Iterator[int]:
     """Listen on a port of 127.0.0.1 that answers no further connection; yield the port."""
@@ -148,49 +147,38 @@ def test_the_protocol_gets_the_connection_and_the_transport_is_returned() -> Non
 
 def test_the_error_of_a_port_without_a_server() -> None:
     port = free_port()
-    assert error_of(source(host="127.0.0.1", port=port)) == (
-        f"connection refused by 127.0.0.1:{port}; is the RT server running, and is this its port?"
-    )
+    assert names(error_of(source(host="127.0.0.1", port=port)), "refused", f"127.0.0.1:{port}")
 
 
 @pytest.mark.parametrize(
-    ("raised", "text"),
+    ("raised", "value"),
     [
-        (
-            socket.gaierror(socket.EAI_NONAME, "Name or service not known"),
-            "is not known (Name or service not known); check sources.host and DNS",
-        ),
-        (
-            OSError(errno.EMFILE, "Too many open files"),
-            f"cannot be resolved: Too many open files; {CHECK_DNS}",
-        ),
-        (None, f"was not resolved within 0.1 s; {CHECK_DNS}"),
+        (socket.gaierror(socket.EAI_NONAME, "Name or service not known"), "Name or service not known"),
+        (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
+        (None, "0.1 s"),
     ],
 )
 def test_the_error_of_a_name_that_cannot_be_resolved(
-    resolver: Resolver, raised: OSError | None, text: str
+    resolver: Resolver, raised: OSError | None, value: str
 ) -> None:
     resolver.error = raised
     if raised is None:
         resolver.answers.clear()
-    assert error_of(source(host="labb", port=3020, connect_timeout_s=0.1)) == f"host name 'labb' {text}"
+    text = error_of(source(host="labb", port=3020, connect_timeout_s=0.1))
+    assert names(text, "'labb'", value, "DNS")
 
 
 @pytest.mark.netns
 def test_the_error_of_a_server_that_does_not_answer() -> None:
     with full_server() as port:
-        assert error_of(source(host="127.0.0.1", port=port, connect_timeout_s=0.1)) == (
-            f"no answer from 127.0.0.1:{port} within 0.1 s; "
-            "is the computer on and reachable, and its firewall open for this port?"
-        )
+        text = error_of(source(host="127.0.0.1", port=port, connect_timeout_s=0.1))
+        assert names(text, "no answer", f"127.0.0.1:{port}", "0.1 s")
 
 
 @pytest.mark.netns
 def test_the_error_of_any_other_failure_of_the_network() -> None:
-    assert error_of(source(host="192.0.2.20", port=3020)) == (
-        "no connection to 192.0.2.20:3020: Network is unreachable; check address, cable and "
-        "routing, and whether a firewall rejects the connection"
-    )
+    text = error_of(source(host="192.0.2.20", port=3020))
+    assert names(text, "192.0.2.20:3020", os.strerror(errno.ENETUNREACH))
 
 
 async def connected_address(port: int, timeout_s: float) -> str:
