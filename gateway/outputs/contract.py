@@ -289,6 +289,10 @@ class Output(ABC):
     def health(self) -> OutputHealth:
         """Return whether the output can send, and if not, why and what to do."""
 
+    def warnings(self) -> Sequence[str]:
+        """Return what works and yet needs attention, a sentence each: the gateway is degraded."""
+        return ()
+
     @abstractmethod
     def close(self) -> None:
         """Close everything. Called in a thread; safe to call more than once and in any state."""

@@ -86,6 +86,7 @@ class GuardedOutput(Output):
     announce_file = _guarded(Output.announce_file, None)
     serve_queries = _guarded(Output.serve_queries, None)
     maintain = _guarded(Output.maintain, None, is_repeated=True)
+    warnings = _guarded(Output.warnings, (), is_repeated=True)
     topic_names = _guarded(Output.topic_names, {}, is_repeated=True)
     oldest_recorded = _guarded(Output.oldest_recorded, None, is_repeated=True)
 

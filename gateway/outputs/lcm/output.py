@@ -5,7 +5,7 @@ import functools
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Final
 
@@ -80,6 +80,10 @@ class LcmOutput(Output):
         """Return whether LCM is open and the last message was sent."""
         return OutputHealth(not self._sender.problem, self._sender.problem)
 
+    def warnings(self) -> Sequence[str]:
+        """Return which sources other gateways publish, too."""
+        return () if self._requests is None else self._requests.others.warnings
+
     def maintain(self) -> None:
         """Retry to open LCM if it is time, and publish parameters again that are due."""
         self._sender.maintain()
@@ -107,6 +111,8 @@ class LcmOutput(Output):
     def withdraw(self, source: str) -> None:
         """Stop publishing its parameters. The service no longer serves requests about it."""
         self._publications.pop(source, None)
+        if self._requests is not None:
+            self._requests.others.forget(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML as ``parameters_t``, now and every REPEAT_S. LCM keeps the order of messages.

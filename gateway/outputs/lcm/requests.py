@@ -8,6 +8,8 @@ import asyncio
 import contextlib
 import functools
 import logging
+import math
+import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
@@ -28,6 +30,7 @@ from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, STOP, QuerySer
 from gateway.outputs.lcm.receiver import MAX_PENDING, LcmReceiver
 from gateway.outputs.lcm.sender import LcmSender, LcmThreadSender, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.other_gateways import OtherGateways
 from gateway.outputs.query_admission import QueryAdmission, QueryDefects, QueryLimits, Refusal
 from gateway.workers import WorkerThread
 
@@ -46,6 +49,9 @@ _REFILL: Final = "_REFILL"
 
 _REFILL_BURST_S: Final = 0.002
 """How far messages that are sent again may be ahead of their pace."""
+
+PRESENCE_S: Final = 5.0
+"""How often a gateway shows itself to others on the URL of requests."""
 
 MAX_REMEMBERED: Final = 64
 """How many commands are remembered with their results, for requests that are repeated."""
@@ -118,9 +124,15 @@ class LcmRequests:
         self.admission = QueryAdmission(
             QueryLimits.of("lcm", "max_queries_per_source_per_s", settings, MAX_PENDING)
         )
+        self.others = OtherGateways("lcm", expires_s=3 * PRESENCE_S)
+        """Other gateways that answer requests about the same sources."""
+        self._id = secrets.token_hex(8)
+        self._sources: dict[str, None] = {}  # those of which requests are answered
+        self._shown_s = -math.inf
         self._tasks: set[asyncio.Task[None]] = set()
         self._remembered: OrderedDict[tuple[Any, ...], asyncio.Task[ReplyContent]] = OrderedDict()
         self._defects = QueryDefects(logger)
+        self._is_receiving = settings.queries
         self._refill_bytes_per_s = settings.max_reply_bytes_per_s
         self._is_refilling = False
 
@@ -129,11 +141,28 @@ class LcmRequests:
         for kind in self._kinds:
             channel = lcm_channel(self._prefix, source, f"{kind.name}_REQUEST")
             self.receiver.add(channel, functools.partial(self._take, kind, source))
+        self._sources[source] = None
+        self.receiver.add(self._presence_channel(source), functools.partial(self._take_presence, source))
 
     def maintain(self) -> None:
-        """See LcmSender."""
+        """See LcmSender. Show this gateway to others that have sources of the same names."""
         if self._own_sender is not None:
             self._own_sender.maintain()
+        self.others.check()
+        now_s = time.monotonic()
+        if now_s - self._shown_s >= PRESENCE_S and self._is_receiving:
+            self._shown_s = now_s
+            for source in filter(self._service.serves, self._sources):
+                self._show_presence(source)
+
+    def _presence_channel(self, source: str) -> str:
+        return lcm_channel(self._prefix, source, "GATEWAY")
+
+    def _show_presence(self, source: str) -> None:
+        message = rtc3d.command_request_t()
+        message.requester = self._id
+        with contextlib.suppress(OutputError):  # replies cannot be sent either, which is counted then
+            self._sender.send(self._presence_channel(source), message.encode())
 
     async def close(self) -> None:
         """Stop receiving requests. Those in progress get no reply."""
@@ -164,6 +193,16 @@ class LcmRequests:
             return
         with contextlib.suppress(RuntimeError):  # the loop has just ended
             self._loop.call_soon_threadsafe(self._start_answer, kind, source, request)
+
+    def _take_presence(self, source: str, data: bytes) -> None:
+        """Note that another gateway answers requests about a source."""
+        if len(data) <= MAX_REQUEST_BYTES:
+            try:
+                gateway = str(rtc3d.command_request_t.decode(data).requester)
+            except Exception:  # noqa: BLE001 - lcm-gen's decoders raise anything
+                return
+            if gateway != self._id and self._service.serves(source):
+                self.others.seen(source, gateway)
 
     def _count_malformed(self, kind: RequestKind, source: str, data: bytes) -> None:
         self._losses[source].lost(

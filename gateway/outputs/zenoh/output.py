@@ -6,7 +6,7 @@ import functools
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
@@ -18,6 +18,7 @@ from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Answer, Output, OutputHealth, QueryService, ServerFile, ServerParameters
+from gateway.outputs.other_gateways import OtherGateways
 from gateway.outputs.zenoh.answers import ZenohAnswers
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.confirmation import LINK_LOST, SILENT_S, RouterConfirmation
@@ -61,6 +62,7 @@ class _Declared(NamedTuple):
     publisher: zenoh.Publisher
     history: zenoh.Queryable[None]
     history_token: zenoh.LivelinessToken
+    others: zenoh.Subscriber[None]
 
 
 class ZenohOutput(Output):
@@ -84,6 +86,7 @@ class ZenohOutput(Output):
         )
         self._confirmation = RouterConfirmation(self._holder)
         self._link = ZenohLink(lambda: self._holder.refusal)
+        self._others = OtherGateways(self.name)
         self._json = JsonConverter(settings.json_max_rate_hz)
         self._losses = self._json.losses
         self._sender = WorkerThread("zenoh-send")
@@ -178,6 +181,10 @@ class ZenohOutput(Output):
             if publisher in self._publishers:
                 self._publishers.remove(publisher)
 
+    def warnings(self) -> Sequence[str]:
+        """Return which sources other gateways publish, too. They have the same liveliness tokens."""
+        return self._others.warnings
+
     def health(self) -> OutputHealth:
         """Return whether messages can be sent, and whether the router of a client reads them."""
         health, silent_s = self._holder.health, self._confirmation.silent_s
@@ -191,6 +198,7 @@ class ZenohOutput(Output):
         """Log whether a client has its router, and check for subscribers. Zenoh itself reconnects."""
         self._holder.maintain()
         self._confirmation.check()
+        self._others.check()
         self._confirmation.count_unconfirmed(self._losses, "the Zenoh router")
         if self.session is not None:
             with self._lock:
@@ -233,6 +241,8 @@ class ZenohOutput(Output):
             self._parameters.pop(source, None)
             declared = self._declared.pop(source, None)
         if declared is not None:
+            declared.others.undeclare()
+            self._others.forget(source)
             declared.history_token.undeclare()
             declared.history.undeclare()
             declared.queryable.undeclare()
@@ -287,6 +297,14 @@ class ZenohOutput(Output):
             found = {} if newest is None else {parameters: Answer(newest.xml, XML, _facts(newest))}
             answers.reply(source, query, found)
 
+        own_id = str(session.info.zid())
+
+        def on_gateway(sample: zenoh.Sample) -> None:
+            gateway = str(sample.key_expr).split("/")[-3]
+            if gateway != own_id:
+                note = self._others.seen if sample.kind == zenoh.SampleKind.PUT else self._others.gone
+                note(source, gateway)
+
         on_query = in_zenoh_thread(functools.partial(answers.receive, source))
         return _Declared(
             session.declare_queryable(f"{key}/**", on_query),
@@ -298,6 +316,9 @@ class ZenohOutput(Output):
             ),
             session.declare_queryable(history, in_zenoh_thread(on_history)),
             session.liveliness().declare_token(history),
+            session.liveliness().declare_subscriber(
+                f"{parameters}/@adv/pub/*/uhlc/_", in_zenoh_thread(on_gateway), history=True
+            ),
         )
 
     def _call_in_loop(self, call: Callable[..., object], *arguments: Any) -> None:

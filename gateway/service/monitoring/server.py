@@ -116,7 +116,7 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
     """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem.
 
     ``process_problems`` are those of the whole process, see ProcessLimits. If something was lost in the last
-    minute, or frames are late, the gateway is degraded, which is still 200.
+    minute, frames are late, or an output has a warning, the gateway is degraded, which is still 200.
     """
     streams = [each for source in gateway.sources for each in _streams(source)]
     outputs = _outputs(gateway)
@@ -131,15 +131,16 @@ def health_page(gateway: Gateway, process_problems: Sequence[str] = ()) -> Page:
         for each in streams
         if each["lag_s"] >= _LATE_S and not each["problem"]
     ]
+    warnings = [text for output in gateway.outputs for text in output.warnings()]
     losses = [f"{route.name}: {text}" for route in routes if (text := last_minute_text(route.losses))]
     causes = []
     for route in routes:
         names = {"source": route.source, "stream": route.stream, "output": route.output}
         causes += [names | loss._asdict() | {"age_s": round(loss.age_s, 1)} for loss in route.losses]
     body = {
-        "status": "unhealthy" if problems else "degraded" if late or losses else "healthy",
+        "status": "unhealthy" if problems else "degraded" if late or warnings or losses else "healthy",
         "healthy": not problems,
-        "reasons": [*problems, *late, *losses],
+        "reasons": [*problems, *late, *warnings, *losses],
         "process": list(process_problems),
         "streams": streams,
         "outputs": outputs,
@@ -223,6 +224,7 @@ def status_lines(gateway: Gateway) -> list[str]:
             texts.append((stream.components, f"{stream.text}, {lost}" if lost else stream.text))
         lines.append(f"{source.name}: {streams_text(texts)}")
     lines += [f"{each['output']}: {each['problem']}" for each in _outputs(gateway) if each["problem"]]
+    lines += [text for output in gateway.outputs for text in output.warnings()]
     for route in _routes(gateway):
         if route.output and (text := last_minute_text(route.losses)):
             lines.append(f"{route.name}: {text}")

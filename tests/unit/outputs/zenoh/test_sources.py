@@ -12,6 +12,7 @@ import zenoh
 from gateway.errors import QueryError
 from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs import other_gateways
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -28,6 +29,33 @@ XML = b"<RT_Parameters/>"
 @pytest.fixture
 def lab(queried: QueriedLab) -> QueriedLab:
     return queried
+
+
+# Other gateways ------------------------------------------------------------------------------
+
+
+async def test_gateways_with_a_source_of_one_name_notice_each_other(
+    lab: QueriedLab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Subscribers get the messages of both, in any order. The tokens alive of both are the same."""
+    monkeypatch.setattr(other_gateways, "HOLD_S", 0.0)
+    assert lab.output.warnings() == []
+    other = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=lab.endpoint)))
+    other.serve_queries(lab.service)  # type: ignore[arg-type]  # it has the methods that are called
+    for name in ("hall", "lab"):
+        other.announce(name)
+    try:
+        other.start()
+        await wait_until_async(lambda: len(lab.output.warnings()) == len(other.warnings()) == 1)
+        other.withdraw("lab")
+        await wait_until_async(lambda: not lab.output.warnings())
+        assert other.warnings() == []
+        other.announce("lab")
+        await wait_until_async(lambda: len(lab.output.warnings()) == len(other.warnings()) == 1)
+    finally:
+        await other.stop_queries()
+        await asyncio.to_thread(other.close)
+    await wait_until_async(lambda: not lab.output.warnings())
 
 
 # Queries -------------------------------------------------------------------------------------

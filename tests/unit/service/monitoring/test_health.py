@@ -187,6 +187,15 @@ async def test_late_frames_degrade_the_gateway(lag_s: float, age_s: float, expec
     assert body["streams"][0]["lag_s"] == lag_s
 
 
+async def test_a_warning_of_an_output_degrades_the_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as that another gateway publishes a source of the same name."""
+    lab = lab_with(StreamState.STREAMING, 0.01)
+    monkeypatch.setattr(lab.output, "warnings", lambda: ["lab: another gateway"])
+    status, body = lab.health()
+    assert (status, body["status"], body["reasons"]) == (200, "degraded", ["lab: another gateway"])
+    assert "lab: another gateway" in status_lines(lab.gateway)
+
+
 async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:
     lab = lab_with(StreamState.STREAMING, 0.01)
     now_s = 1000.0
