@@ -162,21 +162,23 @@ class GatewayClient:
 
     def subscribe(
         self,
-        sources: Collection[str],
-        components: Collection[str] | None,
+        sources: Collection[str] | str,
+        components: Collection[str] | str | None,
         reception: Reception[Any, Any],
         *,
         complete: bool = False,
         last_s: float | None = None,
         patience_s: float | None = None,
     ) -> GatewaySubscriber:
-        """Subscribe to these sources (all, if empty) and components (None: all).
+        """Subscribe to these sources (all, if empty) and components (None: all), or to one of each.
 
         With ``complete``, the messages of each key come in the order of their numbers, and those that were
         missed come from the gateway's history. With ``last_s``, each key begins with the messages of so many
         seconds. What arrives waits for those, no longer than ``patience_s`` (None: as long as a gateway may
         need). The subscriber has a connection of its own. Raises QueryError if Zenoh does not open.
         """
+        sources = [sources] if isinstance(sources, str) else sources
+        components = [components] if isinstance(components, str) else components
         transport = _open(self._address)
         try:
             return close_at_end(

@@ -53,7 +53,7 @@ logger = logging.getLogger(__name__)
 
 def live(  # noqa: PLR0913 - each is an option of its own, by name
     *sources: str,
-    components: Collection[str] | None = None,
+    components: Collection[str] | str | None = None,
     join: bool = False,
     complete: bool = False,
     last_s: float | None = None,
@@ -72,17 +72,20 @@ def live(  # noqa: PLR0913 - each is an option of its own, by name
         for frame in live("lab", components=["3d"]):
             print(frame.markers["head"], frame.capture_time)
 
-    ``sources`` (names; none: all) and ``components`` (of 3d, 6d, analog, force, event; None: all) say what is
-    received. Without ``join``, each message is a frame. With it, each frame of the first component has
-    everything that the other components, and other sources, have had since the frame before. With
-    ``complete``, what was lost on the way comes from the gateway's history, in its order; ``last_s`` seconds
-    from before the first message come first.
+    ``sources`` (names; none: all) and ``components`` (of 3d, 6d, analog, force, event, or one of them; None:
+    all) say what is received. Without ``join``, each message is a frame. With it, each frame of the first
+    component has everything that the other components, and other sources, have had since the frame before.
+    With ``complete``, what was lost on the way comes from the gateway's history, in its order; ``last_s``
+    seconds from before the first message come first.
 
     Gateways on Zenoh are found by multicast, or at an endpoint (``connect``), such as tcp/192.0.2.5:7447, or
     as a configuration file of Zenoh says. With ``lcm`` or ``url``, they are received on LCM. ``prefix`` is
     what keys or channels begin with, if it is not the default. Raises SelectionError if there is no such
-    component.
+    component, or a source is not a name.
     """
+    if not all(isinstance(source, str) for source in sources):
+        raise SelectionError("name each source as an argument of its own: live('lab', 'stage')")
+    components = [components] if isinstance(components, str) else components
     unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
     if unknown:
         raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")

@@ -60,7 +60,7 @@ USES: Final = {
                 END
     """,
     "a generator in a global": """
-        frames = iter(live("lab", join=True, **where))
+        frames = iter(live("lab", components="3d", join=True, **where))
         next(frames)
         ready()
         for _ in range(1):
@@ -125,7 +125,7 @@ USES: Final = {
     "messages": """
         has_come = threading.Event()
         client = GatewayClient(address)
-        subscriber = client.subscribe(["lab"], ["3d"], Messages(lambda *_: has_come.set()))
+        subscriber = client.subscribe("lab", "3d", Messages(lambda *_: has_come.set()))
         has_come.wait()
         ready()
         for _ in range(1):

@@ -435,9 +435,16 @@ def test_the_newest_parameters_are_kept_when_the_clock_was_set_back(num_before: 
         assert data.frames(1)[0].markers.labels == (f"m{version}",)
 
 
-def test_an_unknown_component_is_refused() -> None:
+@pytest.mark.parametrize("components", [["4d"], "4d", "3", ["3d", "d"]])
+def test_an_unknown_component_is_refused(components: Any) -> None:
     with pytest.raises(SelectionError, match="choose from 3d"):
-        live("lab", components=["4d"])
+        live("lab", components=components)
+
+
+def test_a_list_of_sources_is_refused_before_anything_is_opened() -> None:
+    names: Any = ["lab", "stage"]
+    with pytest.raises(SelectionError):
+        live(names)
 
 
 def test_values_are_numpy_arrays_without_a_copy() -> None:
