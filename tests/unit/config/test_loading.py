@@ -122,6 +122,7 @@ MISTAKES = [
     ("\u00a0lcm: {}", "4:1: found the character U+00A0"),
     ("lcm:\n  enabled: true\n \u00a0url: memq://", "6:2: found the character U+00A0"),
     ("lcm: {\u00a0enabled: true}", "4:7: lcm: found the character U+00A0"),
+    ("lcm:\u00a0\n  enabled: true", "4:5: found the character U+00A0"),
     ("   lcm: {}", "4:4: this line does not fit"),
     ("      port: 3030", "4:11: this line does not fit"),
     ("lcm:\n    enabled: true\n   url: memq://", "6:4: this line does not fit"),
