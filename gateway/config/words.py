@@ -41,8 +41,9 @@ def join_or(words: Iterable[str]) -> str:
 
 def spelling_hint(word: object, known: Iterable[str]) -> str:
     """Return " (did you mean 'x'?)" if ``word`` is similar to ``x``, a member of ``known``; else ""."""
-    near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+    by_lower = {each.lower(): each for each in known}
+    near = difflib.get_close_matches(str(word).lower()[:60], by_lower, n=1)
+    return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""
 
 
 MASK: Final = "***"

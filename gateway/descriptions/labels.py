@@ -171,6 +171,20 @@ class EventText(NamedTuple):
         return "; ".join(f"{name}: {value}" for name, value in self.values)
 
 
+def num_repeated_labels(component: ComponentType, parameters: Parameters) -> int:
+    """Return how many items have the label of one before them, so that ``describe`` gives them a number."""
+    given: Iterable[str] = ()
+    match component:
+        case ComponentType.MARKERS | ComponentType.TOOLS:
+            given = described_labels(parameters, component)
+        case ComponentType.ANALOG:
+            given = (channel.label for channel in parameters.analog.channels) if parameters.analog else ()
+        case ComponentType.FORCE:
+            given = (plate.label for plate in parameters.force.plates) if parameters.force else ()
+    labels = [label.strip() for label in given if label.strip()]
+    return len(labels) - len(set(labels))
+
+
 def event_text(parameters: Parameters, item: Any) -> EventText:
     """Return the texts of one event, an item with the fields of LONG_EVENT."""
     number = int(item["id"])

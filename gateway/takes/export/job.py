@@ -215,6 +215,9 @@ class ExportJob:
             progress=lambda done, total: self.progress(f"reading {self.take.name}", done, total),
             spool_folder=self.out.parent,
         )
+        for source in take.sources.values():
+            if source.is_cut_off:
+                self.note(f"INCOMPLETE: the recording of {source.name} was cut off, so its end is missing")
         if take.num_damaged:
             places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"
             self.note(f"the take is damaged at {places}", amount=f"{take.damaged_bytes} bytes")
@@ -233,6 +236,7 @@ class ExportJob:
                 )
         self.note_malformed(take)
         self._note_left_out(take)
+        self._note_labels(take)
         if components:
             self.progress(f"arranging the frames of {self.take.name}", 0, 0)
         return take
@@ -249,6 +253,23 @@ class ExportJob:
             left_out += [what for key, what in chosen.lacks.items() if key in recorded]
             if left_out:
                 self.note(f"left out of {source.name}: {', '.join(left_out)}")
+
+    def _note_labels(self, take: "Take") -> None:
+        """Report labels that several items have: each but the first gets a number."""
+        from gateway.descriptions.labels import num_repeated_labels  # noqa: PLC0415 - it imports numpy
+
+        for source in take.sources.values():
+            for key in source.recorded.intersection(self.chosen_format.components):
+                found = (
+                    num_repeated_labels(COMPONENTS_BY_KEY[key], each.parameters) for each in source.parameters
+                )
+                number = max(found, default=0)
+                if number:
+                    self.note(
+                        f"{_NOUNS[key]} of {source.name} with the label of another one got a number",
+                        "",
+                        number,
+                    )
 
     def note_malformed(self, take: "Take") -> None:
         """Report messages that could not be read."""

@@ -7,7 +7,8 @@ from typing import Final
 from gateway.descriptions.labels import fitting_labels
 from gateway.takes.export.job import ExportJob
 
-NOT_IN_LABELS: Final = re.compile(r"[^\w.:+-]+")
+NOT_IN_LABELS: Final = re.compile(r"[^\w.:-]+")
+"""OpenSim forbids ``* + space tab newline / \\`` in names."""
 _MAX_LABEL_BYTES: Final = 100
 _TIME: Final = "time"
 """The label of the first column, which no other may have."""

@@ -5,11 +5,15 @@ from typing import Final
 
 import numpy as np
 
+from gateway.config.words import spelling_hint
 from gateway.descriptions.labels import Description, common, describe, event_labels
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array
+
+_MAX_SHOWN: Final = 20
+"""How many labels an error lists."""
 
 _QUALITY: Final = frozenset({"reliability", "error"})
 """The fields of items that are not their position, orientation, force or voltage."""
@@ -56,8 +60,10 @@ class ItemValues(ABC):
         try:
             place = self.labels.index(label)
         except ValueError:
+            shown = [*self.labels[:_MAX_SHOWN], *(["…"] if len(self.labels) > _MAX_SHOWN else [])]
+            hint = spelling_hint(label, self.labels)
             raise KeyError(
-                f"{self.component.key} has no {label!r}; it has {', '.join(self.labels)}"
+                f"{self.component.key} has no {label!r}{hint}; it has {', '.join(shown)}"
             ) from None
         names = self.items.dtype.names
         if not names:

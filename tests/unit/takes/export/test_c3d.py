@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gateway.descriptions.labels import EventText
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
     AnalogChannel,
@@ -27,6 +28,7 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes.export.c3d import _context_of
 from gateway.takes.export.job import ExportJob, export_take
 from tests.support.takes import (
     SERVER_START_US,
@@ -367,3 +369,25 @@ def test_a_plate_without_corners_is_reported(tmp_path: Path) -> None:
     found, [note] = export_c3d(tmp_path, plate_messages(Plate("1", "left"), np.ones((5, 2)), np.ones((5, 6))))
     assert note == "force plate 1 (left) left out: its parameters do not give the corners of a rectangle"
     assert found.analog.shape == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("label", "values", "context"),
+    [
+        ("Foot Strike", (("Side", "left"),), "Left"),
+        ("Right Foot Off", (), "Right"),
+        ("Left and Right", (), "General"),
+        ("Left Foot Off", (("Side", "RIGHT"),), "Right"),
+        ("Foot Off", (("From", "Left"), ("To", "Right")), "General"),
+        ("Left Foot Off", (("From", "Left"), ("To", "Right")), "Left"),
+        ("Leftover", (), "General"),
+        ("Left", (("Context", "Right"),), "Right"),
+        ("Left", ((" CONTEXT ", "Invalid"),), "Invalid"),
+        ("Left", (("Context", ""),), "Left"),
+    ],
+)
+def test_the_side_of_an_event_is_clear_or_general(
+    label: str, values: tuple[tuple[str, str], ...], context: str
+) -> None:
+    """A text with both sides has none, and a parameter decides before the label."""
+    assert _context_of(EventText(label, values)) == context

@@ -316,3 +316,12 @@ def test_messages_are_in_the_order_of_time(name: str, tmp_path: Path) -> None:
     assert summary is not None
     chunks = summary.chunk_indexes
     assert all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))
+
+
+@pytest.mark.parametrize("name", [".c3d", ".trc", ".csv", ".parquet", ".mcap", "opensim", "bids", "ros2"])
+def test_labels_that_several_markers_have_are_reported(name: str, tmp_path: Path) -> None:
+    messages = [exported.labelled("a", "b", "a", "a", ""), markers(5)]
+    job = job_for(name, write_take(tmp_path / "take.lcmlog", messages), tmp_path / "out")
+    job.details = {"subject": "01"}
+    export_take(job)
+    assert [note.amount for note in job.notes if "the label of another one" in note.what] == ["2"]

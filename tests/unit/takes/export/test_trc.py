@@ -12,7 +12,7 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
-from tests.support.takes import frame, parameters, scene_messages
+from tests.support.takes import frame, markers, parameters, scene_messages
 from tests.unit.takes.export.exported import NAN, export_messages, labelled, notes_of
 
 MARKERS = tuple(Marker(str(number), f"m{number}") for number in range(4))
@@ -120,3 +120,9 @@ def test_a_unit_cannot_break_the_head(tmp_path: Path) -> None:
     messages = [labelled("a", unit="m\tm"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)])]
     export_messages(tmp_path, messages, "walk.trc")
     assert (tmp_path / "walk.trc").read_text().splitlines()[2].split("\t")[3:6] == ["1", "m_m", "100"]
+
+
+@pytest.mark.parametrize("character", [*"*+/\\ "])
+def test_labels_have_no_character_that_opensim_forbids(tmp_path: Path, character: str) -> None:
+    export_messages(tmp_path, [labelled(f"a{character}b"), markers(1)], "out.trc")
+    assert read_trc(tmp_path / "out.trc").labels == ["a_b"]

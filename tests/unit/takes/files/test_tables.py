@@ -12,6 +12,8 @@ from gateway.takes import open_take
 from gateway.takes.export.job import ExportJob, export_take
 from gateway.takes.files.take import TakeSource
 from tests.support.documents import ROOT
+from tests.support.takes import markers, write_take
+from tests.unit.takes.export.exported import labelled
 
 WALK = ROOT / "examples/walk.lcmlog"
 
@@ -76,3 +78,15 @@ def test_without_the_package_the_error_says_what_to_install(
         walk.markers.to_pandas()
     with pytest.raises(TakeError, match=r"xarray is not installed, .* install it: pip install xarray"):
         walk.markers.to_xarray()
+
+
+def test_a_label_that_does_not_exist_has_a_hint_at_its_spelling(tmp_path: Path) -> None:
+    """The error of a take with hundreds of labels stays short."""
+    names = [f"M{number}" for number in range(200)]
+    messages = [labelled("LASI", *names), markers(201)]
+    found = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"].markers
+    assert found is not None
+    with pytest.raises(KeyError) as caught:
+        found["lasj"]
+    assert "'LASI'" in str(caught.value)
+    assert len(str(caught.value)) < 300
