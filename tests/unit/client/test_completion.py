@@ -380,6 +380,7 @@ def test_when_a_second_gateway_has_ended_gaps_are_filled_again() -> None:
         other.arrive(other.publish())
     assert network.completion.problem
     network._utime = other._utime
+    network.arrive(network.publish())
     network.now_s += TWO_GATEWAYS_S
     network.arrive(network.publish())
     assert not network.completion.problem
@@ -694,4 +695,15 @@ def test_if_the_last_seconds_take_too_long_their_end_is_there_and_no_gap_follows
     [begin] = [after for before, after in itertools.pairwise(numbers) if after != before + 1]
     assert 100 < 1000 - begin < 300
     assert numbers[-1] == 1000
+    assert network.check.num_lost == 0
+
+
+def test_a_past_that_stops_coming_counts_as_lost_for_nobody() -> None:
+    """A display shows what is live then; the rest of the past was before it began."""
+    network = Network(completeness=DISPLAY)
+    network.arrives(20)
+    network.ask(2)
+    assert network.numbers == [15, 16]
+    network.completion.expire(network.now_s + 1.0)
+    assert network.numbers == [15, 16, 20]
     assert network.check.num_lost == 0
