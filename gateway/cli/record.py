@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _TICK_S: Final = 0.1
 
 _REFILL_S: Final = 5.0
-"""How long the end waits for what is missing."""
+"""How long the end waits for what is missing, while no key becomes complete."""
 
 
 @options.with_options
@@ -102,9 +102,11 @@ def record(
 def _refill(recording: "TakeRecording", progress: "RecordProgress") -> None:
     """Request what is missing until now."""
     if (refill := recording.refill) is not None:
-        end_s = time.monotonic() + _REFILL_S
         refill.end()
-        while refill.num_incomplete and time.monotonic() < end_s:
+        least, end_s = refill.num_incomplete, time.monotonic() + _REFILL_S
+        while (num_incomplete := refill.num_incomplete) and time.monotonic() < end_s:
+            if num_incomplete < least:
+                least, end_s = num_incomplete, time.monotonic() + _REFILL_S
             time.sleep(_TICK_S)
             progress.tick()
         time.sleep(_TICK_S)  # an answer can overtake the parameters that describe its messages
