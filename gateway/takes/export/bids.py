@@ -59,6 +59,8 @@ _FIELDS: Final = {
 
 _TYPES: Final = ("ACCEL", "ANGACCEL", "GYRO", "JNTANG", "LATENCY", "MAGN", "MISC", "ORNT", "POS", "VEL")
 _MAX_NAME_BYTES: Final = 100
+_MAX_VALIDATED: Final = 1000
+"""The validator compares the first 1000 rows of channels.tsv only, unless it is told to read all."""
 _NUM_FORCES: Final = 3
 _BLOCK_VALUES: Final = 50_000  # values that become text at once: few MB, which the caches of a CPU hold
 
@@ -165,6 +167,9 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
     note_grid(job, measurement, path.name)
     note_missing(job, path, measurement, 0, grid.num_rows)
     channels = _channels(job, measurement, conversions)
+    if len(channels) > _MAX_VALIDATED:
+        what = f"more than {_MAX_VALIDATED} columns: call the validator with --max-rows -1"
+        job.note(what, path.name, len(channels))
     write_table(job, data_set.path(recording.label, run, "channels.tsv"), _Channel._fields, channels)
     sidecar = _sidecar(data_set, recording, channels)
     write_json(job, data_set.path(recording.label, run, "motion.json"), sidecar)

@@ -415,3 +415,10 @@ def test_tables_of_spreadsheets_get_further_rows(tmp_path: Path) -> None:
 def test_a_take_without_samples_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(TakeError, match="has no markers, tools, analog channels or forces, and --bids holds"):
         export(tmp_path, [frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])])
+
+
+@pytest.mark.parametrize("count", [250, 251])
+def test_more_columns_than_the_validator_reads_are_reported(tmp_path: Path, count: int) -> None:
+    job = export(tmp_path, [markers(count)])
+    amounts = [note.amount for note in job.notes if "--max-rows" in note.what]
+    assert amounts == ([str(4 * count)] if count > 250 else [])

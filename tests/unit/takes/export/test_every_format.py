@@ -33,6 +33,7 @@ from tests.unit.takes.export.read_mcap import read_mcap
 from tests.unit.takes.export.test_opensim import read_storage
 from tests.unit.takes.export.test_rosbag import Bag
 from tests.unit.takes.export.test_trc import read_trc
+from tests.unit.takes.files.test_take import recorded
 
 NAMES: Final = [*FORMATS, *CHOSEN_FORMATS]
 
@@ -325,3 +326,11 @@ def test_labels_that_several_markers_have_are_reported(name: str, tmp_path: Path
     job.details = {"subject": "01"}
     export_take(job)
     assert [note.amount for note in job.notes if "the label of another one" in note.what] == ["2"]
+
+
+@pytest.mark.parametrize("has_end", [True, False])
+def test_a_take_that_was_cut_off_is_reported_first(has_end: bool, tmp_path: Path) -> None:
+    take = recorded(tmp_path, "a", 0, has_end=has_end)
+    job = job_for(".csv", take, tmp_path / "out")
+    export_take(job)
+    assert job.notes[0].what.startswith("INCOMPLETE") == (not has_end)
