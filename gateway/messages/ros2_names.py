@@ -5,11 +5,11 @@ underscore at the beginning. (A part with a leading underscore is hidden from ``
 """
 
 import re
-import unicodedata
 from collections.abc import Sequence
 from typing import Final
 
 from gateway.messages.topics import unique_name
+from gateway.messages.transliteration import without_accents
 
 DEFAULT_NAMESPACE: Final = "mocap"
 
@@ -29,10 +29,9 @@ ROS accepts topics of at most 247 characters.
 def ros_name(text: str, noun: str) -> str:
     """Return ``text`` as a part of a topic; ``noun`` begins it if it has no letter at its beginning.
 
-    "Left Foot" becomes Left_Foot, "2nd" with the noun tool becomes tool_2nd, "é" becomes e.
+    "Left Foot" becomes Left_Foot, "2nd" with the noun tool becomes tool_2nd, "Fuß" becomes Fuss.
     """
-    plain = "".join(each for each in unicodedata.normalize("NFKD", text) if not unicodedata.combining(each))
-    name = re.sub("[^A-Za-z0-9]+", "_", plain).strip("_")[:_MAX_LABEL_CHARS].rstrip("_")
+    name = re.sub("[^A-Za-z0-9]+", "_", without_accents(text)).strip("_")[:_MAX_LABEL_CHARS].rstrip("_")
     if name and name[0].isdigit():
         return f"{noun}_{name}"
     return name or noun

@@ -58,6 +58,9 @@ MAX_PLATES: Final = 64
 _NOT_YET: Final = ServerParameters(b"", 0, 0, components=frozenset())
 """Stands for the parameters before the first are there."""
 
+_MAX_MOVED_US: Final = 10_000
+"""How much later a stamp may become so that it differs; a clock that was set further back is followed."""
+
 _LENGTH_COMPONENTS: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 
 logger = logging.getLogger(__name__)
@@ -127,6 +130,7 @@ class RosSource:
         self._refused: Mapping[ComponentType, int] = {}  # frames that found no place in the queue
         # In the sending thread.
         self._skipped: Mapping[ComponentType, int] = {}  # those whose numbers the topics have used up
+        self._stamps = _Stamps()
         self._node: RosNode | None = None
         self._by_name: dict[str, RosTopic] = {}
         self._former: dict[str, RosTopic] = {}  # those that the newest parameters may need again
@@ -344,7 +348,7 @@ class RosSource:
         if refused is not self._skipped:
             self._skip(refused)
         self._use(parameters)
-        time_stamp = ros_stamp(stamp.capture_utime)
+        time_stamp = ros_stamp(self._stamps.distinct(stamp.capture_utime, frame.layout, components))
         now_ns = time.time_ns()
         for index, layout in enumerate(frame.layout.components):
             kind = layout.type
@@ -427,3 +431,30 @@ class RosSource:
         if count > most:
             text = f"a frame has {count} {noun}; only the first {most} have topics"
             self.losses.lost(f"too many {noun}", text, messages=count - most)
+
+
+class _Stamps:
+    """Makes the stamps of each component's frames differ: of several with one stamp, tf2 keeps only one.
+
+    While the clock of a server is being measured, many frames that come together have the time of their
+    arrival.
+    """
+
+    def __init__(self) -> None:
+        self._newest: dict[ComponentType, int] = {}
+
+    def distinct(self, utime: int, layout: FrameLayout, components: Collection[ComponentType]) -> int:
+        """Return the time for a frame captured at ``utime``, in µs since the Unix epoch.
+
+        That is 1 µs after the one before, if the frame is not really later. The components of a frame have
+        one time, and so have those of two streams that were captured together.
+        """
+        newest = self._newest
+        kinds = [each.type for each in layout.components if each.type in components]
+        for kind in kinds:
+            before = newest.get(kind)
+            if before is not None and 0 <= before - utime < _MAX_MOVED_US:
+                utime = before + 1
+        for kind in kinds:
+            newest[kind] = utime
+        return utime

@@ -3,18 +3,21 @@
 import math
 import struct
 import time
+from itertools import pairwise
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.ros2.source import MAX_PLATES, MAX_TOOLS
-from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Plate
 from tests.support import ros_messages as ros
-from tests.support.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, tools_frame
+from tests.support.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, stamp, tools_frame
 from tests.unit.outputs.ros2.scripted_ros import Source, cause_of
 
 MARKERS, TOOLS, ANALOG, FORCE, _ = WIRE_ORDER
@@ -355,3 +358,57 @@ def test_a_closed_source_publishes_nothing_more_and_its_topics_go() -> None:
     assert not source.publisher.wants(ALL)
     assert cause_of(source.offer, ONE_OF_EACH) == "closed"
     assert source.publisher._wanted == frozenset()
+
+
+# Stamps -------------------------------------------------------------------------------------
+
+
+def stamps_of(source: Source, name: str) -> list[int]:
+    """Return the stamps of the messages of a topic in µs."""
+    times = [struct.unpack_from("<iI", cdr, 4) for cdr in source.node.messages[f"/mocap/lab/{name}"]]
+    return [seconds * 1_000_000 + nanoseconds // 1000 for seconds, nanoseconds in times]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 0, 0, 1, 3, 5_000, -2, -3_600_000_000]),
+            st.sampled_from([(MARKERS,), (TOOLS,), (MARKERS, TOOLS)]),
+        ),
+        max_size=40,
+    )
+)
+def test_frames_of_one_component_have_distinct_stamps_and_the_components_of_a_frame_one(
+    steps: list[tuple[int, tuple[ComponentType, ...]]],
+) -> None:
+    """Of 33 poses with one stamp at the beginning of a session under load, tf2 kept the last."""
+    source = Source(EACH)
+    source.subscribe()
+    utime = UTIME
+    both: list[bool] = []
+    for step, kinds in steps:
+        utime += step
+        before = len(source.node.messages.get("/mocap/lab/markers", ()))
+        source.publisher.publish(ONE_OF_EACH, stamp(utime), frozenset(kinds))
+        source.sender.run()
+        if len(kinds) == 2:
+            both.append(stamps_of(source, "markers")[before] == stamps_of(source, "wand/pose")[-1])
+        for name, kind in (("markers", MARKERS), ("wand/pose", TOOLS)):
+            if kind in kinds:
+                assert 0 <= stamps_of(source, name)[-1] - utime <= 3 * len(steps)
+    assert all(both)
+    for name in ("markers", "wand/pose"):
+        stamps = stamps_of(source, name) if f"/mocap/lab/{name}" in source.node.messages else []
+        assert all(after > before or before - after > 1_000_000 for before, after in pairwise(stamps))
+
+
+def test_frames_of_two_streams_that_were_captured_together_keep_one_stamp() -> None:
+    """Programs pair markers and poses by equal stamps."""
+    source = Source(EACH)
+    source.subscribe()
+    for number in range(3):
+        for kind in (MARKERS, TOOLS):
+            source.publisher.publish(ONE_OF_EACH, stamp(UTIME + 10 * number), frozenset([kind]))
+    source.sender.run()
+    assert stamps_of(source, "markers") == stamps_of(source, "wand/pose")
+    assert stamps_of(source, "markers") == [UTIME, UTIME + 10, UTIME + 20]

@@ -94,7 +94,11 @@ VALID_PART = re.compile("[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
         ("a__b", "a_b"),
         (" _x_ ", "x"),
         ("2nd", "tool_2nd"),
-        ("Füße/été", "Fu_e_ete"),
+        ("Füße/été", "Fusse_ete"),
+        ("GROẞ Ærø Łódź", "GROSS_Aero_Lodz"),
+        ("đ ð þ œ ħ ı", "d_d_th_oe_h_i"),
+        ("Αγκώνας µ", "Agkonas_m"),
+        ("Колено Щит объём", "Koleno_Shchit_obyem"),
         ("", "tool"),
         ("手", "tool"),
         ("*/**", "tool"),
@@ -112,6 +116,7 @@ def test_names_are_different_and_unusable_labels_are_called_by_position() -> Non
     assert unique_ros_names(labels, "tool") == (
         *("Tool_1", "Tool_1_2", "tool_3", "tool_4", "tool_3_2", "Tool_1_3"),
     )
+    assert unique_ros_names(["Fuß", "Fuss", "Fu"], "tool") == ("Fuss", "Fuss_2", "Fu")
     assert unique_ros_names(["x" * 100] * 256, "tool")[-1] == "x" * 48 + "_256"
 
 
