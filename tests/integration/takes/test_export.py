@@ -1,6 +1,8 @@
 """``rtc3d-gateway export`` as a user types it: what it prints, and which files are there afterwards."""
 
+import errno
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -16,6 +18,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.commands import run_in_process
+from tests.support.errors import names as names_values
 from tests.support.gateway_process import PROGRAM
 from tests.support.networks import free_endpoint, free_port, zenoh_keys
 from tests.support.takes import frame, parameters, record_scene, write_take
@@ -38,13 +41,13 @@ def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -
     done = run_in_process("export", take, tmp_path / "walk.c3d")
     size = size_text((tmp_path / "walk.c3d").stat().st_size)
     assert done[:2] == (0, f"{tmp_path}/walk.c3d ({size})\n")
-    assert "walk.c3d\tforces became analog channels, six of each plate\t1\n" in done.stderr
+    assert any(re.fullmatch("walk.c3d\tforces .*\t1", line) for line in done.stderr.splitlines())
     content = bytearray(take.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 3000] = bytes(3000)
     (tmp_path / "damaged.lcmlog").write_bytes(content[:-100])
     done = run_in_process("export", tmp_path / "damaged.lcmlog", tmp_path / "DAMAGED.MCAP")
     assert done.returncode == 0
-    assert "\tthe take is damaged at 2 places\t" in done.stderr
+    assert names_values(done.stderr, "2 places")
 
 
 WALK = Path(__file__).parents[3] / "examples/walk.lcmlog"
@@ -56,7 +59,7 @@ def test_a_bids_data_set_is_a_folder_that_grows(tmp_path: Path) -> None:
     done = run_in_process("export", WALK, study, *BIDS)
     assert done.returncode == 0
     assert f"{study}/sub-01/sub-01_scans.tsv (" in done.stdout
-    assert "positions converted from mm to m" in done.stderr
+    assert names_values(done.stderr, "mm to m")
     done = run_in_process("export", WALK, study, *BIDS, "--session", "2", "--run", "3")
     assert f"{study}/sub-01/ses-2/sub-01_ses-2_scans.tsv (" in done.stdout
     assert len(list(study.rglob("*_run-3_motion.tsv"))) == 4
@@ -66,13 +69,14 @@ def test_who_and_what_the_take_is_about_can_be_replaced(tmp_path: Path) -> None:
     done = run_in_process(
         "export", WALK, tmp_path / "a.csv", "--subject", "S1", "--session", "", "--note", " x "
     )
-    assert done.stderr == "\tleft out of lab: subject, note, parameters except labels and units\t\n"
+    [line] = done.stderr.splitlines()
+    assert names_values(line, "lab", "subject, note")
     done = run_in_process("export", WALK, tmp_path / "a.c3d", "--subject", "S" * 65)
     assert done.returncode == 2
-    assert "up to 64 characters" in done.stderr
+    assert names_values(done.stderr, "64 characters")
 
 
-EXISTS = "exists already, and nothing is overwritten"
+EXISTS = "exists already"
 
 
 @pytest.mark.parametrize(
@@ -81,25 +85,25 @@ EXISTS = "exists already, and nothing is overwritten"
         (
             "walk.xyz",
             (),
-            "walk.xyz has no known extension; choose .c3d, .trc, .mot, .sto, .csv, .parquet or .mcap",
+            ".c3d, .trc, .mot, .sto, .csv, .parquet or .mcap",
             2,
         ),
-        ("walk", (), ".csv, .parquet or .mcap, or --opensim or --bids for a folder", 2),
+        ("walk", (), "--opensim or --bids", 2),
         *((f"walk{each}", (), EXISTS, 1) for each in (".c3d", ".csv", ".trc", ".mcap")),
-        ("missing/a.csv", (), "missing; create it first", 1),
-        ("a.trc", ("--source", "studio"), "has no source 'studio'; its sources are: lab", 2),
+        ("missing/a.csv", (), "create it", 1),
+        ("a.trc", ("--source", "studio"), "'studio'", 2),
         ("a.trc", ("--from", "3000"), "has no markers", 2),
-        ("a.csv", ("--forward", "-x"), "--forward is for .trc, .mot or --opensim only", 2),
-        ("a.mot", ("--bodies", "calcn_r"), "--bodies is for --opensim only", 2),
-        ("a.c3d", ("--task", "x"), "--task is for --bids only", 2),
+        ("a.csv", ("--forward", "-x"), ".trc, .mot or --opensim", 2),
+        ("a.mot", ("--bodies", "calcn_r"), "--bodies", 2),
+        ("a.c3d", ("--task", "x"), "--task", 2),
         (
             "a",
             ("--opensim", "--bodies", "toes, ,heel"),
-            "--bodies must have a name for each plate in walk.mot: 1, not 2",
+            "walk.mot: 1, not 2",
             2,
         ),
         ("walk", ("--opensim",), EXISTS, 1),
-        ("a.mot", ("--opensim",), "a.mot is the name of a file; omit .mot", 2),
+        ("a.mot", ("--opensim",), "omit .mot", 2),
     ],
 )
 def test_what_cannot_be_exported_leaves_no_file(
@@ -147,7 +151,7 @@ def test_an_export_that_is_stopped_or_whose_disk_is_full_leaves_no_file(
         resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
         _, stderr = full.communicate(timeout=60)
     assert full.returncode == 1
-    assert stderr.endswith("cannot be written: File too large; nothing was written\n")
+    assert names_values(stderr, os.strerror(errno.EFBIG), "nothing")
     assert names(tmp_path) == ["long.lcmlog"]
 
 
@@ -199,7 +203,7 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
             wait_until(lambda: take.exists() and take.read_bytes().count(channel) == count, 60)  # noqa: B023
         record.send_signal(signal.SIGINT)
         assert record.wait(30) == 0
-    assert "time 0 is the first frame" in run_in_process("export", take, copy).stderr
+    assert names_values(run_in_process("export", take, copy).stderr, "time 0")
     expected, found = (read_ezc3d(path) for path in (original, copy))
     events = [content["parameters"]["EVENT"] for content in (expected, found)]
     assert events[0]["LABELS"]["value"] == events[1]["LABELS"]["value"]

@@ -1,5 +1,6 @@
 """``record`` as a program of its own, beside a gateway or a publisher of the test, on real Zenoh and LCM."""
 
+import errno
 import itertools
 import os
 import pty
@@ -23,6 +24,7 @@ from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import PREFIX
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.statistics import take_statistics
+from tests.support.errors import names
 from tests.support.gateway_process import PROGRAM
 from tests.support.networks import free_endpoint, lcm_url, open_zenoh
 from tests.support.record_process import (
@@ -110,7 +112,7 @@ def test_a_full_disk_costs_nothing_if_it_has_room_again_and_is_counted_otherwise
         assert_same_bytes(path, gateway.published)
     assert ended.status == 1
     assert take_statistics(path).sources["Lab-1"].is_cut_off
-    assert re.search(r"^\d+ messages were not written: .*: File too large$", ended.stdout, re.MULTILINE)
+    assert re.search(rf"^[1-9]\d* messages .*: {os.strerror(errno.EFBIG)}$", ended.stdout, re.MULTILINE)
     assert re.search(r"^Lab-1 +3d .* Hz +- +- +[1-9]\d*$", ended.stdout, re.MULTILINE)
 
 
@@ -221,7 +223,7 @@ def test_a_restart_of_the_gateway_is_told_from_loss(tmp_path: Path, publisher: P
         wait_until(lambda: num_recorded(tmp_path / "walk.lcmlog", "MOCAP_LAB_3D") == 15)
         ended = record.end()
     assert ended.status == 1, ended
-    assert "lab: its gateway was started again (once)" in ended.stdout
+    assert names(ended.stdout, "lab", "again (once)")
 
 
 def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Publisher) -> None:
@@ -246,16 +248,17 @@ def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Pu
     os.close(terminal)
     os.close(reading)
     assert process.returncode == 1
-    assert "2 messages were lost on the way; 2 so far\r\n" in shown
-    assert "the file was moved or deleted while it was recorded" in stdout
+    assert "2 messages" in shown
+    assert names(shown, "2 so far")
+    assert names(stdout, "moved or deleted")
 
 
 @pytest.mark.parametrize(
     ("side", "problem"),
     [
-        ("zenoh", "no gateway found on Zenoh"),
-        ("lcm", "no gateway found on LCM"),
-        ("", "no Zenoh session to tcp/"),
+        ("zenoh", "found on Zenoh"),
+        ("lcm", "found on LCM"),
+        ("", "session to tcp/"),
     ],
 )
 def test_without_a_gateway_there_is_no_file(
@@ -269,7 +272,7 @@ def test_without_a_gateway_there_is_no_file(
         ended = record.end(signal.SIGINT if side else None)
     assert ended.status == 1
     if side:
-        assert ended.stdout == "nothing was recorded, and there is no file: no message has arrived\n"
+        assert names(ended.stdout, "nothing", "no file")
     assert {path.name for path in tmp_path.iterdir()} == {"stderr"}
 
 

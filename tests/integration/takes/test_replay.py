@@ -23,6 +23,7 @@ from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameter
 from gateway.rtc3d.parameters_xml import encode_parameters
 from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.support.commands import run_in_process
+from tests.support.errors import names
 from tests.support.gateway_process import PROGRAM
 from tests.support.networks import free_endpoint, lcm_url, open_zenoh
 from tests.support.takes import (
@@ -178,8 +179,7 @@ async def test_a_replay_does_not_mix_with_somebody_else(tmp_path: Path, subscrib
         for options in (("--zenoh", "--connect", subscribers.endpoint), ("--lcm", "--url", subscribers.url)):
             ended = await replay(path, *options)
             assert ended.status == 1
-            assert "somebody else publishes" in ended.stderr
-            assert "choose another --prefix" in ended.stderr
+            assert names(ended.stderr, "somebody else", "--prefix")
         ended = await replay(path, *subscribers.options, "--prefix", "site/two", "--to", "0.1")
         assert ended.status == 0, ended.stderr
     expected = by_channel(some_messages(), "SITE_TWO")["SITE_TWO_LAB_3D"][:21]
@@ -196,7 +196,7 @@ async def test_an_output_that_does_not_open_is_left_out(tmp_path: Path, subscrib
         replay(path, *nowhere, "--url", subscribers.url), replay(path, *nowhere, "--zenoh")
     )
     assert ended.status == 0
-    assert "not replayed there: zenoh" in ended.stderr
+    assert names(ended.stderr, "zenoh")
     expected = by_channel(some_messages(frames=20))
     await wait_until_async(lambda: by_channel(subscribers.messages) == expected)
     assert required.status == 1
@@ -226,13 +226,13 @@ def test_what_is_left_out_of_a_bad_take_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ("--rate 0", "expected a number from 0.01 to 1000, or max"),
-        ("--rate nan", "expected a number from 0.01 to 1000, or max"),
-        ("--from 5 --to 5", "--to must be greater than --from"),
-        ("--zenoh --lcm", "give either --zenoh or --lcm"),
+        ("--rate 0", "from 0.01 to 1000, or max"),
+        ("--rate nan", "from 0.01 to 1000, or max"),
+        ("--from 5 --to 5", "--to"),
+        ("--zenoh --lcm", "--zenoh or --lcm"),
         ("--zenoh --url memq://", "--url is for LCM"),
         ("--component c3d", "expected"),
-        ("--prefix a/long/name/of/a/prefix", "at most 16 characters"),
+        ("--prefix a/long/name/of/a/prefix", "16 characters"),
     ],
 )
 def test_options_are_checked(tmp_path: Path, options: str, text: str) -> None:

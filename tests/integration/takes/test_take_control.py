@@ -20,6 +20,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.service.gateway import Gateway
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
+from tests.support.errors import names
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
 from tests.support.servers import ScriptedServer, markers_frame
@@ -123,8 +124,8 @@ async def test_the_view_learns_which_take_is_running_while_a_page_is_open(tmp_pa
 async def test_takes_are_started_listed_and_stopped_or_errors_say_why(tmp_path: Path, side: str) -> None:
     async with lab(tmp_path / "takes") as at:
         options = at.options(side)
-        assert "no take of source 'lab' is running" in await error("stop", *options)
-        assert "cannot be the name of a take" in await error("start", "x;set=stop", *options, status=2)
+        assert names(await error("stop", *options), "no take", "'lab'")
+        assert names(await error("start", "x;set=stop", *options, status=2), "name", "x;set=stop")
         assert await take("start", NAME, *options) == (0, f"lab: take {NAME!r} is running\n", "")
         await at.send(10)
         listed = await take("list", *options)
@@ -187,7 +188,7 @@ async def test_takes_that_grow_shrink_or_are_read_late_are_fetched_as_far_as_the
     assert (fetched.status, fetched.stderr) == (0, "")
     assert copy.read_bytes() == content
     assert MAX_PIECE_BYTES in offsets
-    assert "walk.lcmlog exists already, and nothing is overwritten" in await error(*fetch)
+    assert names(await error(*fetch), "walk.lcmlog", "exists already")
     copy.unlink()
 
     half = len(content) // 2 + 1000
@@ -197,7 +198,7 @@ async def test_takes_that_grow_shrink_or_are_read_late_are_fetched_as_far_as_the
         return read(folder, source, name, offset)._replace(num_bytes=next(sizes, len(content)))
 
     monkeypatch.setattr(TakesFolder, "read", read_while_it_grows)
-    assert "which is still running" in (await take(*fetch)).stdout
+    assert names((await take(*fetch)).stdout, "still running")
     reader = EventLogReader(copy)
     assert list(reader.events())
     assert reader.damaged_bytes == 0
@@ -211,9 +212,9 @@ async def test_takes_that_grow_shrink_or_are_read_late_are_fetched_as_far_as_the
         return piece
 
     monkeypatch.setattr(TakesFolder, "read", read_and_cut)
-    assert "became shorter while it was copied" in await error(*fetch)
+    assert names(await error(*fetch), "shorter")
     missing = await error("fetch", "run", str(tmp_path), *at.options())
-    assert "source 'lab' has no take 'run'" in missing
+    assert names(missing, "'lab'", "'run'")
     assert [path.name for path in tmp_path.iterdir()] == ["takes"]  # noqa: ASYNC240
 
 
@@ -230,7 +231,7 @@ async def test_a_take_in_several_sources_needs_the_source(tmp_path: Path) -> Non
         config = tmp_path / "both.json5"
         config.write_text(json.dumps(keys))
         several = await error("fetch", "walk", str(tmp_path), "--zenoh-config", str(config))
-        assert "several sources have a take 'walk': lab, lab_2; choose with --source" in several
+        assert names(several, "'walk'", "lab, lab_2", "--source")
 
 
 async def test_no_wildcard_starts_stops_or_saves_a_take(tmp_path: Path) -> None:

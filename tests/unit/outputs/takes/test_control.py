@@ -12,6 +12,7 @@ from gateway.outputs.takes.folder import StoredTake, TakePiece
 from gateway.outputs.takes.source_takes import MAX_SAVED_S, TakeList
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from tests.support.clocks import Clock
+from tests.support.errors import raises
 
 ABOUT = TakeDetails("S01", note="left knee")
 WALK = StoredTake("walk-1", 4096, 1_700_000_000_000_000, 12.34567, True, 2, details=ABOUT)
@@ -99,28 +100,28 @@ async def test_a_piece_is_read_with_its_place_in_the_attachment(options: dict[st
     assert answer.attachment == {"name": "walk-1", "bytes": 4096, "offset": offset}
 
 
-ACCEPTED = "is not accepted"
+ACCEPTED = "accepted"
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"set": "pause"}, "set='pause' is not accepted; accepted: start, stop, save"),
-        ({"set": ""}, "set='' is not accepted"),
-        ({"set": "s" * 1_000_000}, "…' is not accepted"),
-        ({"set": "stop", "name": "w"}, "unknown option 'name' of take with set=stop; accepted: none"),
-        ({"set": "start", "last": "5"}, "unknown option 'last' of take with set=start"),
-        ({"set": "start", "read": "w"}, "unknown option 'read' of take with set=start"),
-        ({"name": "w"}, "unknown option 'name' of take; accepted"),
-        ({"x" * 1_000_000: ""}, "unknown option 'xxx"),
-        ({"offset": "0"}, "unknown option 'offset' of take"),
-        ({"read": "w", "offset": "-1"}, "offset='-1' is not accepted; accepted: a number of bytes"),
+        ({"set": "pause"}, "start, stop, save"),
+        ({"set": ""}, "set=''"),
+        ({"set": "s" * 1_000_000}, "…'"),
+        ({"set": "stop", "name": "w"}, "'name' of take with set=stop"),
+        ({"set": "start", "last": "5"}, "'last' of take with set=start"),
+        ({"set": "start", "read": "w"}, "'read' of take with set=start"),
+        ({"name": "w"}, "'name' of take"),
+        ({"x" * 1_000_000: ""}, "'xxx"),
+        ({"offset": "0"}, "'offset' of take"),
+        ({"read": "w", "offset": "-1"}, "offset='-1'"),
         *(({"read": "w", "offset": offset}, ACCEPTED) for offset in ("nan", "", "9" * 19, "٣", "1\n")),
-        ({"set": "stop", "note": "w"}, "unknown option 'note' of take with set=stop"),
+        ({"set": "stop", "note": "w"}, "'note' of take with set=stop"),
         *(({"set": "start", "note": note}, ACCEPTED) for note in ("two%0Alines", "%1B[2J", "n" * 501, "%FF")),
-        *(({"set": "save", name: "s" * 65}, "up to 64 characters") for name in ("subject", "session")),
-        ({"set": "save", "last": "nan"}, "last='nan' is not accepted; accepted: a number of seconds up to"),
-        *(({"set": "save", "last": last}, f"last='{last}' {ACCEPTED}") for last in ("inf", "-1", "3601")),
+        *(({"set": "save", name: "s" * 65}, "64 characters") for name in ("subject", "session")),
+        ({"set": "save", "last": "nan"}, "last='nan'"),
+        *(({"set": "save", "last": last}, f"last='{last}'") for last in ("inf", "-1", "3601")),
         *(({"set": "save", "after": after}, ACCEPTED) for after in ("1e3", "9" * 1_000_000)),
     ],
 )
@@ -143,8 +144,7 @@ async def test_a_flood_of_reads_is_refused() -> None:
         clock.now_s += after_s
         while len(takes.calls) < expected:
             await command("lab", {"read": "walk-1"})
-        with pytest.raises(QueryError, match="reads 100 pieces of takes a second; try again") as caught:
+        with raises(QueryError, 100, code="rate"):
             await command("lab", {"read": "walk-1"})
-        assert caught.value.code == "rate"
         assert len(takes.calls) == expected
     await command("lab", {})

@@ -7,6 +7,7 @@ import pytest
 
 from gateway.errors import QueryError
 from gateway.outputs.takes.folder import MAX_PIECE_BYTES, ROLLING, StoredTake, TakesFolder, add_c3d
+from tests.support.errors import names, raises
 from tests.support.takes import encode_event
 from tests.unit.outputs.takes.test_segments import no_links
 
@@ -50,7 +51,7 @@ def test_a_list_has_the_newest_take_first_with_its_time_and_length(takes: TakesF
     assert takes.take_at(lab / "walk").seconds == 3.0
     stored(lab / "long.lcmlog", log(*range(0, 10**9, 10**6)))  # is measured by its end
     assert takes.take_at(lab / "long").seconds == 999.0
-    with pytest.raises(QueryError, match="somebody has removed it"):
+    with raises(QueryError, "removed"):
         takes.take_at(lab / "wal")
 
 
@@ -98,7 +99,7 @@ def test_no_peer_gets_a_file_outside_the_folder(takes: TakesFolder, tmp_path: Pa
     stored(secret / "lab/evil.lcmlog", log(1))
     (takes.directory / link).parent.mkdir(parents=True, exist_ok=True)
     (takes.directory / link).symlink_to(secret / link)
-    with pytest.raises(QueryError, match="has no take 'evil'"):
+    with raises(QueryError, "'lab'", "'evil'"):
         takes.read("lab", "evil", 0)
     assert takes.entries("lab") == takes.entries() == []
 
@@ -128,7 +129,7 @@ def test_a_lock_that_somebody_deletes_is_taken_again(tmp_path: Path) -> None:
         path.unlink()
     assert folder.open() == ""
     for _ in range(3):
-        assert "another gateway records" in other.open()
+        assert names(other.open(), "another gateway", tmp_path)
     lock = str(tmp_path / ".rtc3d-gateway.lock")
     open_files = [os.path.realpath(each) for each in Path("/proc/self/fd").iterdir()]
     assert open_files.count(lock) == 1  # a gateway that waits for days must not run out of descriptors

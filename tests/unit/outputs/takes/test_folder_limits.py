@@ -11,6 +11,7 @@ from gateway.outputs.takes.disk import FolderWatch, Host
 from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.folder_clock import FILE
 from tests.support.clocks import Clock
+from tests.support.errors import names
 from tests.support.recording_output import NoThread, settings_in
 from tests.unit.outputs.takes.test_folder import NOW_S, stored
 
@@ -325,7 +326,7 @@ def test_after_a_problem_the_folder_is_checked_again_at_once(watched: Watched, t
     former = TakesFolder(tmp_path)
     assert former.open() == ""
     assert watched.check() == 1
-    assert "another gateway records" in watched.watch.problem
+    assert names(watched.watch.problem, "another gateway", tmp_path)
     former.close()
     assert former.open() == f"{tmp_path} is closed"  # a late check must not lock it again
     assert watched.check() == 2
@@ -334,12 +335,12 @@ def test_after_a_problem_the_folder_is_checked_again_at_once(watched: Watched, t
 
 def test_a_disk_that_does_not_respond_is_a_problem(watched: Watched) -> None:
     """A network drive that hangs makes no error; only the time shows it."""
-    assert "is not checked yet" in watched.watch.problem
+    assert names(watched.watch.problem, "checked yet")
     watched.check()
     watched.thread.age_s = 4.9
     assert watched.watch.problem == ""
     watched.thread.age_s = 5.1
-    assert "does not respond" in watched.watch.problem
+    assert names(watched.watch.problem, "respond")
 
 
 def test_the_limits_of_the_settings_are_applied(tmp_path: Path) -> None:
