@@ -363,13 +363,13 @@ def test_a_name_in_a_folder_follows_the_sources(tmp_path: Path, sources: list[st
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("there.lcmlog", "there.lcmlog exists already, and nothing is overwritten"),
+        ("there.lcmlog", "there.lcmlog exists already"),
         ("there", "there.lcmlog exists already"),
         ("dangling.lcmlog", "exists already"),
-        ("nowhere/walk.lcmlog", "there is no folder .*nowhere; create it first"),
-        ("there.lcmlog/walk.lcmlog", "there.lcmlog/walk.lcmlog cannot be created: Not a directory"),
-        ("walk.mcap", r"choose a name that ends with \.lcmlog, and convert it afterwards"),
-        ("x" * 300, "cannot be created: File name too long"),
+        ("nowhere/walk.lcmlog", ".*nowhere; create"),
+        ("there.lcmlog/walk.lcmlog", "there.lcmlog/walk.lcmlog .*Not a directory"),
+        ("walk.mcap", r"\.lcmlog"),
+        ("x" * 300, ".*File name too long"),
     ],
 )
 def test_what_cannot_be_a_new_file_is_an_error(tmp_path: Path, name: str, problem: str) -> None:

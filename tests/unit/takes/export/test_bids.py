@@ -20,8 +20,9 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.job import BidsNames, ExportJob, Note
+from gateway.takes.export.job import BidsNames, ExportJob
 from gateway.takes.files.new_file import NewFiles
+from tests.support.errors import names, one_names, raises
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -110,8 +111,8 @@ def test_all_values_survive_and_lost_frames_are_not_available(tmp_path: Path) ->
     assert_values(tmp_path, SCENE, "Analog", 400, IN_MM["Analog"])
     assert_values(tmp_path, SCENE, "Forces", 400, IN_MM["Forces"])
     file = "sub-01_task-walking_tracksys-labMarkers_run-1_motion.tsv"
-    assert Note(file, "frames missing in the take are empty", "3 of 40") in job.notes
-    assert "positions converted from mm to m" in notes_of(job, usual=True)
+    assert (file, "3 of 40") in [(note.file, note.amount) for note in job.notes]
+    assert one_names(notes_of(job, usual=True), "mm to m")
 
 
 @pytest.mark.takes
@@ -173,7 +174,7 @@ def test_other_units_become_si_units(tmp_path: Path) -> None:
     job = export(tmp_path, messages)
     path = only(tmp_path, "*_motion.tsv")
     assert read_motion(path)[0] == pytest.approx([1000, 2000, 3000, 0.004, 0.005, 0.006])
-    assert "forces and moments converted to N and N.m" in notes_of(job)
+    assert one_names(notes_of(job), "forces", "N.m")
 
 
 def test_a_component_without_items_is_no_tracking_system(tmp_path: Path) -> None:
@@ -191,7 +192,7 @@ def test_an_unknown_unit_of_length_stays_and_is_reported(tmp_path: Path) -> None
     job = export(tmp_path, [labelled("a", unit="cubit"), frame(ComponentType.MARKERS, [(1, 2, 3, 0)])])
     assert read_motion(only(tmp_path, "*_motion.tsv")).tolist() == [[1, 2, 3, 0]]
     assert set(column(only(tmp_path, "*_channels.tsv"), "units")) == {"cubit"}
-    assert notes_of(job)[-1] == "positions not converted to m: their unit, 'cubit', is unknown"
+    assert names(notes_of(job)[-1], "'cubit'")
 
 
 def test_labels_cannot_break_the_tables(tmp_path: Path) -> None:
@@ -199,7 +200,7 @@ def test_labels_cannot_break_the_tables(tmp_path: Path) -> None:
     rows = table(only(tmp_path, "*_channels.tsv"))
     assert [row["name"] for row in rows[::4]] == ["a_b_x", "marker 2_x"]
     assert {row["tracked_point"] for row in rows} == {"a_b", "marker 2"}
-    assert "names of channels changed, because a table cannot hold them | 4" in notes_of(job)
+    assert one_names(notes_of(job), "channels", 4)
 
 
 def runs_of(folder: Path) -> set[tuple[str, str]]:
@@ -220,7 +221,7 @@ def test_what_sources_record_at_the_same_time_is_one_run(tmp_path: Path) -> None
     assert times["labaMarkers_run-1_motion.tsv"] == times["labbMarkers_run-1_motion.tsv"]
     assert times["labaMarkers_run-1_motion.tsv"] == "2023-11-14T22:13:19.998000Z"
     assert times["labaMarkers_run-2_motion.tsv"] == "2023-11-14T22:13:20.998000Z"
-    assert "there are 2 measurements, so there are 2 runs" in notes_of(job)
+    assert one_names(notes_of(job), "2 measurements", "2 runs")
 
 
 def test_sources_whose_names_have_equal_letters_are_different_tracking_systems(tmp_path: Path) -> None:
@@ -279,7 +280,7 @@ def test_events_count_from_the_first_sample_of_their_run(tmp_path: Path) -> None
     ]
     assert events_of(tmp_path, "tracksys-labMarkers_run-2") == [("0.200000", "event 7")]
     assert {*column(only(tmp_path, "*_run-2_events.tsv"), "value")} == {"7"}
-    assert "events of lab that are of no run left out | 1" in notes_of(job)
+    assert one_names(notes_of(job), "events of lab", 1)
 
 
 def test_an_event_is_in_the_nearest_run_only_beside_the_markers(tmp_path: Path) -> None:
@@ -304,7 +305,7 @@ def test_subject_and_session_come_from_the_take_in_letters_and_digits(tmp_path: 
     )
     assert only(tmp_path, "*_scans.tsv").parent.name == "ses-baseline"
     for note in ("the subject 'S-01' is called 'S01'", "the task 'heel-toe' is called 'heeltoe'"):
-        assert f"{note}: BIDS has letters and digits only" in notes_of(job)
+        assert any(each.startswith(note) for each in notes_of(job))
 
 
 @pytest.mark.parametrize(("subject", "task", "missing"), [("", "rest", "subject"), ("01", "", "task")])
@@ -340,7 +341,7 @@ def test_sources_with_different_subjects_need_a_choice(tmp_path: Path) -> None:
 def test_a_source_whose_name_bids_cannot_have_is_reported(tmp_path: Path) -> None:
     job = export(tmp_path, [description("lab-2"), markers(1, source="lab-2")])
     assert runs_of(tmp_path) == {("lab2Markers", "1")}
-    assert "the source 'lab-2' is called 'lab2': BIDS has letters and digits only" in notes_of(job)
+    assert one_names(notes_of(job), "'lab-2'", "'lab2'")
 
 
 def test_a_data_set_grows_and_keeps_what_others_wrote(tmp_path: Path) -> None:
@@ -370,16 +371,16 @@ def test_an_export_that_fails_changes_nothing(tmp_path: Path) -> None:
     study = tmp_path / "study"
     export(tmp_path, [markers(1)])
     before = content(study)
-    with pytest.raises(TakeError, match=r"_run-1_motion\.tsv exists already, and nothing is overwritten"):
+    with pytest.raises(TakeError, match=r"_run-1_motion\.tsv exists already"):
         export(tmp_path, [markers(1)], replace(NAMES, run=1))
     assert content(study) == before
     (study / "sub-01/sub-01_scans.tsv").write_text("filename\tduration\n")
     before = content(study)
-    with pytest.raises(TakeError, match=r"sub-01_scans\.tsv has no column 'acq_time'; add it"):
+    with raises(TakeError, "sub-01_scans.tsv", "'acq_time'"):
         export(tmp_path, [markers(1)])
     assert content(study) == before
     (study / "participants.tsv").write_bytes(b"\xff")
-    with pytest.raises(TakeError, match=r"participants\.tsv is not in UTF-8"):
+    with raises(TakeError, "participants.tsv", "UTF-8"):
         export(tmp_path, [markers(1)], subject="02")
     assert not (study / "sub-02").exists()
 
@@ -387,7 +388,7 @@ def test_an_export_that_fails_changes_nothing(tmp_path: Path) -> None:
 def test_a_folder_of_other_files_is_not_made_a_data_set(tmp_path: Path) -> None:
     (tmp_path / "study").mkdir()
     (tmp_path / "study/thesis.txt").touch()
-    with pytest.raises(SelectionError, match=r"has files, but no dataset_description\.json"):
+    with raises(SelectionError, "dataset_description.json"):
         export(tmp_path, [markers(1)])
 
 
@@ -396,10 +397,10 @@ def test_two_exports_to_one_data_set_cannot_lose_rows(tmp_path: Path) -> None:
     export(tmp_path, [markers(1)])
     with NewFiles() as other:
         other.lock_folder(tmp_path / "study")
-        with pytest.raises(TakeError, match=r"another program is writing to .*study"):
+        with pytest.raises(TakeError, match=r"another program .*study"):
             export(tmp_path, [markers(1)])
         (tmp_path / "study/dataset_description.json").unlink()  # as while the other one creates the data set
-        with pytest.raises(TakeError, match=r"another program is writing to .*study"):
+        with pytest.raises(TakeError, match=r"another program .*study"):
             export(tmp_path, [markers(1)])
 
 
@@ -413,7 +414,7 @@ def test_tables_of_spreadsheets_get_further_rows(tmp_path: Path) -> None:
 
 
 def test_a_take_without_samples_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(TakeError, match="has no markers, tools, analog channels or forces, and --bids holds"):
+    with raises(TakeError, "markers, tools, analog channels or forces", "--bids"):
         export(tmp_path, [frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])])
 
 

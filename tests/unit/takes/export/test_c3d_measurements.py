@@ -12,6 +12,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob
+from tests.support.errors import each_names, names, one_names
 from tests.support.takes import Message, description, frame, parameters, scene_messages
 from tests.unit.takes.export.exported import (
     SCENE,
@@ -48,11 +49,12 @@ def later(message: Message, step_us: int) -> Message:
 def test_lost_frames_are_empty_and_the_others_keep_their_places(tmp_path: Path) -> None:
     lost = {ComponentType.MARKERS: {10, 11, 30}, ComponentType.ANALOG: {205, 206}}
     found, notes = export_c3d(tmp_path, scene(50, keep=lambda key, number: number not in lost.get(key, ())))
-    assert notes == [
-        "out.c3d | frames missing in the take are empty | 3 of 50",
-        "out.c3d | analog samples missing in the take are NaN | 2",
-        "out.c3d | forces became analog channels, six of each plate | 2",
-    ]
+    assert each_names(
+        notes,
+        ["out.c3d", "frames", "3 of 50"],
+        ["out.c3d", "analog samples", 2],
+        ["out.c3d", "forces", "analog", 2],
+    )
     assert np.flatnonzero(np.isnan(found.points[0]).all(axis=0)).tolist() == [10, 11, 30]
     assert np.array_equal(found.points[0, :, 12:13], x_of(12, 13), equal_nan=True)
     assert np.flatnonzero(np.isnan(found.analog[:3]).any(axis=0)).tolist() == [205, 206]
@@ -79,7 +81,7 @@ def test_what_markers_and_analog_do_not_both_have_at_the_ends_is_left_out(
     assert found.points.shape[2] == last - first
     assert np.array_equal(found.analog[:3], samples(10 * first, 10 * last))
     assert np.array_equal(found.points[0], x_of(first, last), equal_nan=True)
-    assert ("frames at the ends left out" in "".join(notes)) == (last - first < len(markers))
+    assert one_names(notes, "frames", "ends") == (last - first < len(markers))
     count, total = len(analog) - 10 * (last - first), len(analog)
     left_out = f"samples of analog of lab that fit no frame left out | {count} of {total}"
     assert (left_out in notes) == (count > 0)
@@ -94,7 +96,7 @@ def test_each_measurement_is_a_file(tmp_path: Path) -> None:
     ]
     job, files = export_all(tmp_path, messages)
     assert [path.name for path in job.files.paths] == ["walk-1.c3d", "walk-2.c3d", "walk-3.c3d"]
-    assert notes_of(job)[0] == "several measurements, each with files of its own | 3"
+    assert names(notes_of(job)[0], "measurements", 3)
     for found, count in zip(files, (20, 30, 10), strict=True):
         assert found.points.shape[2] == count
         assert np.array_equal(found.analog[:3], samples(0, 10 * count))
@@ -116,7 +118,7 @@ def test_each_set_of_labels_is_a_file(tmp_path: Path) -> None:
 def test_frames_without_items_begin_no_new_measurement(tmp_path: Path) -> None:
     frames = [frame(ComponentType.MARKERS, [] if n % 5 == 2 else [(n, 2, 3, 0)], n) for n in range(20)]
     _, notes = export_c3d(tmp_path, [labelled("a"), *frames])
-    assert notes == ["out.c3d | frames missing in the take are empty | 4 of 20"]
+    assert each_names(notes, ["out.c3d", "frames", "4 of 20"])
     content = read_independently(tmp_path / "out.c3d")
     assert content.is_visible[:, 0].tolist() == [n % 5 != 2 for n in range(20)]
     assert content.points[3, 0, 0] == 3
@@ -129,7 +131,7 @@ def test_a_step_of_the_clock_changes_nothing(tmp_path: Path, step_us: int) -> No
     messages[half:] = [later(message, step_us) for message in messages[half:]]
     found, notes = export_c3d(tmp_path, [description(), *messages])
     notes = [note for note in notes if "the last row of" not in note]
-    assert notes == ["out.c3d | forces became analog channels, six of each plate | 2"]
+    assert each_names(notes, ["out.c3d", "forces", "analog", 2])
     assert np.array_equal(found.points[0], x_of(0, 100), equal_nan=True)
     assert np.array_equal(found.analog[:3], samples(0, 1000))
 

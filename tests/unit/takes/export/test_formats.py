@@ -1,7 +1,9 @@
 """What several formats have in common: files, times, memory, and takes without anything to export."""
 
 import csv
+import errno
 import math
+import os
 import re
 from datetime import datetime
 from pathlib import Path
@@ -11,6 +13,7 @@ import pytest
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.files import component_rows, spool
+from tests.support.errors import raises
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -30,11 +33,11 @@ EVENT = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
 @pytest.mark.parametrize(
     ("extension", "messages", "options", "problem"),
     [
-        (".c3d", [EVENT], {}, r"has no markers, analog channels or forces, and \.c3d holds nothing"),
-        (".trc", [ANALOG], {}, r"take\.lcmlog has no markers, and \.trc holds nothing else"),
-        (".trc", [markers(1)], {"from_s": 5.0}, "has no markers between --from and --to"),
+        (".c3d", [EVENT], {}, r"no markers, analog channels or forces, .*\.c3d"),
+        (".trc", [ANALOG], {}, r"take\.lcmlog .*no markers, .*\.trc"),
+        (".trc", [markers(1)], {"from_s": 5.0}, "no markers .*--from"),
         (".csv", [description(), labelled("a")], {}, "has no frames"),
-        (".csv", [markers(1)], {"from_s": math.inf}, "has no frames between --from and --to"),
+        (".csv", [markers(1)], {"from_s": math.inf}, "no frames .*--from"),
         (".sto", [frame(ComponentType.ANALOG, [])], {}, "has no analog channels"),
         (
             ".csv",
@@ -134,8 +137,6 @@ def test_a_full_disk_for_what_does_not_fit_into_memory_is_reported(
     monkeypatch.setattr(component_rows, "_IN_MEMORY_BYTES", 100)
     with Path("/dev/full").open("wb", buffering=0) as full:
         monkeypatch.setattr(component_rows, "spool_file", lambda _folder: full)
-        with pytest.raises(
-            TakeError, match=r"^a temporary file beside the new one cannot be written: No space left"
-        ):
+        with raises(TakeError, "temporary", os.strerror(errno.ENOSPC)):
             export_messages(tmp_path, messages(), "walk.trc")
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]

@@ -38,6 +38,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.mcap_file import McapFile
 from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.take import TakeSource
+from tests.support.errors import each_names, one_names, raises
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -156,9 +157,7 @@ def test_a_converted_or_unknown_unit_is_reported(tmp_path: Path) -> None:
         job = export_messages(tmp_path, [unit(name), markers(1)], f"{name}.mcap")
         assert [note for note in notes_of(job, usual=True) if "positions" in note] == expected
     job = export_messages(tmp_path, [unit("furlong"), markers(1)], "walk.mcap")
-    assert notes_of(job) == [
-        "lab: the unit of length 'furlong' is unknown; positions are shown as if it were mm"
-    ]
+    assert each_names(notes_of(job), ["lab", "'furlong'", "mm"])
 
 
 def test_visible_tools_are_transforms_from_the_source_to_their_labels(tmp_path: Path) -> None:
@@ -301,7 +300,7 @@ def test_labels_that_cannot_be_names_are_reported(tmp_path: Path) -> None:
         messages = [channels(label), frame(ComponentType.ANALOG, [1.0])]
         job = export_messages(tmp_path, messages, f"{label}.mcap")
         notes = notes_of(job, usual=True)
-        assert ("labels of analog changed to names of fields" in notes) == is_changed
+        assert one_names(notes, "labels of analog", "fields") == is_changed
         assert not any("positions" in note for note in notes)
 
 
@@ -325,7 +324,7 @@ def test_frames_with_very_many_channels_are_left_out_and_reported(tmp_path: Path
     values = np.arange(10_001).tolist()
     messages = [frame(ComponentType.ANALOG, values[1:]), frame(ComponentType.ANALOG, values, 1)]
     job = export_messages(tmp_path, messages, "walk.mcap")
-    assert notes_of(job)[1:] == ["messages with more than 10000 numbers in analog of lab left out | 1"]
+    assert each_names(notes_of(job)[1:], ["10000 numbers", "analog of lab", 1])
     [log] = read_mcap(tmp_path / "walk.mcap").topics["/lab/analog"]
     assert list(floats_of(log.content).values()) == values[1:]
 
@@ -335,7 +334,7 @@ def test_labels_that_change_all_the_time_are_an_error(
 ) -> None:
     monkeypatch.setattr("gateway.takes.export.mcap_file._MAX_CHANNELS", 50)
     messages = [frame(ComponentType.ANALOG, [0.0] * number, number) for number in range(1, 60)]
-    with pytest.raises(TakeError, match="labels in the take change so often"):
+    with raises(TakeError, "labels"):
         export_messages(tmp_path, messages, "walk.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
 
@@ -362,12 +361,13 @@ def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
     damaged = [(channel, data) for data in (truncated, too_many, message[:20], early, late)]
     damaged.append((unit("mm")[0], unit("mm")[1][:-1]))
     job = export_messages(tmp_path, [unit("mm"), markers(2), *damaged, other], "walk.mcap")
-    assert sorted(notes_of(job)) == [
-        "malformed messages of 3d of lab left out | 3",
-        "malformed messages of parameters of lab left out | 1",
-        "messages from before 1970 or after 2106 in 3d of lab left out | 2",
-        "messages of other programs or versions left out, on the channels MOCAP_LAB_OTHER | 1",
-    ]
+    assert each_names(
+        sorted(notes_of(job)),
+        ["malformed", "3d of lab", 3],
+        ["malformed", "parameters of lab", 1],
+        ["1970", "2106", "3d of lab", 2],
+        ["MOCAP_LAB_OTHER", 1],
+    )
     assert len(read_mcap(tmp_path / "walk.mcap").topics["/lab/markers"]) == 1
 
 
@@ -387,7 +387,7 @@ def test_without_foxglove_sdk_the_error_has_a_remedy(tmp_path: Path, monkeypatch
     for module in [name for name in sys.modules if name.startswith("gateway.takes.export.mcap")]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "gateway.foxglove_schemas.topics", None)
-    with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[foxglove\]'"):
+    with raises(TakeError, "'rtc3d-gateway[foxglove]'"):
         export_messages(tmp_path, [markers(1)], "walk.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
 

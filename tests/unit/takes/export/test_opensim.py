@@ -25,6 +25,7 @@ from gateway.rtc3d.parameters import (
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import Axis, ExportJob, OpenSimOptions, export_take
+from tests.support.errors import each_names, names, one_names, raises
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -146,10 +147,9 @@ def test_ground_reactions_worked_out_by_hand(tmp_path: Path) -> None:
     assert position == pytest.approx(np.array([[0.25, 0, -0.4], [0.2, 0, -0.3], [0.25, 0, -0.4]]))
     assert moment == pytest.approx(np.array([[0, 0.5, 0], [0, 0, 0], [0, 0.5, 0]]))
     rotated = "axes rotated: X is x, Y is z, Z is -y of the server; z is up by the plates"
-    assert notes_of(job) == [
-        f"walk.mot | {rotated}",
-        "walk.mot | plate 1: no contact below 10 N: force and moment are 0 | 1 of 3 samples",
-    ]
+    assert each_names(
+        notes_of(job), [f"walk.mot | {rotated}"], ["walk.mot", "plate 1", "10 N", "1 of 3 samples"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_units_of_the_server_become_newtons_and_metres(
     load = tuple(value * factors[n > 2] for n, value in enumerate(STEP))
     messages = step_messages(load, plate=replace(PLATE, channels=channels))
     job = export_messages(tmp_path, messages, "walk.mot")
-    assert "forces and moments converted to N and N.m" in notes_of(job)
+    assert one_names(notes_of(job), "forces", "N.m")
     [force], [position], [moment] = vectors_of(read_storage(tmp_path / "walk.mot"), 1)
     assert force == pytest.approx([10, 800, -20])
     assert position == pytest.approx([0.25, 0, -0.4])
@@ -173,7 +173,7 @@ def test_units_of_the_server_become_newtons_and_metres(
 def test_unknown_units_of_a_plate_are_reported(tmp_path: Path) -> None:
     channels = tuple(replace(each, unit="lb" if n < 3 else "lb.in") for n, each in enumerate(NEWTONS))
     job = export_messages(tmp_path, step_messages(STEP, plate=replace(PLATE, channels=channels)), "walk.mot")
-    assert "unknown units of plates, lb, lb.in, count as N and N.mm" in notes_of(job)
+    assert one_names(notes_of(job), "plates", "lb, lb.in", "N.mm")
 
 
 def test_positions_in_metres_are_not_converted(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_samples_that_are_missing_have_no_row(tmp_path: Path) -> None:
     reactions, channels = (read_storage(tmp_path / "out" / name) for name in ("take.mot", "take.sto"))
     for name, found in (("take.mot", reactions), ("take.sto", channels)):
         assert found.times_s - found.times_s[0] == pytest.approx(np.array(rows) / 1000, abs=2e-6)
-        assert f"{name} | rows without a value in the take left out | 2 of 200" in notes_of(job)
+        assert one_names(notes_of(job), name, "2 of 200")
     assert np.array_equal(channels.values.T.astype(np.float32), samples(0, 200)[:, rows].astype(np.float32))
     times_s = read_trc(tmp_path / "out/take.trc").times_s
     assert channels.times_s[0] == pytest.approx(times_s[0], abs=1e-6)
@@ -235,7 +235,7 @@ def test_channels_are_written_as_they_were_recorded(tmp_path: Path) -> None:
     assert np.array_equal(
         found.values.astype(np.float32), np.array(values, np.float32)[[0, 2]], equal_nan=True
     )
-    assert "emg.sto | rows without a value in the take left out | 1 of 3" in notes_of(job)
+    assert one_names(notes_of(job), "emg.sto", "1 of 3")
 
 
 def test_samples_outside_the_frames_and_other_components_are_reported(tmp_path: Path) -> None:
@@ -245,10 +245,10 @@ def test_samples_outside_the_frames_and_other_components_are_reported(tmp_path: 
     shown = SyntheticScene(markers=5, tools=1, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000)
     job = export_messages(tmp_path, scene(20, shown, keep=keep), "out", format="opensim")
     notes = notes_of(job, usual=True)
-    assert "samples of force of lab that fit no frame left out | 50 of 200" in notes
-    assert "samples of analog of lab that fit no frame left out | 50 of 200" in notes
+    assert one_names(notes, "samples of force of lab", "50 of 200")
+    assert one_names(notes, "samples of analog of lab", "50 of 200")
     assert "left out of lab: tools (6D), reliabilities of markers" in notes
-    assert "positions converted from mm to m" in " ".join(notes)
+    assert one_names(notes, "mm to m")
 
 
 def test_a_rate_that_is_no_multiple_is_reported_and_a_file_of_its_own_has_it(tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_axes_are_chosen(tmp_path: Path, up: Axis | None, forward: Axis | None, 
     values = {"x": 1, "y": 2, "z": 3, "-x": -1, "-y": -2, "-z": -3}
     position = [values[axis] / 1000 for axis in expected.split()]
     assert read_trc(tmp_path / "out/take.trc").positions[0, 0].tolist() == pytest.approx(position)
-    assert ("is a guess" in notes_of(job)[0]) is (up is None)
+    assert names(notes_of(job)[0], "guess") is (up is None)
     alone = export_messages(tmp_path, messages, "alone.trc", opensim=chosen)
     found = read_trc(tmp_path / "alone.trc")
     is_chosen = chosen.has_axes
@@ -313,7 +313,7 @@ def test_axes_are_chosen(tmp_path: Path, up: Axis | None, forward: Axis | None, 
 
 def test_one_axis_cannot_point_up_and_forward(tmp_path: Path) -> None:
     messages = step_messages(STEP)
-    with pytest.raises(SelectionError, match="z points up, so --forward cannot be -z; choose another axis"):
+    with raises(SelectionError, "--forward", "-z"):
         export_messages(tmp_path, messages, "walk.mot", opensim=OpenSimOptions(forward="-z"))
 
 
@@ -336,7 +336,7 @@ def test_bodies_are_guessed_and_reported_or_as_many_as_the_plates(tmp_path: Path
     job = export_messages(tmp_path, scene(10), "out", format="opensim")
     guess = "take.xml | which foot is on which plate is a guess: calcn_r, calcn_l; choose with --bodies"
     assert f"{guess} | 2" in notes_of(job)
-    with pytest.raises(SelectionError, match=r"each plate in take\.mot: 2, not 1"):
+    with raises(SelectionError, "take.mot: 2, not 1"):
         export_messages(tmp_path, scene(10), "b", format="opensim", opensim=OpenSimOptions(bodies=("a",)))
     assert not (tmp_path / "b").exists()
 
@@ -344,7 +344,7 @@ def test_bodies_are_guessed_and_reported_or_as_many_as_the_plates(tmp_path: Path
 def test_a_folder_that_exists_keeps_what_is_in_it(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/take.mot").write_text("mine")
-    with pytest.raises(TakeError, match=r"take\.mot exists already, and nothing is overwritten"):
+    with raises(TakeError, "take.mot", "exists already"):
         export_messages(tmp_path, scene(10), "out", format="opensim")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["take.mot"]
     (tmp_path / "out/take.mot").unlink()
@@ -364,5 +364,5 @@ def test_each_measurement_has_its_own_files(tmp_path: Path) -> None:
 def test_a_take_without_loads_or_channels_is_an_error(tmp_path: Path, name: str) -> None:
     plate = replace(PLATE, corners=())
     messages = step_messages(STEP, plate=plate) if name == "walk.mot" else [description(), labelled("a")]
-    with pytest.raises(TakeError, match=rf"take\.lcmlog has no .*, and \{name[4:]} holds nothing else"):
+    with pytest.raises(TakeError, match=rf"take\.lcmlog .*no .*\{name[4:]}"):
         export_messages(tmp_path, messages, name)

@@ -19,6 +19,7 @@ from gateway.takes.export.job import ExportJob, export_take
 from gateway.takes.files import event_log, reader
 from gateway.takes.files.tables import TIME_COLUMNS
 from tests.support.documents import ROOT
+from tests.support.errors import names, raises
 from tests.support.takes import START_UTIME, description, details, frame, parameters, record_scene
 from tests.unit.takes.export.exported import export_messages, notes_of, scene
 
@@ -103,7 +104,7 @@ def test_a_label_that_is_called_like_a_column_of_time_gets_a_number(tmp_path: Pa
     ]
     job = export_messages(tmp_path, messages, "walk.parquet")
     for name in ("time_s", "utime"):
-        assert f"the channel {name} of lab is the column {name}_2" in str(job.notes)
+        assert names(str(job.notes), f"{name}_2")
     found = pd.read_parquet(tmp_path / "walk-analog.parquet")
     assert (found["utime_2"].tolist(), found["time_s_2"].tolist()) == ([0.5], [0.25])
 
@@ -132,8 +133,6 @@ def test_without_pyarrow_the_error_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.delitem(sys.modules, "gateway.takes.export.parquet")
-    with pytest.raises(
-        TakeError, match=r"without pyarrow; install it: pip install 'rtc3d-gateway\[parquet\]'"
-    ):
+    with raises(TakeError, "pyarrow", "'rtc3d-gateway[parquet]'"):
         export_take(ExportJob(WALK, tmp_path / "walk.parquet"))
     assert not list(tmp_path.iterdir())

@@ -16,6 +16,7 @@ from gateway.takes import open_take
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.files.take import Take
+from tests.support.errors import raises
 from tests.support.takes import description, log_bytes, markers, parameters, write_take
 
 READERS: list[Callable[[Path], Any]] = [
@@ -84,7 +85,7 @@ def test_what_is_no_take_is_a_clear_error(tmp_path: Path, kind: str, read: Calla
 @pytest.mark.parametrize("name", ["a\0b", "a" * 300, "file/below"])
 def test_odd_paths(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(TakeError, match="cannot be read"):
+    with raises(TakeError, tmp_path.name):
         open_take(tmp_path / name)
 
 

@@ -14,6 +14,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.takes import open_take
 from gateway.takes.files.resampling import slerp
 from gateway.takes.files.series import Series
+from tests.support.errors import raises
 from tests.support.takes import START_UTIME, Message, description, frame, markers, write_take
 from tests.unit.takes.export.exported import NAN, labelled
 
@@ -171,21 +172,19 @@ def test_loads_are_interpolated(series: Open) -> None:
 
 
 def test_what_cannot_be_resampled_is_an_error_that_says_why(series: Open) -> None:
-    with pytest.raises(TakeError, match="events have no rate"):
+    with raises(TakeError, "events"):
         series(ComponentType.EVENT, [(0.0, [(7, 0, -1, -1, -1)])]).resample(100)
     far = series(ComponentType.ANALOG, [(0.0, [1]), (0.001, [1]), (1e6, [1])])
-    with pytest.raises(
-        TakeError, match="its 3 frames would become 1000000001 rows; resample parts by from_s"
-    ):
+    with raises(TakeError, "3 frames", "1000000001 rows", "from_s"):
         far.resample(1000)
     assert len(far.resample(1000, to_s=1)) == 1001
     with pytest.raises(TakeError, match="would become 0 rows"):
         far.resample(1000, from_s=1.0001, to_s=1.0002)
     for limits in ({"from_s": NAN}, {"to_s": math.inf}):
-        with pytest.raises(TakeError, match="give numbers, or None for all"):
+        with raises(TakeError, "None"):
             far.resample(1000, **limits)
     for rate_hz, max_gap_s in ((0, 0.1), (-1, 0.1), (NAN, 0.1), (1e9, 0.1), (100, -1)):
-        with pytest.raises(TakeError, match="cannot resample to"):
+        with raises(TakeError, "resample"):
             far.resample(rate_hz, max_gap_s=max_gap_s)
 
 

@@ -32,6 +32,7 @@ from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.series import Series
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.files.take import TakeSource
+from tests.support.errors import raises
 from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
 
 NAN = math.nan
@@ -175,9 +176,9 @@ def test_limits_of_time_sources_and_components(tmp_path: Path) -> None:
     assert list(take.sources) == ["b"]
     assert markers_in(take.sources["b"]).sequence.tolist() == [2, 3, 4]
     assert open_take(path, components=["6d"]).sources["lab"].markers is None
-    with pytest.raises(TakeError, match="no source 'c'; its sources are: lab, b"):
+    with raises(TakeError, "'c'", "lab, b"):
         open_take(path, sources=["c"])
-    with pytest.raises(TakeError, match="'3D' is no component"):
+    with raises(TakeError, "'3D'"):
         open_take(path, components="3D")
 
 

@@ -138,7 +138,7 @@ async def test_sources_and_components_are_selected_and_parameters_stay(replayed:
     assert await replayed.play(sources=frozenset({"lab"})) == keyed(messages)
     assert replayed.publication.sources.keys() == {"lab"}
     for selection in ({"sources": frozenset({"x"})}, {"start_us": 10**9}):
-        with pytest.raises(TakeError, match=r"no messages to replay with these .* --source \(stage, lab\)"):
+        with pytest.raises(TakeError, match=r"no messages .* --source \(stage, lab\)"):
             await replayed.play(**selection)
 
 
