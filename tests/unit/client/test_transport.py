@@ -6,6 +6,7 @@ import pytest
 
 from gateway.client.transport import recent_keys
 from gateway.errors import QueryError
+from tests.support.errors import raises
 
 
 def test_of_the_history_the_wanted_keys_with_recent_messages_are_used() -> None:
@@ -20,5 +21,5 @@ def test_of_the_history_the_wanted_keys_with_recent_messages_are_used() -> None:
 
 @pytest.mark.parametrize("keys", [None, [], {"3d": None}, {"3d": {}}, {"3d": {"newest_utime": "x"}}])
 def test_an_overview_that_cannot_be_read_is_an_error(keys: Any) -> None:
-    with pytest.raises(QueryError, match="cannot be read"):
+    with raises(QueryError, code="unreadable"):
         recent_keys({"keys": keys}, None, 10)

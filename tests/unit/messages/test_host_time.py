@@ -80,7 +80,6 @@ def test_a_step_is_followed_at_once_and_logged_once(
     assert clock.steps == 1
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     [message] = caplog.messages
-    assert message.startswith("the clock of this computer was set ")
     assert text[:-2] in message
 
 

@@ -17,6 +17,7 @@ from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZENOH, ZenohSettings
 from gateway.outputs.zenoh.subscriber import key_patterns
+from tests.support.errors import raises
 from tests.support.memory_output import MemoryOutput
 from tests.support.networks import (
     add_multicast_route,
@@ -167,12 +168,8 @@ def test_no_message_is_lost_while_a_receiver_of_lcm_pauses() -> None:
 
 def test_an_endpoint_without_zenoh_is_named_with_what_to_check(received: list[tuple[str, bytes]]) -> None:
     endpoint = free_endpoint()
-    with pytest.raises(OutputError) as caught:
+    with raises(OutputError, endpoint, "gateway", "router", cause="not open"):
         subscribed("zenoh", SubscriptionRequest(address=endpoint), received)
-    text = str(caught.value)
-    assert text.startswith(f"no Zenoh session to {endpoint}: ")
-    assert text.endswith("; is the gateway or the router running there?")
-    assert caught.value.cause == "not open"
 
 
 @pytest.mark.parametrize(

@@ -102,15 +102,13 @@ async def test_without_a_connection_the_error_has_the_address_or_reason_age_and_
     error = await source.parameters_error()
     assert error.code == "no-connection"
     assert names(str(error), "lab", "192.0.2.1:3020")
-    source.status.record_error("connection refused by 192.0.2.1:3020; is the RT server running?")
+    source.status.record_error("connection refused by 192.0.2.1:3020; is it on?")
     source.status.last_error_s -= 300
     source.second_status.record_error("an older error")
     source.second_status.last_error_s -= 400
     problem, _, remedy = str(await source.parameters_error(stale_ok=True)).partition("; ")
-    assert re.fullmatch(
-        r"source 'lab' has no connection: refused by 192.0.2.1:3020, tried 3..\.. s ago", problem
-    )
-    assert remedy == "is the RT server running?"
+    assert re.search(r"'lab' .*refused by 192.0.2.1:3020, .* 3..\.. s", problem)
+    assert remedy == "is it on?"
 
 
 OK = Packet(PacketType.COMMAND, b"OK-Recording")

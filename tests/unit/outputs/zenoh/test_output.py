@@ -229,7 +229,7 @@ def test_what_zenoh_refuses_is_a_config_error_with_its_reason(
         ZenohOutput(ZenohSettings.model_construct(config=config if is_inline else path))
     text = str(caught.value)
     where = "the inline zenoh.config" if is_inline else f"the file {path}"
-    assert text.startswith(f"Zenoh does not accept {where}: ")
+    assert names(text, where)
     assert reason in text
     assert ".rs:" not in text
     assert len(text.splitlines()) == 1
