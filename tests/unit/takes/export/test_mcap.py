@@ -71,8 +71,9 @@ def one_of(interval: int) -> str:
 def export(
     folder: Path, messages: Iterable[Message], *, notes: Sequence[str] = (), **options: Any
 ) -> McapContent:
+    """Return what is exported. ``notes`` are texts that the notes about it have, one of each."""
     job = export_messages(folder, messages, "walk.mcap", **options)
-    assert notes_of(job) == [*notes]
+    assert each_names(notes_of(job), *([note] for note in notes))
     return read_mcap(folder / "walk.mcap")
 
 
@@ -240,7 +241,8 @@ def test_arrows_know_the_units_of_forces_and_moments(
 def test_a_plate_whose_place_is_not_known_has_numbers_but_no_arrow(tmp_path: Path) -> None:
     unknown = plate(corners=(Point(), Point(), Point(), Point()))
     loads = [(1, 2, 300, 4, 5, 6)] * 3
-    content = export(tmp_path, [plates(unknown, plate()), frame(ComponentType.FORCE, loads)])
+    messages = [plates(unknown, plate()), frame(ComponentType.FORCE, loads)]
+    content = export(tmp_path, messages, notes=["forces of lab"])  # whose labels are the same
     assert [entity.id for entity in content.topics["/lab/forces"][0].content.entities] == ["left_2"]
     assert list(floats_of(content.topics["/lab/loads"][0].content).values()) == [1, 2, 300, 4, 5, 6] * 3
 
@@ -282,7 +284,8 @@ def test_events_are_logged_with_their_labels_and_parameters(tmp_path: Path) -> N
 def test_analog_channels_have_their_labels_as_names(tmp_path: Path) -> None:
     labels = ("EMG 1", "EMG_1", "EMG1", "emg1", "Füße", "力", "1st", "a.b", "EMG 1", "")
     values = [0.1 * number for number in range(10)]
-    content = export(tmp_path, [channels(*labels), frame(ComponentType.ANALOG, [*values, 7.0])])
+    messages = [channels(*labels), frame(ComponentType.ANALOG, [*values, 7.0])]
+    content = export(tmp_path, messages, notes=["analog channels of lab"])  # of which two have one label
     found = floats_of(content.topics["/lab/analog"][0].content)
     assert list(found) == [
         *("EMG_1", "EMG_1_2", "EMG1", "emg1", "Fu_e", "channel_6", "_1st", "a_b", "EMG_1_2_2"),
