@@ -146,8 +146,8 @@ class ParameterCache:
         try:
             answer = await self._take(packet.body, announce_always=True)
         except ParametersError as error:
-            self._keep_unreadable((), packet.body, error)
             await self._invalidate(str(error))
+            self._keep_unreadable((), packet.body, error)  # with the version that is valid now
             raise
         self._connections.append(connection)
         self._problems.recovered("the server sends its parameters again")
@@ -330,7 +330,6 @@ class ParameterCache:
 
     async def _request_sections(self, sections: Sections, everything: ServerAnswer) -> ServerAnswer:
         """Request some sections; if the server does not send single ones, return ``everything``."""
-        answer = replace(everything, sections=sections)
         if self._sends_sections:
             command, connection = SendParameters(sections), self._any_connection()
             try:
@@ -345,8 +344,12 @@ class ParameterCache:
                     parsed = await self._xml_thread.process(xml, parse_parameters)
                 except ParametersError as error:
                     return self._keep_unreadable(sections, xml, error)
-                answer = ServerAnswer(sections, xml, parsed, session, version)
-        self._answers[sections] = answer
+                self._answers[sections] = answer = ServerAnswer(sections, xml, parsed, session, version)
+                return answer
+        newest = self.newest
+        if newest is not None and newest.received_s >= everything.received_s:
+            everything = newest  # it has arrived meanwhile
+        self._answers[sections] = answer = replace(everything, sections=sections)
         return answer
 
     def _keep_unreadable(self, sections: Sections, xml: bytes, error: ParametersError) -> ServerAnswer:
