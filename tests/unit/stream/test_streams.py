@@ -170,6 +170,7 @@ async def test_a_second_connection_that_breaks_twice_in_a_row_is_given_up(
             await end(lab.server.connections[-1])
         await until(lambda: lab.limitations)
         assert lab.limitations[0].startswith(ONE_CONNECTION)
+        assert names(lab.limitations[0], "accepts one")
         await asyncio.sleep(3600)
         assert len(lab.server.connections) == 3
 
