@@ -215,6 +215,11 @@ class ExportJob:
             progress=lambda done, total: self.progress(f"reading {self.take.name}", done, total),
             spool_folder=self.out.parent,
         )
+        if take.num_recordings > 1:
+            self.note(
+                "several takes in one file: rows are in the order of time, and each occurs once",
+                amount=take.num_recordings,
+            )
         for source in take.sources.values():
             if source.is_cut_off:
                 self.note(f"INCOMPLETE: the recording of {source.name} was cut off, so its end is missing")

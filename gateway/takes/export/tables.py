@@ -3,12 +3,14 @@
 They are made while the take is read, so that its size does not matter.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
@@ -20,6 +22,8 @@ from gateway.takes.files.tables import Column, value_columns
 from gateway.takes.files.take import Take, TakeSource, utime_range
 
 _MAX_TABLES: Final = 200
+
+_PART_US: Final = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,9 @@ def _note_columns(job: ExportJob, source: str, run: Series, columns: tuple[Colum
 
 def parts_of(job: ExportJob, take: Take) -> Iterator[list[tuple[str, str, Series]]]:
     """Yield parts of the take of some MB: its components, each with the name of its source and its key."""
+    if take.num_recordings > 1:
+        yield from _parts_in_order(job)
+        return
     reader = TakeReader(job.take)
     first_utime, end_utime = utime_range(take.start_utime, job.from_s, job.to_s)
     for batches in reader.batches(end_utime):
@@ -98,3 +105,41 @@ def parts_of(job: ExportJob, take: Take) -> Iterator[list[tuple[str, str, Series
         yield found
         job.progress(f"writing {job.out.name}", reader.read_bytes, reader.num_bytes)
     job.progress(f"writing {job.out.name}", reader.num_bytes, reader.num_bytes)
+
+
+def _parts_in_order(job: ExportJob) -> Iterator[list[tuple[str, str, Series]]]:
+    """Yield what ``parts_of`` does, of several takes in one file, whose order need not be that of time."""
+    take = job.open_take(COMPONENTS_BY_KEY.keys())
+    every = [
+        _RowsInOrder(name, key, series)
+        for name, source in take.sources.items()
+        for key, series in source.series.items()
+    ]
+    total = sum(len(each.times) for each in every)
+    while waiting := [each for each in every if each.next_row < len(each.times)]:
+        end_utime = min(int(each.times[each.next_row]) for each in waiting) + _PART_US
+        yield [(each.source, each.key, run) for each in waiting for run in each.before(end_utime)]
+        job.progress(f"writing {job.out.name}", sum(each.next_row for each in every), total)
+
+
+class _RowsInOrder:
+    """The rows of a series that are still to be written; a step of the clock leaves them in their order."""
+
+    def __init__(self, source: str, key: str, series: Series) -> None:
+        self.source, self.key = source, key
+        self.times = np.maximum.accumulate(series.utime)
+        self.next_row = 0
+        self._runs = deque(series.runs())
+        self._first_row = 0  # of the first run that is left
+
+    def before(self, end_utime: int) -> Iterator[Series]:
+        """Yield the rows before a time, in parts with constant labels."""
+        stop = int(np.searchsorted(self.times, end_utime))
+        while self.next_row < stop:
+            run = self._runs[0]
+            end = min(stop, self._first_row + len(run))
+            yield run.rows(np.arange(self.next_row - self._first_row, end - self._first_row))
+            self.next_row = end
+            if end == self._first_row + len(run):
+                self._first_row = end
+                self._runs.popleft()

@@ -92,6 +92,30 @@ class EventLogReader:
         """
         return filter(None, self.collect({}, start_offset, stop_offset))
 
+    def utimes_of(self, fingerprint: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield the time and the channel of each message of a type, without reading the other events.
+
+        This takes a small part of the time of ``events``. What cannot be read has no messages.
+        """
+        longest = _HEADER_BYTES + MAX_CHANNEL_BYTES
+        kept = b""
+        try:
+            with open_file(self.path) as file:
+                while data := file.read(_READ_BYTES):
+                    data = kept + data
+                    # A message that was wholly in the bytes before has been found.
+                    message = data.find(fingerprint, max(len(kept) - len(fingerprint) + 1, 0))
+                    while message >= 0:
+                        start = data.rfind(SYNC, max(message - longest, 0), message)
+                        if start >= 0 and start + _HEADER_BYTES <= message:
+                            _, _, utime, channel_bytes, _ = _HEADER.unpack_from(data, start)
+                            if start + _HEADER_BYTES + channel_bytes == message:
+                                yield utime, data[start + _HEADER_BYTES : message]
+                        message = data.find(fingerprint, message + 1)
+                    kept = data[-(longest + len(fingerprint)) :]
+        except (OSError, ValueError):
+            return
+
     def collect(
         self, columns: Mapping[bytes, EventColumns], start_offset: int = 0, stop_offset: int | None = None
     ) -> Iterator[Event | None]:

@@ -24,9 +24,13 @@ def join_series(parts: Sequence[Series]) -> Series:
     }
     entries: list[Array] = []
     parameters: list[ParametersEntry] = []
-    for content in contents:
-        entries.append(np.where(content.entries >= 0, content.entries.astype(np.int64) + len(parameters), -1))
-        parameters += content.parameters
+    for number, content in enumerate(contents):
+        if number and content.parameters is contents[number - 1].parameters:  # of takes in one file
+            first = len(parameters) - len(content.parameters)
+        else:
+            first = len(parameters)
+            parameters += content.parameters
+        entries.append(np.where(content.entries >= 0, content.entries.astype(np.int64) + first, -1))
     if all(before.utime.max() < after.utime.min() for before, after in pairwise(parts)):
         order = np.arange(len(columns["utime"]))
     else:

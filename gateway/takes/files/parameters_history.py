@@ -56,6 +56,16 @@ class ParametersHistory:
         return self.newest
 
 
+def changes_in_order(parameters: Sequence[ParametersEntry]) -> list[ParametersEntry]:
+    """Return the parameters of several recordings in the order of time, without repeated ones."""
+    found: list[ParametersEntry] = []
+    for entry in sorted(parameters, key=lambda entry: entry.utime):
+        is_same_version = bool(found) and found[-1].version == entry.version
+        if not (is_same_version and differ_in_statistics_only(found[-1].xml, entry.xml)):
+            found.append(entry)
+    return found
+
+
 def entries_of_rows(utime: Array, version: Array, parameters: Sequence[ParametersEntry]) -> Array:
     """Return the index of the parameters that describe each row; -1 if there are none.
 

@@ -104,6 +104,8 @@ _KEYS: Final[dict[type[Any], str]] = {
 }
 
 
+_DESCRIPTION: Final[bytes] = rtc3d.take_t._get_packed_fingerprint()  # noqa: SLF001 - see encode.py
+
 DESCRIPTIONS: Final = frozenset({"take", "details", "end"})
 """The keys of messages that are in files only, without numbers."""
 
@@ -173,6 +175,20 @@ class TakeReader:
         self._routes: dict[tuple[str, bytes], tuple[str, str] | None] = {}  # by channel and fingerprint
         self.start_utime: int = next(self.events()).utime
         """The time of the first event."""
+
+    def first_utime(self) -> int:
+        """Return the time of the first moment; with several takes in one file, that of the earliest of them.
+
+        To find these takes, the files are searched for descriptions, which takes as long as the disk does.
+        """
+        utimes = [self.start_utime]
+        for log in self.logs:
+            described: set[bytes] = set()
+            for utime, channel in log.utimes_of(_DESCRIPTION):
+                if channel in described:
+                    utimes.append(utime)
+                described.add(channel)
+        return min(utimes)
 
     @property
     def num_bytes(self) -> int:
@@ -252,8 +268,11 @@ class TakeReader:
 
         This is the fast way to read everything. A batch ends before parameters that differ from those
         before, and before another take in the same file. What comes more than 10 s after ``end_utime`` is
-        not read: nothing before it arrives so late. Raises TakeError, also if there are no such messages.
+        not read: nothing before it arrives so late, unless an earlier take follows in the same file. Raises
+        TakeError, also if there are no such messages.
         """
+        if math.isfinite(end_utime) and self.first_utime() < self.start_utime:
+            end_utime = math.inf
         for batches in self._batches():
             # `all` stops at the first batch with an earlier message, so that reading a whole take stays fast.
             if batches and all(min(batch.utimes) > end_utime + _MAX_LATE_US for batch in batches):

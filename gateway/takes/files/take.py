@@ -17,7 +17,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.joined import join_series
-from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory
+from gateway.takes.files.parameters_history import ParametersEntry, ParametersHistory, changes_in_order
 from gateway.takes.files.reader import MessageBatch, TakeReader
 from gateway.takes.files.series import MAX_GAP_S, Series, SeriesBuilder
 
@@ -86,7 +86,8 @@ class Take:
     takes in one file (``cat``), it is that of the earliest.
     ``num_damaged`` places of the files, with ``damaged_bytes`` in all, could not be read. ``unknown`` is how
     many messages have a type that is none of a gateway's, by channel. ``path`` is None if it was collected
-    live, or joined from several takes.
+    live, or joined from several takes. ``num_recordings`` is how many takes somebody has put into one file:
+    the rows of all are in the order of time, and each occurs once.
     """
 
     path: Path | None
@@ -95,6 +96,7 @@ class Take:
     num_damaged: int = 0
     damaged_bytes: int = 0
     unknown: dict[str, int] = field(default_factory=dict)
+    num_recordings: int = 1
 
     def __repr__(self) -> str:
         """Return a summary."""
@@ -173,7 +175,8 @@ def open_take(
     if not readers:
         raise TakeError("there is no take to open; name at least one")
     takes: list[Take] = []
-    start_utime = readers[0].start_utime
+    is_part = from_s is not None or to_s is not None
+    start_utime = min(reader.first_utime() if is_part else reader.start_utime for reader in readers)
     first_utime, end_utime = utime_range(start_utime, from_s, to_s)
     total = sum(reader.num_bytes for reader in readers)
     chosen = COMPONENTS_BY_KEY.keys() if components is None else components
@@ -189,6 +192,7 @@ def open_take(
         take = Take(reader.path, begin_utime, sources_of_take)
         take.num_damaged, take.damaged_bytes = reader.num_damaged, reader.damaged_bytes
         take.unknown = dict(reader.unknown)
+        take.num_recordings = loader.num_recordings
         takes.append(take)
     if progress is not None:  # what comes after ``to_s`` is not read
         progress(total, total)
@@ -223,6 +227,7 @@ def _join_takes(takes: Sequence[Take]) -> Take:
         sum(take.num_damaged for take in takes),
         sum(take.damaged_bytes for take in takes),
         dict(unknown),
+        sum(take.num_recordings for take in takes),
     )
 
 
@@ -277,16 +282,19 @@ class TakeLoader:
     ) -> None:
         self._wanted, self._components, self._spool_folder = sources, components, spool_folder
         self._sources: dict[str, TakeSource] = {}
-        self._statuses: dict[str, bytes] = {}  # the newest, by source
-        self._histories: dict[str, ParametersHistory] = {}  # by source
+        self._statuses: dict[str, tuple[int, bytes]] = {}  # the newest and its time, by source
+        self._histories: dict[tuple[str, int], ParametersHistory] = {}  # by source and recording
         self._builders: dict[tuple[str, str, int], SeriesBuilder] = {}  # by source, component and recording
         self.earliest_utime = math.inf
         """The time of the earliest message of takes that follow another one in its file."""
+        self.num_recordings = 1
+        """How many takes follow each other in one file."""
         self._num_open: Counter[str] = Counter()  # files that should have an end, and have none so far
 
     def add(self, batch: MessageBatch, first_utime: float = -math.inf, end_utime: float = math.inf) -> None:
         """Take messages in a range of time; parameters are taken from the whole take."""
         if batch.recording:
+            self.num_recordings = max(self.num_recordings, batch.recording + 1)
             self.earliest_utime = min(self.earliest_utime, *batch.utimes)
         if self._wanted is not None and batch.source not in self._wanted:
             return
@@ -307,10 +315,13 @@ class TakeLoader:
 
     def _describe_all(self, source: TakeSource, batch: MessageBatch) -> None:
         if batch.key == "status":
-            self._statuses[source.name] = batch.messages[-1]
+            known = self._statuses.get(source.name)
+            # Within a recording, the last one counts, also after a step of the clock.
+            if known is None or not batch.recording or known[0] <= batch.utimes[-1]:
+                self._statuses[source.name] = batch.utimes[-1], batch.messages[-1]
         for message in batch.messages:
             if batch.key != "status" or not source.server:
-                self._describe(source, batch.key, message)
+                self._describe(source, batch.key, message, batch.recording)
 
     def _builder(self, batch: MessageBatch) -> SeriesBuilder:
         identity = (batch.source, batch.key, batch.recording)
@@ -330,6 +341,8 @@ class TakeLoader:
         """Return the sources with their arrays. ``is_whole`` tells whether the end of the take was read."""
         for source in self._sources.values():
             source.is_cut_off = is_whole and self._num_open[source.name] > 0
+            if self.num_recordings > 1:
+                source.parameters = changes_in_order(source.parameters)
         parts: dict[tuple[str, str], list[Series]] = {}
         for (name, key, _), builder in self._builders.items():
             series = builder.build(self._sources[name].parameters, start_utime)
@@ -337,18 +350,18 @@ class TakeLoader:
                 parts.setdefault((name, key), []).append(series)
         for (name, key), found in parts.items():
             setattr(self._sources[name], _FIELDS[key], join_series(found))
-        for name, message in self._statuses.items():
+        for name, (_, message) in self._statuses.items():
             self._sources[name].frame = _frame_of(message)
         return self._sources
 
-    def _describe(self, source: TakeSource, key: str, message: bytes) -> None:
+    def _describe(self, source: TakeSource, key: str, message: bytes, recording: int = 0) -> None:
         try:
             decoded = decode(message)
         except ProtocolError:
             source.malformed[key] += 1
             return
         if key == "parameters":
-            history = self._histories.setdefault(source.name, ParametersHistory())
+            history = self._histories.setdefault((source.name, recording), ParametersHistory())
             entry = history.add(decoded)
             if entry is not None:
                 source.parameters.append(entry)
