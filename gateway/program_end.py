@@ -77,7 +77,8 @@ class _OpenObjects:
         while others := [
             thread
             for thread in threading.enumerate()
-            if not (thread.daemon or thread in mine or thread.name.endswith(_ZENOH_THREAD))
+            if thread.is_alive()  # not if Ctrl-C has interrupted its join: Python takes it as stopped
+            and not (thread.daemon or thread in mine or thread.name.endswith(_ZENOH_THREAD))
         ]:
             for thread in others:
                 thread.join()

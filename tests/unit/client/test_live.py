@@ -15,7 +15,7 @@ from gateway.client.client import GatewayAddress
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.live_frames import ClockDifference, Frame, Sent
 from gateway.client.live_join import MAX_WAIT_S
-from gateway.client.live_stream import Live, live
+from gateway.client.live_stream import _MAX_WAIT_S, Live, live
 from gateway.errors import SelectionError
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.takes.files.series import Series
@@ -304,7 +304,7 @@ def test_a_component_that_stops_is_awaited_once(monkeypatch: pytest.MonkeyPatch)
     data._decode()
     assert [each.sequence for each in data._ready] == [0, 1]
     data.feed([ones(MARKERS, 2)])
-    assert data._decode() is None
+    assert data._decode() == _MAX_WAIT_S
     assert [each.sequence for each in data._ready] == [0, 1, 2]
 
 
@@ -332,6 +332,23 @@ async def test_frames_can_be_awaited() -> None:
         if len(found) == 2:
             data.close()
     assert found == [0, 1]
+
+
+def test_a_program_to_which_nothing_comes_does_not_wait_without_an_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Python does not see a Ctrl-C that comes just before it begins to wait."""
+    data = Fed()
+    waits: list[float | None] = []
+
+    def wait(_num_seen: int, timeout_s: float | None) -> None:
+        waits.append(timeout_s)
+        data.close()
+
+    monkeypatch.setattr(data._reception, "wait", wait)
+    assert list(data) == []
+    assert waits != []
+    assert None not in waits
 
 
 def test_a_function_gets_each_frame_until_it_is_closed() -> None:
