@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from gateway import __version__
+from gateway.descriptions.labels import printable
 from gateway.errors import SelectionError, TakeError
 from gateway.takes.export.job import ExportJob
 from gateway.takes.files.take import Take
@@ -125,7 +126,7 @@ def note_label(job: ExportJob, what: str, text: str, label: str) -> None:
 
 def _describe(job: ExportJob) -> None:
     """Write what belongs to the whole data set."""
-    name = job.out.resolve().name
+    name = printable(job.out.resolve().name)  # which need not be UTF-8
     description = {
         "Name": name,
         "BIDSVersion": _VERSION,

@@ -50,7 +50,9 @@ _BLOCK_ROWS: Final = 4000
 def export_opensim(job: ExportJob) -> None:
     """Write each measurement of each source to files in a folder, which is created if it does not exist."""
     job.files.create_folder(job.out)
-    job = replace(job, out=job.out / f"{job.take.absolute().name.removesuffix(SUFFIX)}.trc")
+    # The names are in XML, too, which has no place for bytes that are not UTF-8.
+    name = printable(job.take.absolute().name.removesuffix(SUFFIX)) or "take"
+    job = replace(job, out=job.out / f"{name}.trc")
     named = named_measurements(job, ("3d", "analog", "force"), "markers, analog channels or forces")
     written: Counter[tuple[str, str]] = Counter()
     for measurement, path in named:
@@ -177,7 +179,7 @@ class _PlateLoads(NamedTuple):
         return [plan for plan, _ in self.plates]
 
     def blocks(
-        self, min_force_n: float, progress: Callable[[int, int], None]
+        self, min_force_n: float, pressed_signs: Sequence[int], progress: Callable[[int, int], None]
     ) -> Iterator[tuple[Array, Array, list[GroundReactions]]]:
         """Yield parts of the samples: their times, whether all loads are known, and each plate's reactions.
 
@@ -186,13 +188,14 @@ class _PlateLoads(NamedTuple):
         for start, stop, times in self.samples.blocks(progress):
             is_known = np.full(len(times), True)
             found = []
-            for plan, placed in self.plates:
+            for (plan, placed), pressed_sign in zip(self.plates, pressed_signs, strict=True):
                 newtons, _ = units_of(plan.plate)
                 centre = plan.geometry.corners.mean(axis=0) * self.metres
                 with np.errstate(invalid="ignore"):  # any bits that are a NaN, and infinity
                     loads = _loads_of(plan, placed.block(start, stop))
                     loads = loads * newtons * ([1.0] * 3 + [self.metres] * 3)
-                    found.append(ground_reactions(loads, plan.geometry.rotation[:, 2], centre, min_force_n))
+                    normal = plan.geometry.rotation[:, 2]
+                    found.append(ground_reactions(loads, normal, centre, min_force_n, pressed_sign))
                 is_known &= np.isfinite(loads).all(axis=1)
             yield times, is_known, found
 
@@ -213,12 +216,11 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
     """Write forces, centres of pressure and free moments of all plates."""
     chosen_n = job.opensim.min_force_n
     min_force_n = MIN_FORCE_N if chosen_n is None else chosen_n
-    signs = _signs(job, path, loads, rotation, min_force_n)
+    signs, pressed_signs = _signs(job, path, loads, rotation, min_force_n)
 
     def blocks() -> Iterator[tuple[Array, Array]]:
-        for times, is_known, found in loads.blocks(
-            min_force_n, partial(job.progress, f"writing {path.name}")
-        ):
+        progress = partial(job.progress, f"writing {path.name}")
+        for times, is_known, found in loads.blocks(min_force_n, pressed_signs, progress):
             vectors = [
                 vector @ rotation.T
                 for reactions, sign in zip(found, signs, strict=True)
@@ -238,22 +240,29 @@ def _identifiers(plan: PlatePlan) -> tuple[str, str, str]:
 
 def _signs(
     job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array, min_force_n: float
-) -> list[float]:
+) -> tuple[list[float], list[int]]:
     """Return -1 for each plate whose loads are those on the plate, 1 for those on the person.
 
-    The force on a person points up. Cubes are summed, so that steps decide, and not hours of the small force
+    Also return the sign of the force along the normal of each plate while something presses it. The force on
+    a person points up. Cubes are summed, so that steps decide, and not hours of the small force
     that an empty plate shows.
     """
-    sums, num_contacts = np.zeros(len(loads.plans)), np.zeros(len(loads.plans), int)
+    sums, normal_sums = np.zeros(len(loads.plans)), np.zeros(len(loads.plans))
+    num_positive, num_negative = np.zeros(len(loads.plans), int), np.zeros(len(loads.plans), int)
     num_known = 0
     progress = partial(job.progress, f"reading the forces of {path.name}")
-    for _, is_known, found in loads.blocks(min_force_n, progress):
+    for _, is_known, found in loads.blocks(min_force_n, [0] * len(loads.plans), progress):
         num_known += int(np.count_nonzero(is_known))
         for index, reactions in enumerate(found):
             forces = reactions.forces[is_known]
             sums[index] += ((forces @ rotation[1]) ** 3).sum()
-            num_contacts[index] += np.count_nonzero(forces.any(axis=1))
+            normal_forces = forces @ loads.plans[index].geometry.rotation[:, 2]
+            normal_sums[index] += (normal_forces**3).sum()
+            num_positive[index] += np.count_nonzero(normal_forces > 0)
+            num_negative[index] += np.count_nonzero(normal_forces < 0)
     signs = []
+    pressed_signs = np.where(normal_sums < 0, -1, 1)
+    num_contacts = np.where(normal_sums < 0, num_negative, num_positive)
     for plan, total, num_contact in zip(loads.plans, sums.tolist(), num_contacts.tolist(), strict=True):
         is_vertical = abs(float(plan.geometry.rotation[:, 2] @ rotation[1])) > _VERTICAL
         signs.append(-1.0 if is_vertical and total < 0 else 1.0)
@@ -265,7 +274,7 @@ def _signs(
             path.name,
             f"{num_known - num_contact} of {num_known} samples",
         )
-    return signs
+    return signs, pressed_signs.tolist()
 
 
 def _write_sto(job: ExportJob, path: Path, analog: _Samples) -> None:

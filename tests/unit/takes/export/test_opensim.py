@@ -197,7 +197,19 @@ def test_forces_on_the_plate_become_those_on_the_person(tmp_path: Path) -> None:
 def test_the_offset_of_an_empty_plate_does_not_reverse_the_forces_of_a_step(tmp_path: Path) -> None:
     offset = (0.0, 0.0, -15.0, 0.0, 0.0, 0.0)
     export_messages(tmp_path, step_messages(*[offset] * 100, STEP), "walk.mot")
-    assert vectors_of(read_storage(tmp_path / "walk.mot"), 1)[0][:, 1].tolist() == [-15] * 100 + [800]
+    assert vectors_of(read_storage(tmp_path / "walk.mot"), 1)[0][:, 1].tolist() == [0] * 100 + [800]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_force_that_would_pull_at_the_plate_is_no_contact(tmp_path: Path, sign: float) -> None:
+    """Whether the forces on the person or those on the plate were recorded; the note does not count it."""
+    loads = [tuple(sign * value for value in load) for load in (STEP, (0, 0, -20, 1, 1, 1), STEP)]
+    job = export_messages(tmp_path, step_messages(*loads), "walk.mot")
+    force, position, moment = vectors_of(read_storage(tmp_path / "walk.mot"), 1)
+    assert force[:, 1].tolist() == [800, 0, 800]
+    assert position[1] == pytest.approx([0.2, 0, -0.3])
+    assert not moment[1].any()
+    assert one_names(notes_of(job), "plate 1: no contact", "1 of 3 samples")
 
 
 def test_the_limit_of_contact_is_chosen(tmp_path: Path) -> None:
