@@ -88,17 +88,19 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     """
     order = _by_sequence(run.sequence)
     frames: Frames = slice(0, len(run)) if order is None else order
+    sequence = run.sequence[frames]
     num_repeated = 0
     has_time_stamps = by_time_stamps
     if by_time_stamps:
         is_new = _is_new(run.timestamp_us[frames], run.frame_number[frames])
         if is_new is not None:
             num_repeated = len(is_new) - int(is_new.sum())
+            sequence = _without_repeated(sequence, is_new)
             frames = np.flatnonzero(is_new) if order is None else order[is_new]
         has_time_stamps = _mostly_progresses(run.timestamp_us[frames])
     times = run.timestamp_us[frames] if has_time_stamps else run.capture_utime[frames]
     numbers = run.frame_number[frames]
-    whole = RunTimes(run.sequence[frames], numbers, times, number_step(numbers))
+    whole = RunTimes(sequence, numbers, times, number_step(numbers))
     grids, is_dense = _grids(whole, frames, run.rate_hz, has_time_stamps=has_time_stamps)
     changes = rate_changes(whole) if is_dense else []
     if changes:
@@ -235,6 +237,24 @@ def _is_new(stamps: Array, numbers: Array) -> Array | None:
         is_same = (np.diff(stamps[near]) == 0) & (np.diff(numbers[near]) == 0)
         is_new[max(start, 1) : stop] = ~is_same | np.isin(stamps[max(start, 1) : stop], NO_TIMES_US)
     return is_new if 1 < is_new.sum() < len(is_new) else None
+
+
+def _without_repeated(sequence: Array, is_new: Array) -> Array:
+    """Return the gateway's numbers of the new frames as if it had not counted those that repeat them.
+
+    Otherwise, the places of the repeated ones would be empty rows.
+    """
+    numbers = sequence[is_new]
+    steps = np.diff(numbers)
+    copies = number_step(numbers)
+    if copies > 1 and np.count_nonzero(steps % copies) <= _FEW * len(steps):
+        counted = np.round(steps / copies).astype(np.int64).clip(1)  # of lost frames, all copies are missing
+        return np.concatenate([[0], np.cumsum(counted)])
+    found: Array = (sequence - np.cumsum(~is_new))[is_new]
+    return found
+
+
+_FEW: Final = 0.2
 
 
 def _by_sequence(sequence: Array) -> Array | None:

@@ -15,12 +15,18 @@ from gateway.takes.files.take import TakeSource
 from tests.support.takes import START_UTIME, markers, parameters, write_take
 
 
-def series(tmp_path: Path, rows: list[tuple[int, int]], announced_hz: float | None = 100.0) -> Series:
+def series(
+    tmp_path: Path, rows: list[tuple[int, int]], announced_hz: float | None = 100.0, **options: int
+) -> Series:
     """Return markers with these sequence numbers and time stamps in µs; capture has a jitter of 3 ms."""
     jitter = np.random.default_rng(3)
     messages = [
         markers(
-            1, sequence, timestamp_us=time, utime=START_UTIME + sequence * 10_000 + int(jitter.integers(3000))
+            1,
+            sequence,
+            timestamp_us=time,
+            utime=START_UTIME + sequence * 10_000 + int(jitter.integers(3000)),
+            **options,
         )
         for sequence, time in rows
     ]
@@ -139,3 +145,22 @@ def test_the_rate_of_capture_is_the_slope_through_all_frames(
     single = series(tmp_path, [(0, 0)])
     [placed] = place(single)
     assert measurement._replace(base=single, grid=placed).captured_rate_hz is None
+
+
+@pytest.mark.parametrize("lost", [(), (4, 11)])
+@pytest.mark.parametrize("every", [1, 3])
+def test_frames_sent_twice_leave_no_empty_rows_without_frame_numbers(
+    tmp_path: Path, lost: tuple[int, ...], every: int
+) -> None:
+    """The gateway counts them, and its numbers are the only ones if the server has none."""
+    rows: list[tuple[int, int]] = []
+    sequence = 0
+    for number in range(60):
+        for _ in range(2 if number % every == 0 else 1):
+            if number not in lost:
+                rows.append((sequence, 5_000_000 + 10_000 * number))
+            sequence += 1
+    found = place(series(tmp_path, rows, frame_number=7))[0]
+    assert found.rows.tolist() == [number for number in range(60) if number not in lost]
+    assert (found.rate_hz, len(found.skipped_rows)) == (100, 0)
+    assert found.num_repeated == len(rows) - len(found.rows)
