@@ -63,7 +63,16 @@ async def view_process(endpoint: str, *, is_required: bool, opens_browser: bool)
         with contextlib.suppress(OSError), socket.create_server((_HOST, candidate)) as test:
             port = int(test.getsockname()[1])
             break
-    command = [sys.executable, "-m", "gateway", "view", "--connect", endpoint, "--port", str(port)]
+    command = [
+        sys.executable,
+        "-m",
+        "gateway.cli.demo_view",
+        "view",
+        "--connect",
+        endpoint,
+        "--port",
+        str(port),
+    ]
     if not (is_required and opens_browser):
         command.append("--no-browser")
     # A session of its own: Ctrl-C in the terminal must not end it before the demo does.

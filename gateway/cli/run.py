@@ -235,9 +235,16 @@ def _stop_event() -> "asyncio.Event":
     import asyncio
 
     stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    _call_at_stop(stop.set)
     return stop
+
+
+def _call_at_stop(function: Callable[[], object]) -> None:
+    """Call a function of the running event loop at Ctrl-C and SIGTERM."""
+    import asyncio
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, function)
 
 
 @options.with_options
@@ -284,8 +291,17 @@ def demo(
     )
 
     async def play() -> bool:
-        stop = asyncio.Event() if run_s is not None else _stop_event()
-        return await run_demo(scene, stop, Console(), seconds=run_s, udpm=udpm, view=watch)
+        stop = _stop_event()
+        running = asyncio.ensure_future(
+            run_demo(scene, stop, Console(), seconds=run_s, udpm=udpm, view=watch)
+        )
+        if run_s is not None:  # it ends before it is complete, and has nothing to report
+            _call_at_stop(running.cancel)
+        return await running
 
-    if not uvloop.run(play()):
+    try:
+        is_complete = uvloop.run(play())
+    except asyncio.CancelledError:
+        raise typer.Exit(130) from None
+    if not is_complete:
         raise typer.Exit(1)

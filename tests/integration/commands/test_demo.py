@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,6 +23,7 @@ from gateway.outputs.lcm.settings import LCM
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
+from tests.support.waiting import wait_until_async
 
 
 class StallingScene(SyntheticScene):
@@ -114,3 +116,50 @@ def _with_deaf_subscriber(every: int) -> Any:
         return side._replace(subscribe=subscribe)
 
     return replace(kind, demo=demo_side)
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_a_demo_that_is_interrupted_ends_quietly(number: signal.Signals) -> None:
+    """It publishes meanwhile, and reports no losses: it is not complete."""
+    process = await started_demo()
+    process.send_signal(number)
+    output, errors = await process.communicate()
+    assert (process.returncode, errors) == (130, b"")
+    assert b"lost" not in output.splitlines()[-1]
+
+
+@pytest.mark.netns
+async def test_the_view_ends_with_a_demo_that_is_killed() -> None:
+    process = await started_demo()
+    views = children(process.pid)
+    assert views != []
+    process.kill()
+    await process.communicate()
+    await wait_until_async(lambda: not any(is_alive(each) for each in views))
+
+
+async def started_demo() -> asyncio.subprocess.Process:
+    """Start a demo that would run for long; return it when it has its view and shows what it receives."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "gateway", "demo", "--seconds", "1000"),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env=os.environ | {"COLUMNS": "200", "FORCE_COLOR": "1"},
+    )
+    assert process.stdout is not None
+    while b"3d" not in (line := await process.stdout.readline()):
+        assert line
+    return process
+
+
+def children(pid: int) -> list[int]:
+    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs, and is no zombie."""
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
