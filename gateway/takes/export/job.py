@@ -215,14 +215,18 @@ class ExportJob:
             progress=lambda done, total: self.progress(f"reading {self.take.name}", done, total),
             spool_folder=self.out.parent,
         )
+        for source in take.sources.values():
+            if source.is_cut_off:
+                self.note(f"INCOMPLETE: the recording of {source.name} was cut off, so its end is missing")
+            if source.num_lost:
+                self.note(
+                    f"INCOMPLETE: messages of {source.name} that its recorder lost", amount=source.num_lost
+                )
         if take.num_recordings > 1:
             self.note(
                 "several takes in one file: rows are in the order of time, and each occurs once",
                 amount=take.num_recordings,
             )
-        for source in take.sources.values():
-            if source.is_cut_off:
-                self.note(f"INCOMPLETE: the recording of {source.name} was cut off, so its end is missing")
         if take.num_damaged:
             places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"
             self.note(f"the take is damaged at {places}", amount=f"{take.damaged_bytes} bytes")

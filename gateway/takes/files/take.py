@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from gateway.config.words import spelling_hint
 from gateway.errors import ProtocolError, SelectionError, TakeError
 from gateway.logs.safe_text import quoted
 from gateway.messages.coordinate_frame import CoordinateFrame
@@ -169,7 +170,10 @@ def open_take(
     components = [components] if isinstance(components, str) else components
     unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
     if unknown:
-        raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
+        hint = spelling_hint(min(unknown), COMPONENTS_BY_KEY)
+        raise SelectionError(
+            f"{min(unknown)!r} is no component{hint}; choose from {', '.join(COMPONENTS_BY_KEY)}"
+        )
     paths = [path] if isinstance(path, Path | str) else path
     readers = sorted((TakeReader(Path(each)) for each in paths), key=lambda reader: reader.start_utime)
     if not readers:
@@ -201,7 +205,8 @@ def open_take(
         known = dict.fromkeys(name for reader in readers for name in reader.source_names)
         names = ", ".join(known) or "none of a gateway"
         opened = ", ".join(str(reader.path) for reader in readers)
-        raise SelectionError(f"{opened} has no source {min(missing)!r}; its sources are: {names}")
+        hint = spelling_hint(min(missing), known)
+        raise SelectionError(f"{opened} has no source {min(missing)!r}{hint}; its sources are: {names}")
     return takes[0] if len(takes) == 1 else _join_takes(takes)
 
 

@@ -334,3 +334,10 @@ def test_a_take_that_was_cut_off_is_reported_first(has_end: bool, tmp_path: Path
     job = job_for(".csv", take, tmp_path / "out")
     export_take(job)
     assert job.notes[0].what.startswith("INCOMPLETE") == (not has_end)
+
+
+def test_messages_that_the_recorder_lost_are_reported_first(tmp_path: Path) -> None:
+    job = job_for(".csv", recorded(tmp_path, "a", 0, num_lost=7), tmp_path / "out")
+    export_take(job)
+    assert job.notes[0].what.startswith("INCOMPLETE")
+    assert job.notes[0].amount == "7"

@@ -9,7 +9,7 @@ import pytest
 import rtc3d
 
 from gateway.client.transport import Reply
-from gateway.errors import TakeError
+from gateway.errors import SelectionError, TakeError
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
@@ -359,3 +359,10 @@ def test_summaries_are_short(tmp_path: Path) -> None:
     assert "lab" in repr(take)
     take.sources = {f"source {number}": source for number in range(1000)}
     assert len(repr(take)) < 200
+
+
+@pytest.mark.parametrize("chosen", [{"sources": "lob"}, {"components": "3D"}])
+def test_a_misspelt_choice_names_the_similar_one(tmp_path: Path, chosen: dict[str, str]) -> None:
+    """A source or a component that does not exist is mostly a slip of the finger."""
+    with pytest.raises(SelectionError, match=r"did you mean '(lab|3d)'"):
+        open_take(recorded(tmp_path, "a", 0), **chosen)  # type: ignore[arg-type]
