@@ -14,6 +14,7 @@ from gateway.simulator.c3d_scene import C3dScene
 from tests.support.commands import run_in_process
 from tests.support.takes import description, details, frame, markers, record_scene, write_take
 from tests.unit.takes.export.exported import labelled
+from tests.unit.takes.export.test_rosbag import status
 
 WALK = Path(__file__).parents[2] / "examples/walk.lcmlog"
 VALIDATOR = Path(sys.executable).with_name("bids-validator-deno")
@@ -57,6 +58,7 @@ def test_the_official_validator_finds_no_error(tmp_path: Path) -> None:
     for source in ("lab-a", "Studio B"):
         messages += [details("Ä 7", "1/2", "left\\knee", source)]
         messages += [markers(3, number, source=source, session=number // 10) for number in range(20)]
+    messages.append(status("world", (0.0, 0.0, 0.6, 0.8), 2e-3))
     messages += [labelled('a\t"b', "", "ü" * 200), frame(ComponentType.EVENT, [(7, 5_000, -1, -1, -1)], 2)]
     messages += [
         frame(ComponentType.MARKERS, [(1, 2, 3, 0)] * 3, number, source="lab") for number in range(3)

@@ -38,6 +38,7 @@ from gateway.takes.export.measurements import (
 )
 from gateway.takes.export.number_text import number_rows, rounded
 from gateway.takes.export.plates import unit_notes
+from gateway.takes.export.source_frame import frame_of, is_of_server
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import Take, TakeSource
 
@@ -282,9 +283,22 @@ def _sidecar(data_set: DataSet, recording: _Recording, channels: list[_Channel])
 def _reference_frame(measurement: Measurement) -> dict[str, str]:
     """Return the description of the axes; where they point to is not known."""
     text = f"Origin and axes of the motion-capture server of {measurement.source.name}."
+    frame = frame_of(measurement.source)
+    if not is_of_server(frame):
+        text += (
+            f" Their transform to the frame {printable(frame.frame_id)} is not applied: to scale by "
+            f"{frame.scale:.9g}, to rotate by the quaternion (x, y, z, w) {_numbers(frame.rotation_xyzw)}, "
+            f"and to move by {_numbers(frame.translation_m)} m."
+        )
+    elif measurement.source.frame:
+        text += f" They are the frame {printable(frame.frame_id)}."
     if measurement.base.key == "force":
         text += " Moments are about the centre of the surface of the plate."
     return {"RotationRule": "right-hand", "Description": text}
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return f"({', '.join(f'{value:.9g}' for value in values)})"
 
 
 _EVENT_COLUMNS: Final = {

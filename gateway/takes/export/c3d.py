@@ -22,6 +22,7 @@ from gateway import version_text
 from gateway.descriptions.force_plates import ADDED_LABELS, CALIBRATED, calibration_of
 from gateway.descriptions.labels import EventText, event_text, fitting_labels, printable
 from gateway.errors import TakeError
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.takes.export.c3d_content import (
     MAX_LIST,
     C3dContent,
@@ -38,6 +39,7 @@ from gateway.takes.export.measurements import (
     utc_text,
 )
 from gateway.takes.export.plates import PlatePlan
+from gateway.takes.export.source_frame import frame_of
 from gateway.takes.files.component_rows import Array
 
 _BLOCK_BYTES: Final = 512
@@ -193,6 +195,8 @@ def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -
         "DATE_TIME": [utc_text(content.measurement, content.start_s)],
         "TIME_OFFSET": content.start_s,
     }
+    if content.measurement.source.frame:
+        groups["TRIAL"] |= _frame_parameters(frame_of(content.measurement.source))
     if details.session:
         groups["TRIAL"]["SESSION"] = [details.session]
     if details.note.strip():  # in lines as long as a parameter can have in any script
@@ -205,6 +209,17 @@ def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -
         groups["EVENT"] = events
     groups["MANUFACTURER"] = {"SOFTWARE": ["rtc3d-gateway"], "VERSION_LABEL": [version_text()]}
     return groups
+
+
+def _frame_parameters(frame: CoordinateFrame) -> _Group:
+    """Return the frame of the source, and what brings the coordinates of the file, which are the server's,
+    into it: they are scaled, rotated and moved by metres, in this order."""
+    return {
+        "FRAME_ID": [printable(frame.frame_id)],
+        "FRAME_SCALE": frame.scale,
+        "FRAME_ROTATION": np.array(frame.rotation_xyzw),
+        "FRAME_TRANSLATION": np.array(frame.translation_m),
+    }
 
 
 def _texts(job: ExportJob, labels: list[str], descriptions: list[str], max_bytes: int, noun: str) -> _Group:

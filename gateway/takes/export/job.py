@@ -79,6 +79,8 @@ _NOUNS: Final = {
 }
 """What the components are called in notes."""
 
+_WITH_COORDINATES: Final = frozenset({"3d", "6d", "force"})
+
 _MAX_NAMED: Final = 10
 
 _NOT_IN_NAMES: Final = re.compile(r"[/\x00-\x1f\x7f-\x9f]")
@@ -246,6 +248,7 @@ class ExportJob:
         self.note_malformed(take)
         self._note_left_out(take)
         self._note_labels(take)
+        self._note_frames(take)
         if components:
             self.progress(f"arranging the frames of {self.take.name}", 0, 0)
         return take
@@ -279,6 +282,18 @@ class ExportJob:
                         "",
                         number,
                     )
+
+    def _note_frames(self, take: "Take") -> None:
+        """Report in which frame the coordinates are; all formats but ``ros2`` have those of the server."""
+        from gateway.takes.export.source_frame import frame_note  # noqa: PLC0415 - it imports numpy
+
+        if self.format == "ros2":
+            return
+        with_coordinates = _WITH_COORDINATES.intersection(self.chosen_format.components)
+        for source in take.sources.values():
+            note = frame_note(source)
+            if note and source.recorded & with_coordinates:
+                self.note(note)
 
     def note_malformed(self, take: "Take") -> None:
         """Report messages that could not be read."""

@@ -43,6 +43,7 @@ from gateway.messages.topics import unique_name
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.mcap_file import SourceExport, export_to_mcap
 from gateway.takes.export.plates import unit_notes
+from gateway.takes.export.source_frame import frame_of
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import TakeSource
@@ -72,10 +73,7 @@ class _RosExport(SourceExport):
     def __init__(self, source: TakeSource, name: str) -> None:
         super().__init__()
         self._source = source.name
-        self._frame = source.frame or CoordinateFrame(source.name, None)
-        unit = source.parameters[-1].parameters.length_unit if source.parameters else ""
-        metres, of_unit = self._frame.metres_per_unit, metres_per_unit(unit)
-        self._scale = metres / of_unit if metres and of_unit else 1.0
+        self._frame = frame_of(source)
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
         self._stamped = StampedEncoder(self._frame.frame_id)
         self._topics: dict[tuple[str, RosType], Topic] = {}
@@ -97,7 +95,7 @@ class _RosExport(SourceExport):
     def _frame_of(self, run: Series) -> CoordinateFrame:
         """Return the coordinate frame with the unit of a run, and the scale of the settings."""
         metres = metres_per_unit(run.unit)
-        return replace(self._frame, metres_per_unit=None if metres is None else metres * self._scale)
+        return replace(self._frame, metres_per_unit=None if metres is None else metres * self._frame.scale)
 
     def _markers(self, run: Series, rows: Array) -> list[TopicMessages]:
         frame = self._frame_of(run)

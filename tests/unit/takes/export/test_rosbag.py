@@ -156,10 +156,15 @@ def test_the_frame_and_the_transform_are_those_of_the_newest_status(tmp_path: Pa
     assert {cloud.header.frame_id, wrench.header.frame_id, pose.header.frame_id} == {"world"}
 
 
-def status(frame_id: str, rotation: tuple[float, ...], metres_per_unit: float) -> Message:
+def status(
+    frame_id: str,
+    rotation: tuple[float, ...],
+    metres_per_unit: float,
+    translation: tuple[float, ...] = (1.0, 2.0, 3.0),
+) -> Message:
     """Return a ``status_t`` whose frame is turned and moved."""
     message = rtc3d.status_t()
     message.utime, message.source, message.server = START_UTIME, "lab", "192.0.2.20:3020"
     message.frame_id, message.metres_per_unit = frame_id, metres_per_unit
-    message.rotation_xyzw, message.translation_m = [*rotation], [1.0, 2.0, 3.0]
+    message.rotation_xyzw, message.translation_m = [*rotation], [*translation]
     return lcm_channel("MOCAP", "lab", "status"), message.encode()
