@@ -280,19 +280,17 @@ class GroundReactions(NamedTuple):
 
 
 def ground_reactions(
-    loads: Array, normal: Array, centre: Array, min_force_n: float = MIN_FORCE_N, pressed_sign: int = 0
+    loads: Array, normal: Array, centre: Array, min_force_n: float = MIN_FORCE_N
 ) -> GroundReactions:
     """Return the forces of loads, shape (samples, 6), in N and Nm, as ``force_on`` does for one.
 
     ``normal`` and ``centre`` are those of the surface. Below ``min_force_n`` at a right angle to the surface,
     or if the load is not known, there is no contact: forces and moments are 0, and the position is the
-    centre. ``pressed_sign`` is the sign of the force along the normal while something presses the plate, 1 or
-    -1: nothing can pull at a plate, so the other one is noise. 0 means that it is not known.
+    centre.
     """
     forces, moments = loads[:, :3], loads[:, 3:]
     normal_forces = forces @ normal
-    pressures = normal_forces * pressed_sign if pressed_sign else abs(normal_forces)
-    has_contact = np.isfinite(loads).all(axis=1) & (pressures >= min_force_n) & (normal_forces != 0)
+    has_contact = np.isfinite(loads).all(axis=1) & (abs(normal_forces) >= min_force_n) & (normal_forces != 0)
     forces, moments = (np.where(has_contact[:, None], values, 0.0) for values in (forces, moments))
     divisors = np.where(has_contact, normal_forces, 1.0)[:, None]
     arms = np.cross(normal, moments) / divisors

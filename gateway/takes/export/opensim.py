@@ -179,25 +179,34 @@ class _PlateLoads(NamedTuple):
         return [plan for plan, _ in self.plates]
 
     def blocks(
-        self, min_force_n: float, pressed_signs: Sequence[int], progress: Callable[[int, int], None]
-    ) -> Iterator[tuple[Array, Array, list[GroundReactions]]]:
-        """Yield parts of the samples: their times, whether all loads are known, and each plate's reactions.
+        self, min_force_n: float, contacts: Sequence[Array] | None, progress: Callable[[int, int], None]
+    ) -> Iterator[tuple[Array, list[GroundReactions]]]:
+        """Yield parts of the samples of which all loads are known: their times, and each plate's reactions.
 
-        The reactions have the server's axes.
+        ``contacts`` say for each plate which of these samples may be contact; None means all. The reactions
+        have the server's axes.
         """
+        done = 0
         for start, stop, times in self.samples.blocks(progress):
-            is_known = np.full(len(times), True)
+            with np.errstate(invalid="ignore"):  # any bits that are a NaN, and infinity
+                loads = [self._newtons(plan, placed.block(start, stop)) for plan, placed in self.plates]
+            is_known = np.logical_and.reduce([np.isfinite(each).all(axis=1) for each in loads])
+            end = done + int(np.count_nonzero(is_known))
             found = []
-            for (plan, placed), pressed_sign in zip(self.plates, pressed_signs, strict=True):
-                newtons, _ = units_of(plan.plate)
+            for index, plan in enumerate(self.plans):
+                known = loads[index][is_known]
+                if contacts is not None:
+                    known[~contacts[index][done:end]] = 0.0
                 centre = plan.geometry.corners.mean(axis=0) * self.metres
-                with np.errstate(invalid="ignore"):  # any bits that are a NaN, and infinity
-                    loads = _loads_of(plan, placed.block(start, stop))
-                    loads = loads * newtons * ([1.0] * 3 + [self.metres] * 3)
-                    normal = plan.geometry.rotation[:, 2]
-                    found.append(ground_reactions(loads, normal, centre, min_force_n, pressed_sign))
-                is_known &= np.isfinite(loads).all(axis=1)
-            yield times, is_known, found
+                found.append(ground_reactions(known, plan.geometry.rotation[:, 2], centre, min_force_n))
+            yield times[is_known], found
+            done = end
+
+    def _newtons(self, plan: PlatePlan, values: Array) -> Array:
+        """Return the loads on a plate in N and Nm."""
+        newtons, _ = units_of(plan.plate)
+        loads: Array = _loads_of(plan, values) * newtons * ([1.0] * 3 + [self.metres] * 3)
+        return loads
 
 
 def _loads_of(plan: PlatePlan, values: Array) -> Array:
@@ -216,17 +225,17 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
     """Write forces, centres of pressure and free moments of all plates."""
     chosen_n = job.opensim.min_force_n
     min_force_n = MIN_FORCE_N if chosen_n is None else chosen_n
-    signs, pressed_signs = _signs(job, path, loads, rotation, min_force_n)
+    signs, contacts = _contacts(job, path, loads, rotation, min_force_n)
 
     def blocks() -> Iterator[tuple[Array, Array]]:
         progress = partial(job.progress, f"writing {path.name}")
-        for times, is_known, found in loads.blocks(min_force_n, pressed_signs, progress):
+        for times, found in loads.blocks(min_force_n, contacts, progress):
             vectors = [
                 vector @ rotation.T
                 for reactions, sign in zip(found, signs, strict=True)
                 for vector in (sign * reactions.forces, reactions.positions, sign * reactions.free_moments)
             ]
-            yield times[is_known], rounded(np.concatenate(vectors, axis=1)[is_known])
+            yield times, rounded(np.concatenate(vectors, axis=1))
 
     names = [f"{name}{axis}" for plan in loads.plans for name in _identifiers(plan) for axis in "xyz"]
     _write_table(job, path, loads.samples, names, "", blocks())
@@ -238,43 +247,58 @@ def _identifiers(plan: PlatePlan) -> tuple[str, str, str]:
     return f"ground_force_{number}_v", f"ground_force_{number}_p", f"ground_torque_{number}_"
 
 
-def _signs(
+_MIN_CONTACT_S: Final = 0.01
+"""A shorter contact is a disturbance: a foot stays on a plate for some 100 ms, and a blow for some 10 ms."""
+
+
+def _contacts(
     job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array, min_force_n: float
-) -> tuple[list[float], list[int]]:
+) -> tuple[list[float], list[Array]]:
     """Return -1 for each plate whose loads are those on the plate, 1 for those on the person.
 
-    Also return the sign of the force along the normal of each plate while something presses it. The force on
-    a person points up. Cubes are summed, so that steps decide, and not hours of the small force
-    that an empty plate shows.
+    Also return for each plate which of the samples whose loads are known are contact. Nothing can pull at a
+    plate, so contact has the sign along the normal that strong forces have. The force on a person points up.
+    Cubes are summed, so that steps decide, and not hours of the small force that an empty plate shows.
     """
     sums, normal_sums = np.zeros(len(loads.plans)), np.zeros(len(loads.plans))
-    num_positive, num_negative = np.zeros(len(loads.plans), int), np.zeros(len(loads.plans), int)
-    num_known = 0
+    normal_signs: list[list[Array]] = [[] for _ in loads.plans]
     progress = partial(job.progress, f"reading the forces of {path.name}")
-    for _, is_known, found in loads.blocks(min_force_n, [0] * len(loads.plans), progress):
-        num_known += int(np.count_nonzero(is_known))
+    for _, found in loads.blocks(min_force_n, None, progress):
         for index, reactions in enumerate(found):
-            forces = reactions.forces[is_known]
-            sums[index] += ((forces @ rotation[1]) ** 3).sum()
-            normal_forces = forces @ loads.plans[index].geometry.rotation[:, 2]
+            sums[index] += ((reactions.forces @ rotation[1]) ** 3).sum()
+            normal_forces = reactions.forces @ loads.plans[index].geometry.rotation[:, 2]
             normal_sums[index] += (normal_forces**3).sum()
-            num_positive[index] += np.count_nonzero(normal_forces > 0)
-            num_negative[index] += np.count_nonzero(normal_forces < 0)
-    signs = []
-    pressed_signs = np.where(normal_sums < 0, -1, 1)
-    num_contacts = np.where(normal_sums < 0, num_negative, num_positive)
-    for plan, total, num_contact in zip(loads.plans, sums.tolist(), num_contacts.tolist(), strict=True):
+            normal_signs[index].append(np.sign(normal_forces).astype(np.int8))
+    rate_hz = loads.samples.measurement.grid.rate_hz * loads.samples.per_frame
+    min_samples = round(_MIN_CONTACT_S * rate_hz)
+    signs, contacts = [], []
+    for index, plan in enumerate(loads.plans):
         is_vertical = abs(float(plan.geometry.rotation[:, 2] @ rotation[1])) > _VERTICAL
-        signs.append(-1.0 if is_vertical and total < 0 else 1.0)
+        signs.append(-1.0 if is_vertical and sums[index] < 0 else 1.0)
         name = f"plate {plan.position + 1}"
         if signs[-1] < 0:
             job.note(f"{name}: forces reversed, because those on the plate were recorded", path.name)
+        is_pressed = np.concatenate(normal_signs[index]) == (-1 if normal_sums[index] < 0 else 1)
+        contact = _without_short(is_pressed, min_samples)
+        contacts.append(contact)
         job.note(
-            f"{name}: no contact below {min_force_n:g} N: force and moment are 0",
+            f"{name}: no contact below {min_force_n:g} N or for less than {1000 * _MIN_CONTACT_S:g} ms: "
+            "force and moment are 0",
             path.name,
-            f"{num_known - num_contact} of {num_known} samples",
+            f"{len(contact) - np.count_nonzero(contact)} of {len(contact)} samples",
         )
-    return signs, pressed_signs.tolist()
+    return signs, contacts
+
+
+def _without_short(flags: Array, min_samples: int) -> Array:
+    """Return flags without the rows of neighbours that are shorter."""
+    starts, stops = np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2).T
+    is_long = stops - starts >= min_samples
+    steps = np.zeros(len(flags) + 1, np.int8)
+    steps[starts[is_long]] = 1
+    steps[stops[is_long]] = -1
+    kept: Array = np.cumsum(steps[:-1], dtype=np.int8) > 0
+    return kept
 
 
 def _write_sto(job: ExportJob, path: Path, analog: _Samples) -> None:

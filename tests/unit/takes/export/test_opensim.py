@@ -212,6 +212,61 @@ def test_a_force_that_would_pull_at_the_plate_is_no_contact(tmp_path: Path, sign
     assert one_names(notes_of(job), "plate 1: no contact", "1 of 3 samples")
 
 
+def pressed(*newtons: float, rate_hz: float) -> list[Message]:
+    """Return forces at a right angle to the plate; NaN is a sample that was not measured."""
+    loads = [(0.0, 0.0, force, 0.0, 0.0, 0.5) for force in newtons]
+    plate = replace(PLATE, frequency_hz=rate_hz)
+    messages = [description(), parameters(Parameters(force=ParametersForce((plate,))))]
+    for number, load in enumerate(loads):
+        time_us = round(number * 1e6 / rate_hz)
+        utime = START_UTIME + time_us
+        messages.append(frame(ComponentType.FORCE, [load], number, timestamp_us=time_us, utime=utime))
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "num_samples", "has_contact"),
+    [
+        (1000, 1, False),
+        (1000, 9, False),
+        (1000, 10, True),
+        (2000, 19, False),
+        (2000, 20, True),
+        (100, 1, True),
+        (30, 1, True),
+    ],
+)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("place", [0, 50, 3995, 4195])
+def test_a_force_of_less_than_10_ms_is_no_contact(
+    tmp_path: Path, rate_hz: float, num_samples: int, has_contact: bool, sign: float, place: int
+) -> None:
+    """Also where one block of samples ends and the next begins, and at both ends of the take."""
+    forces = np.zeros(4200)
+    forces[100:200] = 800
+    place = min(place, len(forces) - num_samples)
+    forces[place : place + num_samples] = 20
+    job = export_messages(tmp_path, pressed(*(sign * forces), rate_hz=rate_hz), "walk.mot")
+    force, position, moment = vectors_of(read_storage(tmp_path / "walk.mot"), 1)
+    expected = forces if has_contact else np.where(forces == 20, 0, forces)
+    assert np.array_equal(force[:, 1], expected)
+    assert np.array_equal(moment[:, 1] != 0, expected != 0)
+    assert position == pytest.approx(np.tile([0.2, 0, -0.3], (4200, 1)))
+    num_empty = np.count_nonzero(expected == 0)
+    assert one_names(notes_of(job), "plate 1: no contact", "10 ms", f"{num_empty} of 4200 samples")
+
+
+def test_samples_that_are_missing_do_not_end_a_contact(tmp_path: Path) -> None:
+    """Every fifth sample of a step and of a spike is missing: the step stays, the spike does not."""
+    forces = np.zeros(300)
+    forces[100:200], forces[250:258] = 800, 20
+    forces[::5] = NAN
+    export_messages(tmp_path, pressed(*forces, rate_hz=1000), "walk.mot")
+    found = vectors_of(read_storage(tmp_path / "walk.mot"), 1)[0][:, 1]
+    known = forces[~np.isnan(forces)]
+    assert np.array_equal(found, np.where(known == 800, 800, 0))
+
+
 def test_the_limit_of_contact_is_chosen(tmp_path: Path) -> None:
     messages = step_messages(STEP, (0, 0, 9.5, 0, 0, 1))
     export_messages(tmp_path, messages, "walk.mot", opensim=OpenSimOptions(min_force_n=9.5))
