@@ -171,18 +171,14 @@ class EventText(NamedTuple):
         return "; ".join(f"{name}: {value}" for name, value in self.values)
 
 
-def num_repeated_labels(component: ComponentType, parameters: Parameters) -> int:
-    """Return how many items have the label of one before them, so that ``describe`` gives them a number."""
-    given: Iterable[str] = ()
+def given_labels(component: ComponentType, parameters: Parameters) -> list[str]:
+    """Return the labels of the items as the server gave them, which may be empty or equal."""
     match component:
-        case ComponentType.MARKERS | ComponentType.TOOLS:
-            given = described_labels(parameters, component)
         case ComponentType.ANALOG:
-            given = (channel.label for channel in parameters.analog.channels) if parameters.analog else ()
+            return [channel.label for channel in parameters.analog.channels] if parameters.analog else []
         case ComponentType.FORCE:
-            given = (plate.label for plate in parameters.force.plates) if parameters.force else ()
-    labels = [label.strip() for label in given if label.strip()]
-    return len(labels) - len(set(labels))
+            return [plate.label for plate in parameters.force.plates] if parameters.force else []
+    return described_labels(parameters, component)
 
 
 def event_text(parameters: Parameters, item: Any) -> EventText:

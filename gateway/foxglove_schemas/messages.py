@@ -59,7 +59,7 @@ _POINT_FIELDS: Final = [
     for index, name in enumerate(_POINT.names or ())
 ]
 _LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
-_NOUNS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
+FIELD_NOUNS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
 """What channels and plates without a name are called."""
 
 NUMBERS_PER_ITEM: Final = {ComponentType.ANALOG: 1, ComponentType.FORCE: len(_LOADS)}
@@ -122,7 +122,7 @@ class FoxgloveSource:
     def changed_names(self) -> dict[str, dict[str, str]]:
         """The names of fields that are not the labels of channels or plates, by component key and label."""
         found: dict[str, dict[str, str]] = {}
-        for component, noun in _NOUNS.items():
+        for component, noun in FIELD_NOUNS.items():
             labels = self._labels_of(component, num_described_items(self._parameters, component))
             names = zip(labels, field_names(labels, noun), strict=True)
             found[component.key] = {label: name for label, name in names if label != name}
@@ -278,7 +278,7 @@ class FoxgloveSource:
         """Return the topics of a component's values by their labels; {} if there are none or too many."""
         if not 0 < num_items * NUMBERS_PER_ITEM[component] <= MAX_FIELDS:
             return {}
-        name, names = "analog", field_names(self._labels_of(component, num_items), _NOUNS[component])
+        name, names = "analog", field_names(self._labels_of(component, num_items), FIELD_NOUNS[component])
         if component is ComponentType.FORCE:
             labels = [f"{plate}_{load}" for plate in names for load in _LOADS]
             name, names = "loads", field_names(labels, "load")

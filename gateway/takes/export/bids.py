@@ -25,6 +25,7 @@ from gateway.takes.export.bids_data_set import (
     write_json,
     write_table,
 )
+from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.measurements import (
     Measurement,
@@ -229,9 +230,9 @@ def _channels(
         for label, description, units in zip(series.labels, _descriptions(series), conversions, strict=True)
         for (_, component, kind), (unit, _) in zip(fields, units, strict=True)
     ]
-    changed = sum(channel.name != name for channel, name in zip(channels, names, strict=True))
-    if changed:
-        job.note("names of channels changed, because a table cannot hold them", amount=changed)
+    end = f"_{fields[0][0]}" if fields[0][0] else ""
+    written = [channel.name.removesuffix(end) for channel in channels[:: len(fields)]]
+    note_labels(job, measurement.source.name, series, written)
     return channels
 
 

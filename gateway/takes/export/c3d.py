@@ -30,6 +30,7 @@ from gateway.takes.export.c3d_content import (
     encode_points,
     residual_step,
 )
+from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import (
     event_seconds,
@@ -173,8 +174,18 @@ def _head(job: ExportJob, content: C3dContent, scale: float) -> bytes:
                     "descriptions left out and labels cut: a C3D file has no room for so many texts",
                     amount=f"{max_bytes} bytes each",
                 )
+            _note_labels(job, content, groups)
             return head
     raise TakeError("the labels do not fit into a C3D file; export to .csv instead")
+
+
+def _note_labels(job: ExportJob, content: C3dContent, groups: _Groups) -> None:
+    for name, placed in (("POINT", content.markers), ("ANALOG", content.analog)):
+        if placed is not None:
+            parts = [values for key, values in groups[name].items() if key.startswith("LABELS")]
+            written = [str(text) for part in parts if isinstance(part, Sequence) for text in part]
+            source = content.measurement.source.name
+            note_labels(job, source, placed.series, written[: placed.num_items])
 
 
 def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -> _Groups:
@@ -187,9 +198,9 @@ def _groups(job: ExportJob, content: C3dContent, scale: float, max_bytes: int) -
         labels += content.markers.series.labels
         described = content.parameters.markers.markers if content.parameters.markers else ()
         descriptions += _padded([marker.description for marker in described], len(labels))
-    groups["POINT"] |= _texts(job, labels, descriptions, max_bytes, "marker")
+    groups["POINT"] |= _texts(labels, descriptions, max_bytes, "marker")
     labels, descriptions, units = _channel_texts(content)
-    groups["ANALOG"] |= _texts(job, labels, descriptions, max_bytes, "channel")
+    groups["ANALOG"] |= _texts(labels, descriptions, max_bytes, "channel")
     groups["ANALOG"] |= _lists("UNITS", [printable(unit) for unit in units])
     groups["TRIAL"] |= {
         "DATE_TIME": [utc_text(content.measurement, content.start_s)],
@@ -222,11 +233,8 @@ def _frame_parameters(frame: CoordinateFrame) -> _Group:
     }
 
 
-def _texts(job: ExportJob, labels: list[str], descriptions: list[str], max_bytes: int, noun: str) -> _Group:
+def _texts(labels: list[str], descriptions: list[str], max_bytes: int, noun: str) -> _Group:
     fitted = fitting_labels(labels, printable, max_bytes, noun)
-    changed = sum(old != new for old, new in zip(labels, fitted, strict=True))
-    if changed and max_bytes == _MAX_TEXT_BYTES:
-        job.note(f"labels of {noun}s changed, because a C3D file cannot hold them", amount=changed)
     if max_bytes < _MAX_TEXT_BYTES or not any(descriptions):
         descriptions = [""] * len(fitted)
     return _lists("LABELS", fitted) | _lists("DESCRIPTIONS", [printable(text) for text in descriptions])

@@ -247,7 +247,6 @@ class ExportJob:
                 )
         self.note_malformed(take)
         self._note_left_out(take)
-        self._note_labels(take)
         self._note_frames(take)
         if components:
             self.progress(f"arranging the frames of {self.take.name}", 0, 0)
@@ -265,23 +264,6 @@ class ExportJob:
             left_out += [what for key, what in chosen.lacks.items() if key in recorded]
             if left_out:
                 self.note(f"left out of {source.name}: {', '.join(left_out)}")
-
-    def _note_labels(self, take: "Take") -> None:
-        """Report labels that several items have: each but the first gets a number."""
-        from gateway.descriptions.labels import num_repeated_labels  # noqa: PLC0415 - it imports numpy
-
-        for source in take.sources.values():
-            for key in source.recorded.intersection(self.chosen_format.components):
-                found = (
-                    num_repeated_labels(COMPONENTS_BY_KEY[key], each.parameters) for each in source.parameters
-                )
-                number = max(found, default=0)
-                if number:
-                    self.note(
-                        f"{_NOUNS[key]} of {source.name} with the label of another one got a number",
-                        "",
-                        number,
-                    )
 
     def _note_frames(self, take: "Take") -> None:
         """Report in which frame the coordinates are; all formats but ``ros2`` have those of the server."""

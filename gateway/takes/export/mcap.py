@@ -1,12 +1,12 @@
 """Export to MCAP with Foxglove's types, for Foxglove, Lichtblick and rerun."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
 
-from gateway.foxglove_schemas.messages import NUMBERS_PER_ITEM, FoxgloveSource
-from gateway.foxglove_schemas.topics import MAX_FIELDS, FloatTopics, TopicMessages
+from gateway.foxglove_schemas.messages import FIELD_NOUNS, NUMBERS_PER_ITEM, FoxgloveSource
+from gateway.foxglove_schemas.topics import MAX_FIELDS, FloatTopics, TopicMessages, field_names
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.export.job import ExportJob
@@ -59,6 +59,11 @@ class _FoxgloveExport(SourceExport):
             times = (utimes, run.timestamp_us[part].tolist())
             yield from converter.convert_frames(component, items[part], *times, interval)
 
+    def labels_of(self, run: Series) -> Sequence[str]:
+        """Return the names of fields of numbers; markers and tools keep their labels."""
+        noun = FIELD_NOUNS.get(run.component)
+        return run.labels if noun is None else field_names(run.labels, noun)
+
     def _new_converter(self, index: int, version: int) -> FoxgloveSource:
         parameters = Parameters() if index < 0 else self._parameters[index].parameters
         if len(self._converters) == _MAX_CONVERTERS:
@@ -66,6 +71,4 @@ class _FoxgloveExport(SourceExport):
         converter = self._converters[index] = FoxgloveSource(self._topics, parameters, version)
         if converter.problem:
             self.notes[f"{self._topics.source}: {converter.problem}"] = None
-        for key in converter.changed_names:
-            self.notes[f"labels of {key} changed to names of fields"] = None
         return converter

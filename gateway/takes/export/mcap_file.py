@@ -8,7 +8,7 @@ import logging
 from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from types import TracebackType
 from typing import IO, Any, Final, Self
@@ -21,6 +21,7 @@ from gateway.errors import TakeError
 from gateway.foxglove_schemas.topics import MAX_UTIME, Topic, TopicMessages
 from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import differ_in_statistics_only
+from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.tables import parts_of
 from gateway.takes.files.component_rows import Array
@@ -57,6 +58,10 @@ class SourceExport(ABC):
     def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
         """Return the messages of some rows, whose times are possible."""
 
+    def labels_of(self, run: Series) -> Sequence[str]:
+        """Return what the items of frames with constant labels are called in the file."""
+        return run.labels
+
     def count(self, what: str, rows: Array) -> None:
         """Count rows (where the array is true) that are left out."""
         count = int(rows.sum())
@@ -80,6 +85,7 @@ def export_to_mcap(
                 if name not in exports:
                     exports[name] = new_export(take.sources[name])
                 for run in series.runs():
+                    note_labels(job, name, run, exports[name].labels_of(run))
                     for messages in exports[name].messages(key, run):
                         file.add(messages)
             file.write_most()

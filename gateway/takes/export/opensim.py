@@ -312,7 +312,7 @@ def _write_sto(job: ExportJob, path: Path, analog: _Samples) -> None:
             yield times[is_known], values[is_known]
 
     units = printable(series.unit or ",".join(series.units))
-    labels = opensim_labels(job, path.name, series.labels, "channel")
+    labels = opensim_labels(job, path.name, analog.measurement.source.name, series)
     _write_table(job, path, analog, labels, f"units={units}\n", blocks())
 
 

@@ -1,6 +1,6 @@
 """Export to a bag of ROS 2: an MCAP file with the messages that the output ``ros2`` publishes live."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -40,6 +40,7 @@ from gateway.messages.ros2_names import (
     wrench_topic,
 )
 from gateway.messages.topics import unique_name
+from gateway.rtc3d.components import ComponentType
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.mcap_file import SourceExport, export_to_mcap
 from gateway.takes.export.plates import unit_notes
@@ -92,6 +93,10 @@ class _RosExport(SourceExport):
                 return self._forces(run, rows)
         return ()
 
+    def labels_of(self, run: Series) -> Sequence[str]:
+        """Return the names of topics of tools; other labels stay, or are in no message."""
+        return unique_ros_names(run.labels, "tool") if run.component is ComponentType.TOOLS else run.labels
+
     def _frame_of(self, run: Series) -> CoordinateFrame:
         """Return the coordinate frame with the unit of a run, and the scale of the settings."""
         metres = metres_per_unit(run.unit)
@@ -115,8 +120,6 @@ class _RosExport(SourceExport):
             self.count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
             return []
         tools = unique_ros_names(run.labels, "tool")
-        if [*tools] != [*run.labels]:
-            self.notes["labels of tools changed to names of topics"] = None
         names = [TransformNames(frame.frame_id, f"{self._source}/{tool}") for tool in tools]
         topics = [self._topic(f"{self._base}/{pose_topic(tool)}", POSE_STAMPED) for tool in tools]
         found = [TopicMessages(topic, [], []) for topic in topics]

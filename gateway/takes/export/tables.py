@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from gateway.errors import TakeError
-from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES
+from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.reader import TakeReader
@@ -60,8 +61,7 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
                 parts = (name if len(take.sources) > 1 else "", key, str(number) if number > 1 else "")
                 table = Table(source, key, columns, job.file_name(*parts))
                 tables[name, key, columns] = table
-                if key == "analog":
-                    _note_columns(job, name, run, columns)
+                _note_columns(job, name, run, columns)
             yield table, run
     if not tables:
         raise nothing_to_export(job, "frames")
@@ -72,10 +72,14 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
 
 
 def _note_columns(job: ExportJob, source: str, run: Series, columns: tuple[Column, ...]) -> None:
-    """Report channels that are called like one of the first columns."""
-    for label, column in zip(run.labels, columns, strict=True):
-        if label != column.name:
-            job.note(f"the channel {label} of {source} is the column {column.name}")
+    """Report labels that are not in the names of the columns, such as that of the first columns."""
+    if run.labels:
+        fields = ITEM_DTYPES[run.component].names or ("",)
+        firsts = columns[:: len(fields)]
+        written = [
+            column.name.removesuffix(f" {fields[0]}") if fields[0] else column.name for column in firsts
+        ]
+        note_labels(job, source, run, written)
 
 
 def parts_of(job: ExportJob, take: Take) -> Iterator[list[tuple[str, str, Series]]]:

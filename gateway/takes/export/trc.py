@@ -72,7 +72,7 @@ def write_trc(
 def _head(job: ExportJob, measurement: Measurement, name: str, unit: str) -> str:
     """Return the five lines before the frames, and an empty one."""
     grid = measurement.grid
-    labels = opensim_labels(job, name, measurement.base.labels, "marker")
+    labels = opensim_labels(job, name, measurement.source.name, measurement.base)
     rate = f"{grid.rate_hz:.10g}"
     values = (rate, rate, grid.num_rows, len(labels), printable(unit), rate, 1, grid.num_rows)
     axes = [f"{axis}{number}" for number in range(1, len(labels) + 1) for axis in "XYZ"]

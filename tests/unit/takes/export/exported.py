@@ -85,9 +85,9 @@ USUAL_NOTES = (
     "left out of ",
     "times of capture and frame numbers replaced by a regular grid",
     "positions converted from ",
-    "labels of tools changed to names of topics",
-    "labels of analog changed to names of fields",
-    "labels of force changed to names of fields",
+    "labels of tools of ",
+    "labels of channels of ",
+    "labels of plates of ",
     "residuals rounded to 127 steps",
     "moments converted to Nmm",
 )

@@ -200,7 +200,7 @@ def test_labels_cannot_break_the_tables(tmp_path: Path) -> None:
     rows = table(only(tmp_path, "*_channels.tsv"))
     assert [row["name"] for row in rows[::4]] == ["a_b_x", "marker 2_x"]
     assert {row["tracked_point"] for row in rows} == {"a_b", "marker 2"}
-    assert one_names(notes_of(job), "channels", 4)
+    assert one_names(notes_of(job), "labels of markers", "a_b", 1)
 
 
 def runs_of(folder: Path) -> set[tuple[str, str]]:

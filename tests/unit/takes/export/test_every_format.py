@@ -1,7 +1,7 @@
 """What holds for each format, also for those that will be added: sources, progress, what is reported."""
 
 import csv
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from itertools import count, groupby, pairwise
@@ -14,8 +14,9 @@ import rtc3d
 from mcap.reader import make_reader
 
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import AnalogChannel, Parameters, Parameters6D, ParametersAnalog, Tool
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, export_take
+from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, Format, export_take
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -319,13 +320,65 @@ def test_messages_are_in_the_order_of_time(name: str, tmp_path: Path) -> None:
     assert all(a.message_end_time <= b.message_start_time for a, b in pairwise(chunks))
 
 
-@pytest.mark.parametrize("name", [".c3d", ".trc", ".csv", ".parquet", ".mcap", "opensim", "bids", "ros2"])
-def test_labels_that_several_markers_have_are_reported(name: str, tmp_path: Path) -> None:
-    messages = [exported.labelled("a", "b", "a", "a", ""), markers(5)]
-    job = job_for(name, write_take(tmp_path / "take.lcmlog", messages), tmp_path / "out")
+def items_called(component: ComponentType, labels: Sequence[str]) -> list[Message]:
+    """Return parameters with these labels, and a frame with an item for each."""
+    numbered = [*enumerate(labels)]
+    match component:
+        case ComponentType.MARKERS:
+            return [exported.labelled(*labels), markers(len(labels))]
+        case ComponentType.TOOLS:
+            tools = Parameters6D(100.0, tuple(Tool(str(n), label) for n, label in numbered))
+            poses = [(1, 0, 0, 0, 1, 2, 3, 0)] * len(labels)
+            return [parameters(Parameters(tools=tools)), frame(component, poses)]
+    channels = tuple(AnalogChannel(str(n), label, frequency_hz=100.0) for n, label in numbered)
+    return [parameters(Parameters(analog=ParametersAnalog(channels))), frame(component, [1.0] * len(labels))]
+
+
+@pytest.mark.parametrize("component", [ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_label_that_is_not_as_the_server_gave_it_is_reported(
+    name: str, component: ComponentType, tmp_path: Path
+) -> None:
+    """Repeated ones get a number, and one is too long, also to be named in full."""
+    if component.key not in format_of(name).components or name == ".mot":
+        return
+    labels = ["a", "b", "a", "a", "x" * 300]
+    take = write_take(tmp_path / "take.lcmlog", items_called(component, labels))
+    job = job_for(name, take, tmp_path / "out")
     job.details = {"subject": "01"}
     export_take(job)
-    assert [note.amount for note in job.notes if "the label of another one" in note.what] == ["2"]
+    [note] = [note for note in job.notes if note.what.startswith(f"labels of {component.item_noun} of lab")]
+    assert note.amount == "3"
+    for old, new in (("a", "a_2"), ("a", "a_3"), ("x" * 39 + "…", "x" * 39 + "…")):
+        assert f"'{old}' is '{new}'" in note.what
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_labels_that_stay_are_not_reported(name: str, tmp_path: Path) -> None:
+    """Nor those of items without a label, which are called by their position."""
+    for component in (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG):
+        folder = tmp_path / component.key
+        folder.mkdir()
+        if component.key in format_of(name).components and name != ".mot":
+            take = write_take(folder / "take.lcmlog", items_called(component, ["a", "b"]))
+            job = job_for(name, take, folder / "out")
+            job.details = {"subject": "01"}
+            export_take(job)
+            assert not any(note.what.startswith("labels of ") for note in job.notes)
+
+
+def test_ten_labels_are_named_and_all_are_counted(tmp_path: Path) -> None:
+    take = write_take(tmp_path / "take.lcmlog", items_called(ComponentType.MARKERS, ["a"] * 27))
+    job = job_for(".trc", take, tmp_path / "out")
+    export_take(job)
+    [note] = [note for note in job.notes if note.what.startswith("labels of ")]
+    assert note.amount == "26"
+    assert "'a' is 'a_11'" in note.what
+    assert "a_12" not in note.what
+
+
+def format_of(name: str) -> Format:
+    return FORMATS[name] if name in FORMATS else CHOSEN_FORMATS[name]
 
 
 @pytest.mark.parametrize("has_end", [True, False])

@@ -242,7 +242,7 @@ def test_a_plate_whose_place_is_not_known_has_numbers_but_no_arrow(tmp_path: Pat
     unknown = plate(corners=(Point(), Point(), Point(), Point()))
     loads = [(1, 2, 300, 4, 5, 6)] * 3
     messages = [plates(unknown, plate()), frame(ComponentType.FORCE, loads)]
-    content = export(tmp_path, messages, notes=["forces of lab"])  # whose labels are the same
+    content = export(tmp_path, messages)
     assert [entity.id for entity in content.topics["/lab/forces"][0].content.entities] == ["left_2"]
     assert list(floats_of(content.topics["/lab/loads"][0].content).values()) == [1, 2, 300, 4, 5, 6] * 3
 
@@ -285,7 +285,7 @@ def test_analog_channels_have_their_labels_as_names(tmp_path: Path) -> None:
     labels = ("EMG 1", "EMG_1", "EMG1", "emg1", "Füße", "力", "1st", "a.b", "EMG 1", "")
     values = [0.1 * number for number in range(10)]
     messages = [channels(*labels), frame(ComponentType.ANALOG, [*values, 7.0])]
-    content = export(tmp_path, messages, notes=["analog channels of lab"])  # of which two have one label
+    content = export(tmp_path, messages)
     found = floats_of(content.topics["/lab/analog"][0].content)
     assert list(found) == [
         *("EMG_1", "EMG_1_2", "EMG1", "emg1", "Fu_e", "channel_6", "_1st", "a_b", "EMG_1_2_2"),
@@ -303,7 +303,7 @@ def test_labels_that_cannot_be_names_are_reported(tmp_path: Path) -> None:
         messages = [channels(label), frame(ComponentType.ANALOG, [1.0])]
         job = export_messages(tmp_path, messages, f"{label}.mcap")
         notes = notes_of(job, usual=True)
-        assert one_names(notes, "labels of analog", "fields") == is_changed
+        assert one_names(notes, "labels of channels", "EMG_1") == is_changed
         assert not any("positions" in note for note in notes)
 
 

@@ -86,7 +86,7 @@ def test_a_bag_has_the_values_of_the_take_in_the_units_of_ros(tmp_path: Path) ->
     factors = [1.0] * 3 + [1e-3 if plates.plates[1].channels[3].unit == "Nmm" else 1.0] * 3
     assert np.allclose(values, lab.forces.values[:, 1] * factors)
     assert notes_of(job) == []
-    assert one_names(notes_of(job, usual=True), "labels of tools", "topics")
+    assert one_names(notes_of(job, usual=True), "labels of tools", "lab", "Tool_1")
 
 
 def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
