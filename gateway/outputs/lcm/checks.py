@@ -63,7 +63,7 @@ def leaves_host(settings: LcmSettings) -> bool:
 
 
 def open_ports(settings: LcmSettings, sources: Sequence[SourceSettings]) -> list[OpenPort]:
-    """Return the multicast group that the output sends to, the port it sends from, and that of requests."""
+    """Return the multicast groups of messages and of requests, and the ports that the output sends from."""
     url = settings.effective_url
     ports = []
     if destination := multicast_destination(url):
@@ -71,14 +71,18 @@ def open_ports(settings: LcmSettings, sources: Sequence[SourceSettings]) -> list
         purpose = stays if _ttl(url) == "0" else "everybody receives, and can send forged messages"
         interface, remedy = _interface(url), _FIREWALL.format("switch LCM off")
         ports.append(OpenPort("udp", *destination, Access.PUBLISH, purpose, remedy, interface))
-        unread = "LCM sends from here; nothing that arrives is read"
-        ports.append(OpenPort("udp", "0.0.0.0", 0, Access.NOTHING, unread, ""))  # noqa: S104 - not bound here
+        ports.append(_sent_from("LCM sends messages from here; nothing that arrives is read"))
     url = settings.effective_queries_url
     if settings.queries and (destination := multicast_destination(url)):
         access = control_or(Access.READ, sources)
         remedy = _FIREWALL.format("set lcm.queries to false")
         ports.append(OpenPort("udp", *destination, access, "requests are answered", remedy, _interface(url)))
+        ports.append(_sent_from("LCM sends replies from here; nothing that arrives is read"))
     return ports
+
+
+def _sent_from(purpose: str) -> OpenPort:
+    return OpenPort("udp", "0.0.0.0", 0, Access.NOTHING, purpose, "")  # noqa: S104 - not bound here
 
 
 def _interface(url: str) -> str:

@@ -39,6 +39,8 @@ class PastLab(Lab):
             "3d": [self._message(number) for number in range(NUM_MARKERS)],
             "event": [event],
         }
+        self.newest = {key: len(messages) - 1 for key, messages in self.kept.items()}
+        """The number of the newest message of each key that was published."""
         self.live.complete(self._ask, self._find, Completeness(last_s=10, patience_s=60))
 
     def _message(self, number: int) -> bytes:
@@ -48,6 +50,7 @@ class PastLab(Lab):
 
     def send_next(self) -> None:
         """Send the frame with markers that follows those of the past."""
+        self.newest["3d"] = NUM_MARKERS
         self.send(ComponentType.MARKERS, [MISSING], sequence=NUM_MARKERS, utime=self.begin_utime)
 
     def wait_for_past(self) -> LiveSource:
@@ -61,8 +64,7 @@ class PastLab(Lab):
         messages = self.kept[series.key]
         first = 0 if request.last_s is not None else request.first
         last = min(first + 299, len(messages) - 1)
-        newest = NUM_MARKERS if series.key == "3d" else 0  # the one that has arrived, too
-        return HistoryAnswer(messages[first : last + 1], first, last, newest)
+        return HistoryAnswer(messages[first : last + 1], first, last, self.newest[series.key])
 
     def _find(self, source: Source, _last_s: float, _timeout_s: float) -> list[Any]:
         found: Any = source
@@ -114,6 +116,7 @@ def test_nothing_is_shown_in_fast_motion(past: PastLab) -> None:
 def test_data_that_stopped_before_the_beginning_have_stopped_since_then(past: PastLab) -> None:
     """The picture must not look live, and say the right time; the status shows what time it is now."""
     past.kept["3d"] = past.kept["3d"][:600]
+    past.newest["3d"] = 599
     past.silent = ("3d",)
     past.send_status(utime=past.begin_utime, sequence=1)
     past.may_answer.set()

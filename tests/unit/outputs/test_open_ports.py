@@ -55,10 +55,11 @@ LCM_GROUP: Final = "239.255.76.67"
 
 
 def test_lcm_lists_where_it_sends_and_where_requests_arrive() -> None:
-    sending = [("udp", LCM_GROUP, 7667, Access.PUBLISH), ("udp", ALL_IPV4, 0, Access.NOTHING)]
+    sent_from = ("udp", ALL_IPV4, 0, Access.NOTHING)
+    sending = [("udp", LCM_GROUP, 7667, Access.PUBLISH), sent_from]
     url = f"udpm://{LCM_GROUP}:7667?ttl=0"
-    assert opened("lcm", [LAB], url=url) == [*sending, ("udp", LCM_GROUP, 7668, Access.READ)]
-    assert opened("lcm", [LAB, CONTROLLED], url=url)[-1] == ("udp", LCM_GROUP, 7668, Access.CONTROL)
+    assert opened("lcm", [LAB], url=url) == [*sending, ("udp", LCM_GROUP, 7668, Access.READ), sent_from]
+    assert opened("lcm", [LAB, CONTROLLED], url=url)[2] == ("udp", LCM_GROUP, 7668, Access.CONTROL)
     assert opened("lcm", [CONTROLLED], url=url, queries=False) == sending
     assert opened("lcm", [CONTROLLED], url="tcpq://192.0.2.1:7700") == []
 

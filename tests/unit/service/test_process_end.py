@@ -167,8 +167,6 @@ print(flush=True)
 time.sleep(60)
 """
     with running(code) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
         process.send_signal(signal.SIGHUP)
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) == 0
