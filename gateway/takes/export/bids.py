@@ -25,7 +25,7 @@ from gateway.takes.export.bids_data_set import (
     write_json,
     write_table,
 )
-from gateway.takes.export.changed_labels import note_labels
+from gateway.takes.export.changed_labels import note_event_labels, note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.measurements import (
     Measurement,
@@ -334,12 +334,14 @@ def _write_events(
         (chosen,) = np.nonzero(belongs & (outside.argmin(axis=0) == position))
         if not len(chosen):
             continue
-        rows = []
+        rows, labels = [], []
         for row in chosen[np.argsort(seconds[position, chosen], kind="stable")].tolist():
             text = event_text(events.parameters_of(row), events.items[row])
             label, description = printable(text.label), printable(text.description)
             onset = f"{seconds[position, row]:.6f}"
+            labels.append((text.label, label))
             rows.append((onset, 0, label, int(events.items[row]["id"]), description))
+        note_event_labels(job, source.name, *zip(*labels, strict=True))
         columns = ("onset", "duration", *_EVENT_COLUMNS)
         write_table(job, data_set.path(recording.label, number, "events.tsv"), columns, rows)
         described = {name: {"Description": text} for name, text in _EVENT_COLUMNS.items()}

@@ -30,7 +30,7 @@ from gateway.takes.export.c3d_content import (
     encode_points,
     residual_step,
 )
-from gateway.takes.export.changed_labels import note_labels
+from gateway.takes.export.changed_labels import note_event_labels, note_labels
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import (
     event_seconds,
@@ -327,10 +327,13 @@ def _event_group(job: ExportJob, content: C3dContent) -> _Group:
         job.note("events before the first frame have its time", amount=num_early)
     subject = content.measurement.source.details.subject
     texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
+    labels = [printable(text.label) for text in texts]
+    written = [_encode_text(label).decode() for label in labels]
+    note_event_labels(job, content.measurement.source.name, [text.label for text in texts], written)
     return {
         "USED": len(chosen),
         "CONTEXTS": [printable(_context_of(text)) for text in texts],
-        "LABELS": [printable(text.label) for text in texts],
+        "LABELS": labels,
         "DESCRIPTIONS": [printable(text.description) for text in texts],
         "SUBJECTS": [printable(_value_of(text, "subject") or subject) for text in texts],
         "TIMES": np.stack(np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)),

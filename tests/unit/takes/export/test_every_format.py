@@ -14,7 +14,15 @@ import rtc3d
 from mcap.reader import make_reader
 
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import AnalogChannel, Parameters, Parameters6D, ParametersAnalog, Tool
+from gateway.rtc3d.parameters import (
+    AnalogChannel,
+    EventDefinition,
+    Parameters,
+    Parameters6D,
+    ParametersAnalog,
+    ParametersEvents,
+    Tool,
+)
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, Format, export_take
 from tests.support.takes import (
@@ -365,6 +373,25 @@ def test_labels_that_stay_are_not_reported(name: str, tmp_path: Path) -> None:
             job.details = {"subject": "01"}
             export_take(job)
             assert not any(note.what.startswith("labels of ") for note in job.notes)
+
+
+@pytest.mark.parametrize("name", [".c3d", "bids"])
+def test_labels_of_events_that_are_not_as_the_server_gave_them_are_reported(
+    name: str, tmp_path: Path
+) -> None:
+    """Each label once, however often the event occurs; C3D files also cut long ones."""
+    labels = ["start", "left\tdown", "ü" * 100]
+    events = tuple(EventDefinition(str(n), label) for n, label in enumerate(labels))
+    messages = [parameters(Parameters(events=ParametersEvents(events)))]
+    messages += [markers(1, number) for number in range(20)]
+    messages += [frame(ComponentType.EVENT, [(n % 3, -1, -1, -1, -1)], n) for n in range(9)]
+    job = job_for(name, write_take(tmp_path / "take.lcmlog", messages), tmp_path / "out")
+    job.details = {"subject": "01"}
+    export_take(job)
+    [note] = [note for note in job.notes if note.what.startswith("labels of events of lab")]
+    assert note.amount == ("2" if name == ".c3d" else "1")
+    assert r"'left\tdown' is 'left_down'" in note.what
+    assert "start" not in note.what
 
 
 def test_ten_labels_are_named_and_all_are_counted(tmp_path: Path) -> None:
