@@ -116,6 +116,9 @@ class Lab(NamedTuple):
 
     options: tuple[str, ...]
     published: dict[str, list[bytes]]
+    server: subprocess.Popen[str]
+    restart: Callable[[], None]
+    """Ends the gateway by SIGTERM and starts another one."""
 
 
 @contextmanager
@@ -139,7 +142,7 @@ def lab(
         published[lcm_channel("MOCAP", "Lab-1", *names)].append(sample.payload.to_bytes())
 
     with ExitStack() as stack:
-        port, _ = stack.enter_context(simulator(*SCENE, *scene))
+        port, server = stack.enter_context(simulator(*SCENE, *scene))
         keys = zenoh_keys("peer", listen=endpoint, connect=router)
         configuration = {
             "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port, **source}],
@@ -149,8 +152,18 @@ def lab(
             "history": {"seconds": history_s},
         }
         (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
-        gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
-        stack.enter_context(gateway)
+        gateways: list[subprocess.Popen[bytes]] = []
+
+        def start() -> None:
+            gateway = program("run", "--config", str(folder / "gateway.yaml"), stderr=subprocess.DEVNULL)
+            gateways.append(stack.enter_context(gateway))
+
+        def restart() -> None:
+            gateways[-1].terminate()
+            gateways[-1].wait(timeout=60)
+            start()
+
+        start()
         if side == "zenoh":
             session = wait_for_zenoh(endpoint)
             stack.callback(session.close)
@@ -161,7 +174,7 @@ def lab(
             stack.callback(LcmSubscriber(open_lcm(receiving_url(url)), "MOCAP_.+", receive).close)
             options = ("--lcm", "--url", url)
         wait_until(lambda: len(published[lcm_channel("MOCAP", "Lab-1", "3d")]) > 10)
-        yield Lab(options, published)
+        yield Lab(options, published, server, restart)
 
 
 def assert_same_bytes(path: Path, published: dict[str, list[bytes]]) -> None:

@@ -6,15 +6,22 @@ from pathlib import Path
 
 import pytest
 
+from gateway.messages.history import sequence_of
 from tests.support.networks import free_endpoint, open_zenoh
 from tests.support.record_process import (
+    MARKERS,
     assert_same_bytes,
+    by_channel,
     lab,
     record_past,
+    recording,
     refilled,
     stoppable_router,
     wait_for_frames,
+    wait_until_it_hears_everything,
+    wait_until_recorded,
 )
+from tests.support.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 
@@ -53,3 +60,47 @@ def test_a_recorder_on_lcm_that_stands_still_loses_nothing(tmp_path: Path) -> No
         assert_same_bytes(path, gateway.published)
     assert ended.status == 0, ended
     assert refilled(ended) > 50
+
+
+TRIAL = (MARKERS, *(f"MOCAP_LAB_1_{name}" for name in ("6D", "ANALOG", "FORCE", "6D_TOOL_1", "6D_TOOL_2")))
+
+
+@pytest.mark.parametrize("waits", [True, False], ids=["has caught up", "ends at once"])
+def test_a_short_trial_after_a_restart_of_the_gateway_is_not_lacking_unsaid(
+    tmp_path: Path, *, waits: bool
+) -> None:
+    """Nothing arrives live of its keys: the recorder stands still until the server has ended."""
+    path = tmp_path / "walk.lcmlog"
+    with lab(tmp_path) as gateway, recording(path, *gateway.options) as record:
+        wait_until_it_hears_everything(path)
+        os.kill(record.process.pid, signal.SIGSTOP)
+        gateway.restart()
+        wait_until(lambda: has_begun_again(gateway.published[MARKERS]))
+        wait_for_frames(gateway, 200)
+        gateway.server.kill()
+        os.kill(record.process.pid, signal.SIGCONT)
+        if waits:
+            for channel in TRIAL:
+                wait_until_recorded(path, gateway.published[channel][-1])
+        ended = record.end(signal.SIGTERM)
+    assert ended.status == 1, ended  # what the first gateway published last went with it
+    assert "INCOMPLETE" in ended.stdout
+    if waits:
+        recorded = by_channel(path)
+        for channel in TRIAL:
+            trial = last_run(recorded[channel])
+            assert [sequence_of(message) for message in trial] == list(range(len(trial))), channel
+            published = last_run(gateway.published[channel])
+            assert trial[-len(published) :] == published, channel
+
+
+def has_begun_again(messages: list[bytes]) -> bool:
+    """Whether the numbers of messages went back."""
+    return len(last_run(messages)) < len(messages)
+
+
+def last_run(messages: list[bytes]) -> list[bytes]:
+    """Return the messages since the numbers went back last."""
+    numbers = [sequence_of(message) for message in messages]
+    starts = [index for index in range(1, len(numbers)) if numbers[index] < numbers[index - 1]]
+    return messages[starts[-1] if starts else 0 :]
