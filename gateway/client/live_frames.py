@@ -226,6 +226,15 @@ class Frame:
         return (now_steady_us() - self.capture_utime - self._steady_offset_us) / 1e6
 
     @property
+    def steady_offset_us(self) -> int:
+        """What to add to ``capture_utime``, in µs, for this host's steady clock, which nobody sets.
+
+        With it, times of capture of several gateways can be compared, although their clocks differ. It is as
+        known when the frame was read: later frames of the source may have a better one.
+        """
+        return self._steady_offset_us
+
+    @property
     def seconds(self) -> float:
         """The time of capture in s since the first message, on the gateway's clock."""
         return (self.capture_utime - self._start_utime) / 1e6

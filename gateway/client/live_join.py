@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from gateway.client.live_frames import Frame
+from gateway.client.live_frames import ClockDifference, Frame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
 MAX_WAIT_S: Final = 0.25
@@ -13,6 +13,9 @@ MAX_WAIT_S: Final = 0.25
 MAX_FRAMES: Final = 20_000
 """How many frames of one component may wait: 10 s at 2000 Hz."""
 
+_SET_BACK_US: Final = 100_000
+"""A frame that is later by more than one that came after it is of before the gateway's clock was set back."""
+
 _Name = tuple[str, str]  # a source and a component
 
 
@@ -20,9 +23,9 @@ class Join:
     """Gives each frame of the first component what the others have had since the frame before it.
 
     Within a source, frames belong together by the server's time stamps; between sources, by their times of
-    capture. The first component is the first of ``components`` (None: of 3d, 6d, analog, force, event) of the
-    first of ``sources`` (none: the first that is heard). If ``components`` are given, only they are awaited
-    that are heard, or named with their source.
+    capture on this host's steady clock. The first component is the first of ``components`` (None: of 3d, 6d,
+    analog, force, event) of the first of ``sources`` (none: the first that is heard). If ``components`` are
+    given, only they are awaited that are heard, or named with their source.
     """
 
     def __init__(self, sources: Sequence[str], components: Collection[str] | None) -> None:
@@ -33,6 +36,7 @@ class Join:
         self._is_fixed = components is not None
         self._waiting: dict[_Name, deque[Frame]] = {}
         self._newest: dict[_Name, Frame] = {}
+        self._clocks: dict[str, Frame] = {}  # of each source the frame that came last
         self._awaited: set[_Name] = set()
         if components is not None:
             self._awaited = {(source, key) for source in sources for key in components if key != "event"}
@@ -49,7 +53,7 @@ class Join:
         if newest is not None and frame.timestamp_us < newest.timestamp_us and not _is_late(frame, newest):
             self._start_again(frame.source)
         if newest is None or not _is_late(frame, newest):
-            self._newest[name] = frame
+            self._newest[name] = self._clocks[frame.source] = frame
         if frame.key != "event":
             self._awaited.add(name)
         if name == self._first():
@@ -90,15 +94,35 @@ class Join:
         return {
             name
             for name in self._awaited
-            if name not in self._newest or not _is_reached(frame, self._newest[name])
+            if name not in self._newest or not self._is_reached(frame, self._newest[name])
         }
 
     def _take_others(self, frame: Frame) -> list[Frame]:
         others = []
         for waiting in self._waiting.values():
-            while waiting and _is_reached(waiting[0], frame):
+            while waiting and self._is_reached(waiting[0], frame):
                 others.append(waiting.popleft())
         return others
+
+    def _is_reached(self, instant: Frame, frame: Frame) -> bool:
+        """Return whether a frame belongs to an instant, or to a later one."""
+        if frame.source == instant.source:
+            return frame.timestamp_us >= instant.timestamp_us
+        apart_us = self._offset_us(frame) - self._offset_us(instant)
+        if abs(apart_us) <= ClockDifference.SAME_US:
+            apart_us = 0  # nothing that delays of the network would not explain: one clock
+        return frame.capture_utime + apart_us >= instant.capture_utime
+
+    def _offset_us(self, frame: Frame) -> int:
+        """Return what to add to the time of a frame for this host's steady clock, as it is known now.
+
+        That it is the same for all frames of a source keeps their order. Those whose times are later than
+        the newest one has are of before the gateway's clock was set back.
+        """
+        newest = self._clocks[frame.source]
+        if frame.capture_utime > newest.capture_utime + _SET_BACK_US:
+            return min(frame.steady_offset_us, newest.steady_offset_us)
+        return newest.steady_offset_us
 
     def _start_again(self, source: str) -> None:
         """Forget what waits of a source, because its time stamps start again."""
@@ -107,13 +131,6 @@ class Join:
             self.num_dropped += len(self._waiting.pop(name, ()))
         self.num_dropped += sum(frame.source == source for frame, _ in self._instants)
         self._instants = deque(each for each in self._instants if each[0].source != source)
-
-
-def _is_reached(instant: Frame, frame: Frame) -> bool:
-    """Return whether a frame belongs to an instant, or to a later one."""
-    if instant.source == frame.source:
-        return frame.timestamp_us >= instant.timestamp_us
-    return frame.capture_utime >= instant.capture_utime
 
 
 def _is_late(frame: Frame, newest: Frame) -> bool:

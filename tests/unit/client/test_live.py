@@ -308,14 +308,20 @@ def test_a_component_that_stops_is_awaited_once(monkeypatch: pytest.MonkeyPatch)
     assert [each.sequence for each in data._ready] == [0, 1, 2]
 
 
-def test_two_sources_are_joined_by_their_times_of_capture() -> None:
+def test_two_sources_are_joined_by_their_times_of_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of the gateway of stage is 3 s behind."""
+    now_us = 0
+    monkeypatch.setattr(queued_reception, "now_steady_us", lambda: now_us)
     data = Fed("lab", "stage", components=["3d"], join=True)
     data.feed([parameters(xml("a", "b")), parameters(xml("c"), source="stage")])
     for number in range(3):
-        utime = START_UTIME + 10_000 * number
+        now_us = 100_000 * number
+        utime, behind = START_UTIME + now_us, START_UTIME + now_us - 3_000_001
         data.feed([ones(MARKERS, number, utime=utime, timestamp_us=number)])
-        data.feed([ones(MARKERS, 50 + number, 1, utime=utime - 1, source="stage", timestamp_us=7 * number)])
-    data.feed([ones(MARKERS, 60, 1, utime=START_UTIME + 10**6, source="stage", timestamp_us=999)])
+        data.feed([ones(MARKERS, 50 + number, 1, utime=behind, source="stage", timestamp_us=7 * number)])
+    now_us = 10**6
+    behind = START_UTIME + now_us - 3_000_001
+    data.feed([ones(MARKERS, 60, 1, utime=behind, source="stage", timestamp_us=999)])
     frames = data.frames(3)
     assert [(each.source, each.sequence) for each in frames] == [("lab", 0), ("lab", 1), ("lab", 2)]
     assert [each.sources["stage"].sequence for each in frames] == [50, 51, 52]
