@@ -26,7 +26,7 @@ BARE := build/bare-debian-12/complete
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-all test-install test-anywhere test-compiled check bytecode lint types contracts generated messages docs site lcm-types examples \
+.PHONY: demo lock test test-slow test-install test-anywhere test-compiled check bytecode lint types contracts generated messages docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
     clone-url clean
@@ -39,22 +39,13 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
-# What is slow by nature. These mostly wait: for systemd, browsers, installations, compilers, and commands in the documents.
-WAITING_TESTS := $(addprefix tests/,docs systemd release view languages site packaging bids)
-# Attacks and outages load the machine themselves.
-ATTACKS := $(addprefix tests/,hostile outages benchmarks)
-SLOW_NEEDS := .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
-RUN_SLOW := MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup -m 'not installation'
+# What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
+# commands in the documents.
+SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
-test-slow: $(SLOW_NEEDS)
-	$(RUN_SLOW) $(or $(ARGS),$(WAITING_TESTS) $(ATTACKS))
-
-# The tests of `make test` (testpaths in pyproject.toml) compute while others wait. Attacks come after them, alone.
-FAST_TESTS := $(addprefix tests/,compatibility contract integration property unit)
-
-test-all: $(SLOW_NEEDS)
-	$(RUN_SLOW) --workers 8 $(WAITING_TESTS) $(FAST_TESTS)
-	$(RUN_SLOW) $(ATTACKS)
+test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup -m 'not installation' \
+	    $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
 # second build; the wheels and the sdist on a Debian without a compiler; the container image. It takes a quarter of an
@@ -86,10 +77,11 @@ SLOW ?= --slow
 test-anywhere: .venv/installed
 	$(BIN)/python -B -m tests.anywhere $(SLOW) $(SURROUNDINGS)
 
+# The tests use both cores, and wait often enough for the compiler, mypy and downloads to run beside them.
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 compiled wheelhouse lint workflows contracts generated \
-	    docs types bytecode
-	$(MAKE) --no-print-directory test-all
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
+	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types wheelhouse
+	$(MAKE) --no-print-directory test-slow
 	$(MAKE) --no-print-directory test-compiled
 
 # Write the bytecode of the tests: six workers that start together would each compile all of them, in 10 s.

@@ -21,7 +21,8 @@ _ZENOH_THREAD: Final = "(pyo3-closure)"
 _OWN_DAEMONS: Final = frozenset({"live-sources", "refill"})
 """Threads of this package that may be in a call of Zenoh. It returns when the session is closed."""
 
-_JOIN_S: Final = 2.0
+_JOIN_S: Final = 20.0
+"""How long to wait for these threads on a busy computer: one that is still in Zenoh aborts the process."""
 
 
 class _Closable(Protocol):
