@@ -44,8 +44,8 @@ test: .venv/installed
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup -m 'not installation' \
-	    $(or $(ARGS),$(SLOW_TESTS))
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --workers 5 --dist loadgroup \
+	    -m 'not installation' $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
 # second build; the wheels and the sdist on a Debian without a compiler; the container image. It takes a quarter of an

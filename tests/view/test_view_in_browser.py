@@ -135,10 +135,14 @@ def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene,
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
 
 
+SLOW = ("--rate", "50", "--analog-rate", "50")
+"""Rendering in software leaves little of the machine for data, and a picture that lags is not live."""
+
+
 def test_what_happened_before_the_view_was_opened_is_there(tmp_path: Path, new_page: NewPage) -> None:
     """The server has ended: events and markers can only come from the gateway's history."""
     with ExitStack() as stack:
-        port, server = stack.enter_context(simulator())
+        port, server = stack.enter_context(simulator(*SLOW))
         gateway = stack.enter_context(gateway_process(tmp_path, port, hub="router"))
         wait_until(lambda: gateway.headers["event"])
         server.kill()
@@ -154,7 +158,7 @@ def test_a_source_that_is_lost_and_comes_back(tmp_path: Path, new_page: NewPage)
     port = free_port()
     with ExitStack() as stack:
         gateway = stack.enter_context(gateway_process(tmp_path, port, hub="router"))
-        with simulator("--port", str(port)):
+        with simulator("--port", str(port), *SLOW):
             gateway.wait_for_frames(1)
             view = stack.enter_context(view_process("--connect", gateway.endpoint))
             picture = Picture(new_page(viewport=WINDOW), view.address)
@@ -163,7 +167,7 @@ def test_a_source_that_is_lost_and_comes_back(tmp_path: Path, new_page: NewPage)
         picture.wait_for_banner("lab: no data for")
         picture.wait_for_banner(f"waiting for 127.0.0.1:{port}")
         picture.wait_for_text("^lab: no data for ")
-        with simulator("--port", str(port)):
+        with simulator("--port", str(port), *SLOW):
             picture.wait_for_banner("live lab")
             picture.wait_for_no_text("no data")
         assert view.end() == 0
