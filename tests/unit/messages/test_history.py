@@ -149,6 +149,7 @@ class SteppedHost(HostClock):
         self.steps += 1
 
 
+@pytest.mark.interpreted
 @given(
     st.lists(
         st.tuples(
@@ -186,6 +187,7 @@ def test_the_last_seconds_are_those_of_a_clock_that_nobody_sets(
     assert found == sorted(found)
 
 
+@pytest.mark.interpreted
 def test_a_message_that_was_dated_before_a_step_and_kept_after_it_is_young() -> None:
     """Another stream may have noticed the step in between."""
     clock = Clock()
@@ -203,6 +205,7 @@ def test_a_message_that_was_dated_before_a_step_and_kept_after_it_is_young() -> 
     assert read_all(history, "3d", WantedMessages(None, None, None, 3.9)) == []
 
 
+@pytest.mark.interpreted
 def test_the_disk_is_asked_for_the_time_that_the_clock_showed_before_a_step() -> None:
     clock = Clock()
     host = SteppedHost(clock)

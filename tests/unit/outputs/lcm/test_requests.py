@@ -405,6 +405,7 @@ class FakeTime:
         self.now_s += duration_s
 
 
+@pytest.mark.interpreted
 @with_settings(max_reply_bytes_per_s=10_000)
 async def test_messages_are_sent_again_no_faster_than_replies_may_be(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
@@ -423,6 +424,7 @@ async def test_messages_are_sent_again_no_faster_than_replies_may_be(
     assert not lab.requests._is_refilling
 
 
+@pytest.mark.interpreted
 async def test_a_refill_that_cannot_be_sent_is_counted_and_ends(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
