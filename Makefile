@@ -40,7 +40,7 @@ test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
 # What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
-# commands in the documents.
+# commands in the documents. They load the machine more than others: six workers on two cores took longer than five.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
