@@ -12,8 +12,9 @@ from typing import Final, TextIO
 from gateway.cli.echo_output import MAX_WAITING, json_line, text_line, too_fast_text
 from gateway.cli.echo_sources import EchoSources
 from gateway.cli.record_output import missing_texts, unknown_texts
-from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE, Reception, Series, Source
+from gateway.client.reception import MAX_SERIES, MAX_SOURCES, Reception
 from gateway.client.refill import Refill
+from gateway.client.sources import POSE, Series, Source
 from gateway.client.transport import GatewaySubscriber, close_in_time
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode

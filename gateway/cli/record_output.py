@@ -13,7 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.client.completion import Unknown
-from gateway.client.reception import MAX_SERIES, MAX_SOURCES, POSE, Series
+from gateway.client.reception import MAX_SERIES, MAX_SOURCES
+from gateway.client.sources import POSE, Series
 from gateway.client.transport import GatewaySubscriber
 from gateway.logs.safe_text import safe_text
 from gateway.takes.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording

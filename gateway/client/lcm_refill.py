@@ -5,18 +5,16 @@ import json
 import re
 import threading
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import rtc3d
 
 from gateway.client.history_requests import HistoryAnswer, history_answer
+from gateway.client.lcm_requester import LcmRequester
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.history import MAX_ANSWER_BYTES, sequence_of
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-
-if TYPE_CHECKING:
-    from gateway.client.lcm_transport import LcmRequester
 
 _QUIET_S: Final = 0.3
 """If nothing has arrived for so long, the other messages are lost."""
@@ -30,7 +28,7 @@ _PREFIX_BYTES: Final = 40
 class LcmRefill:
     """Asks for messages with a ``requester``, and receives them on ``url``, in a thread after the first."""
 
-    def __init__(self, url: str, prefix: str, requester: "LcmRequester") -> None:
+    def __init__(self, url: str, prefix: str, requester: LcmRequester) -> None:
         self._url = url
         self._prefix = prefix
         self._requester = requester

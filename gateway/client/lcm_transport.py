@@ -1,14 +1,11 @@
 """Gateways on LCM: asking one source or all until there is a reply, and receiving what they publish."""
 
 import contextlib
-import itertools
 import logging
 import re
 import threading
 import time
-import uuid
-from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -23,7 +20,9 @@ from gateway.client.history_requests import (
     HistoryRequest,
 )
 from gateway.client.lcm_refill import LcmRefill
-from gateway.client.reception import FINGERPRINTS, POSE, Reception, Series, Source
+from gateway.client.lcm_requester import LcmRequester
+from gateway.client.reception import Reception
+from gateway.client.sources import FINGERPRINTS, POSE, Series, Source
 from gateway.client.transport import (
     RETRY_S,
     FoundSources,
@@ -219,9 +218,6 @@ _POSE_MARK: Final = "_6D_"
 
 _KEYS_BY_FINGERPRINT: Final = {fingerprint: key for key, fingerprint in FINGERPRINTS.items()}
 
-_MAX_WAITING: Final = 4096
-"""For how many requests a reply is awaited: a source that never replies must not take up memory."""
-
 logger = logging.getLogger(__name__)
 
 
@@ -239,7 +235,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         components: Collection[str] | None,
         reception: Reception[Any, Any],
         completeness: Completeness,
-        requester: "LcmRequester",
+        requester: LcmRequester,
         refill: LcmRefill,
     ) -> None:
         super().__init__(prefix, components, reception, completeness)
@@ -362,45 +358,3 @@ class LcmGatewaySubscriber(GatewaySubscriber):
 def _channel(source: Source, key: str) -> str:
     """Return the channel of a key of the history."""
     return f"{source.channels}{lcm_channel('', *key.split('/', 1))}"
-
-
-class LcmRequester:
-    """Sends requests on PREFIX_SOURCE_KIND_REQUEST, and receives the replies on PREFIX_SOURCE_KIND_REPLY.
-
-    ``url`` is that of requests. A thread calls the callback of a request with each reply to it. Raises
-    OutputError if LCM does not open.
-    """
-
-    def __init__(self, url: str, prefix: str) -> None:
-        self._lcm = open_lcm(url)
-        self._requester = f"rtc3d-gateway {uuid.uuid4()}"
-        self._numbers = itertools.count()
-        self._callbacks: OrderedDict[int, Callable[[Any], object]] = OrderedDict()
-        replies = f"{re.escape(prefix)}_.+_(PARAMETERS|COMMAND)_REPLY"
-        self._subscriber = LcmSubscriber(self._lcm, replies, self._receive)
-
-    def prepare(self, request: Any, on_reply: Callable[[Any], object]) -> Any:
-        """Return the request with a number of its own, with which ``send`` may send and repeat it."""
-        request.requester, request.request_id = self._requester, next(self._numbers)
-        self._callbacks[request.request_id] = on_reply
-        if len(self._callbacks) > _MAX_WAITING:
-            self._callbacks.popitem(last=False)
-        return request
-
-    def send(self, channels: str, request: Any) -> None:
-        """Send a prepared request to the source whose channels begin with ``channels``. Raises OSError."""
-        kind = "COMMAND" if isinstance(request, rtc3d.command_request_t) else "PARAMETERS"
-        self._lcm.publish(f"{channels}_{kind}_REQUEST", request.encode())
-
-    def close(self) -> None:
-        """Stop receiving."""
-        self._subscriber.close()
-
-    def _receive(self, _channel: str, data: bytes) -> None:
-        try:
-            reply = decode(data)
-        except ProtocolError:
-            return
-        is_reply = isinstance(reply, rtc3d.parameters_reply_t | rtc3d.command_reply_t)
-        if is_reply and reply.requester == self._requester:
-            self._callbacks.get(reply.request_id, lambda _reply: None)(reply)

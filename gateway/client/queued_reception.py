@@ -8,7 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
-from gateway.client.reception import Reception, Series, Source
+from gateway.client.reception import Reception
+from gateway.client.sources import Series, Source
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_steady_us, now_utime

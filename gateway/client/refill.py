@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.client.arrived_run import HeldBytes
 from gateway.client.completion import RETRY_S, Completion
@@ -17,11 +17,9 @@ from gateway.client.history_requests import (
     HistoryAnswer,
     HistoryRequest,
 )
+from gateway.client.sources import Series, Source
 from gateway.errors import QueryError
 from gateway.workers import thread_starts
-
-if TYPE_CHECKING:
-    from gateway.client.reception import Reception, Series, Source
 
 Ask = Callable[[Any, HistoryRequest, float], HistoryAnswer]
 """Requests messages of a series, and returns the answer. The last argument is how many seconds it may take.
@@ -57,6 +55,17 @@ class KeptSeries(NamedTuple):
     newest_utime: int
 
 
+class RefilledReception(Protocol):
+    """What a Refill needs to know of the reception whose series it completes."""
+
+    @property
+    def has_room(self) -> bool:
+        """Whether more messages can be taken now. Nothing is requested otherwise."""
+
+    def failed(self, defect: Exception) -> None:
+        """Note a defect in this program."""
+
+
 class Refill:
     """Completes the series of a reception; its ``lock`` protects everything here.
 
@@ -67,7 +76,7 @@ class Refill:
 
     def __init__(
         self,
-        reception: "Reception[Any, Any]",
+        reception: RefilledReception,
         lock: threading.Lock,
         ask: Ask,
         find: FindSeries,
@@ -89,18 +98,18 @@ class Refill:
 
     # Under the lock, which the caller holds.
 
-    def add(self, series: "Series", hand_on: Callable[[bytes], object]) -> Completion:
+    def add(self, series: Series, hand_on: Callable[[bytes], object]) -> Completion:
         """Return what completes a series, which hands its messages on."""
         completion = Completion(hand_on, series.check, self._held_bytes, self.completeness)
         self._completions[series] = completion
         return completion
 
-    def begin(self, source: "Source") -> None:
+    def begin(self, source: Source) -> None:
         """Note that there is a source, which may have had messages in the last seconds."""
         if self.completeness.last_s is not None:
             self._due_of(source)
 
-    def _due_of(self, source: "Source") -> "dict[Series, Completion]":
+    def _due_of(self, source: Source) -> dict[Series, Completion]:
         """Return the series of a source of which something is to be requested, by a thread of the source."""
         due = self._due.get(source)
         if due is None:
@@ -111,14 +120,14 @@ class Refill:
                 self._due[source] = due
         return due
 
-    def check(self, series: "Series") -> None:
+    def check(self, series: Series) -> None:
         """Note that there is something to request of a series."""
         due = self._due_of(series.source)
         if series not in due:
             due[series] = self._completions[series]
             self._changed.notify_all()
 
-    def reached_utime(self, source: "Source") -> float:
+    def reached_utime(self, source: Source) -> float:
         """Return until when all series of a source are complete; infinite if nothing is missing."""
         due = self._due.get(source)
         incomplete = () if due is None else (each for each in due.values() if each.due_s < math.inf)
@@ -155,7 +164,7 @@ class Refill:
 
     # In the threads.
 
-    def _run(self, source: "Source", due: "dict[Series, Completion]") -> None:
+    def _run(self, source: Source, due: dict[Series, Completion]) -> None:
         if self.completeness.last_s is not None:
             self._begin_silent(source, self.completeness.last_s)
         while True:
@@ -170,7 +179,7 @@ class Refill:
             else:
                 self._request(series, due[series])
 
-    def _request(self, series: "Series", completion: Completion) -> None:
+    def _request(self, series: Series, completion: Completion) -> None:
         """Request what a series misses, and give it the answer."""
         source = series.source
         with self._changed:
@@ -196,7 +205,7 @@ class Refill:
             else:
                 completion.answer(request, answer, now_s)
 
-    def _begin_silent(self, source: "Source", last_s: float) -> None:
+    def _begin_silent(self, source: Source, last_s: float) -> None:
         """Begin the series of a source that had messages in the last seconds, and may have none now."""
         end_s = self._monotonic() + min(REPLY_S, self.completeness.patience_s or REPLY_S)
         found: list[KeptSeries] = []
@@ -218,7 +227,7 @@ class Refill:
                     completion.begin(self._monotonic())
                     self.check(series)
 
-    def _look(self, source: "Source") -> None:
+    def _look(self, source: Source) -> None:
         """Look for messages of a source that nothing which arrives shows: the first of a key, or the last."""
         begin_s = self._monotonic()
         found: list[KeptSeries] = []
@@ -249,7 +258,7 @@ class Refill:
                 if completion.due_s < math.inf:
                     self.check(series)
 
-    def _wait(self, source: "Source", due: "dict[Series, Completion]") -> "Series | None":
+    def _wait(self, source: Source, due: dict[Series, Completion]) -> Series | None:
         """Wait until there is something to request, and return of which series; None to look for some."""
         while not self._is_closed:
             now_s = self._monotonic()

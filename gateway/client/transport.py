@@ -9,8 +9,9 @@ from dataclasses import replace
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from gateway.client.history_requests import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
-from gateway.client.reception import FINGERPRINTS, MAX_SERIES, POSE, TYPES_BY_KEY, Reception, Series, Source
+from gateway.client.reception import MAX_SERIES, Reception
 from gateway.client.refill import KeptSeries
+from gateway.client.sources import FINGERPRINTS, POSE, TYPES_BY_KEY, Series, Source
 from gateway.errors import ProtocolError, QueryError
 from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode

@@ -20,7 +20,8 @@ from gateway.client.history_requests import (
     HistoryRequest,
     history_answer,
 )
-from gateway.client.reception import MAX_XML_BYTES, POSE, Reception, Series, Source
+from gateway.client.reception import MAX_XML_BYTES, Reception
+from gateway.client.sources import POSE, Series, Source
 from gateway.client.transport import (
     MAX_STATUS_BYTES,
     RETRY_S,

@@ -8,7 +8,8 @@ from typing import Final
 import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.reception import Messages, Source
+from gateway.client.reception import Messages
+from gateway.client.sources import Source
 from gateway.client.transport import GatewaySubscriber
 from gateway.errors import ConfigError, OutputError, QueryError
 from gateway.logs.safe_text import safe_text

@@ -11,7 +11,8 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.client.reception import Reception, Series, Source
+from gateway.client.reception import Reception
+from gateway.client.sources import Series, Source
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.history import utime_of
 from gateway.messages.host_time import now_utime

@@ -13,7 +13,7 @@ import numpy as np
 import rtc3d
 import zenoh
 
-from gateway.client.reception import FINGERPRINTS
+from gateway.client.sources import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gateway.client.reception import POSE, Series
+from gateway.client.sources import POSE, Series
 from gateway.descriptions.labels import describe
 from gateway.display.live import LiveComponent, LiveSource
 from gateway.logs.safe_text import safe_text

@@ -19,7 +19,7 @@ from typing import Any, Final
 import pytest
 import rtc3d
 
-from gateway.client.reception import FINGERPRINTS
+from gateway.client.sources import FINGERPRINTS
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import PREFIX
 from gateway.takes.files.event_log import EventLogReader

@@ -10,7 +10,7 @@ import pytest
 from gateway.cli import echo_complete
 from gateway.cli.echo_complete import CompleteMessages, print_complete
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.reception import FINGERPRINTS, Series
+from gateway.client.sources import FINGERPRINTS, Series
 from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel
 from tests.support.errors import names

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from gateway.client import GatewayAddress, GatewayClient, Messages
-from gateway.client.reception import FINGERPRINTS
+from gateway.client.sources import FINGERPRINTS
 from gateway.client.transport import Replies, Reply, silence_text
 from gateway.display.live import LiveData
 from gateway.errors import QueryError

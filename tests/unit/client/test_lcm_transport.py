@@ -8,7 +8,8 @@ import pytest
 import rtc3d
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.reception import FINGERPRINTS, MAX_SOURCES
+from gateway.client.reception import MAX_SOURCES
+from gateway.client.sources import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url

@@ -1,6 +1,6 @@
 """The messages of one key, counted, and when gateways are queried about their sources."""
 
-from gateway.client.reception import Series, Source
+from gateway.client.sources import Series, Source
 from gateway.messages.encode import NOT_PUBLISHED, PREFIX
 from tests.support.clocks import Clock
 

@@ -47,7 +47,7 @@ class Subscriber:
         self.source: Any = Source()
         self.series: Any = [Series(self.source) for _ in range(num_series)]
         self._answer_size = answer_size
-        self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE)  # type: ignore[arg-type] # only has_room
+        self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE)
         self.completions = [self.refill.add(each, self._hand_on) for each in self.series]
 
     @property

@@ -8,8 +8,8 @@ import pytest
 
 from gateway.client.history_requests import Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.queued_reception import QueuedSeries
-from gateway.client.reception import Source
 from gateway.client.refill import KeptSeries
+from gateway.client.sources import Source
 from gateway.display import live as live_module
 from gateway.display.live import LiveSource
 from gateway.messages.host_time import now_utime

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.reception import Series
+from gateway.client.sources import Series
 from gateway.display.live import LiveData, LiveSource
 from gateway.display.top import facts
 from gateway.display.top.pages import PAGES, TWO_GATEWAYS, Page, event_time
