@@ -34,6 +34,9 @@ not fill the log.
 REMINDER_S: Final = 3600.0
 """How often a failure that goes on is logged again. In this time, its reason is logged MAX_REPEATS times."""
 
+STEADY_REASON_S: Final = 300.0
+"""A changed reason that has stayed the same for so long is logged in any case."""
+
 _NUMBERS: Final = re.compile(r"\d+")
 """Durations, sizes and counts in a text vary while the reason is the same."""
 
@@ -150,6 +153,8 @@ class FailureLog:
         self._changes = Repeats(MAX_REPEATS, REMINDER_S)
         self._reason = ""  # of the newest failure that was logged as WARNING, and when that was
         self._logged_s = -math.inf
+        self._newest_reason = ""  # of the newest failure, and since when it is the same
+        self._newest_since_s = 0.0
 
     @property
     def failing(self) -> bool:
@@ -164,6 +169,8 @@ class FailureLog:
         self._failures += 1
         self._last_s = monotonic()
         reason = _NUMBERS.sub("0", reason or text)
+        if reason != self._newest_reason:
+            self._newest_reason, self._newest_since_s = reason, self._last_s
         if self._failures > 1:
             self._failed_again(text, reason)
             return
@@ -179,13 +186,19 @@ class FailureLog:
         )
 
     def _failed_again(self, text: str, reason: str) -> None:
-        """Log a further failure: as WARNING once an hour, and if the reason has changed a few times only."""
+        """Log a further failure: as WARNING once an hour, and if the reason has changed.
+
+        Reasons that change all the time would fill the log, so there is a limit. But the last line must not
+        name a reason that is over: beyond the limit, a changed one is logged when it has stayed for a while.
+        """
         now_s = self._last_s
         addition: str | None = None
         if now_s - self._logged_s >= REMINDER_S:
             addition = ""
         elif reason != self._reason:
             addition = self._changes.count(now_s)
+            if addition is None and now_s - self._newest_since_s >= STEADY_REASON_S:
+                addition = ""
         if addition is None:
             self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
             return

@@ -11,6 +11,7 @@ from gateway.logs.failures import (
     HOLD_S,
     MAX_HOLD_S,
     MAX_REPEATS,
+    STEADY_REASON_S,
     DefectLog,
     EventLog,
     FailureLog,
@@ -144,6 +145,22 @@ def test_reasons_that_change_all_the_time_do_not_fill_the_log(
         clock.now_s += 1.0
     num_loud = levels(caplog).count("WARNING")
     assert 10 <= num_loud <= 1 + 10 * (MAX_REPEATS + 1)
+
+
+def test_after_many_changes_the_reason_that_stays_is_logged(
+    clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """While a server restarts, its reasons change often. The last line must not be one that is long over."""
+    failures = FailureLog(LOGGER, "lab")
+    for number in range(MAX_REPEATS + 5):
+        failures.failed(f"broken: {chr(0x4E00 + number)}")
+        clock.now_s += 1.0
+    caplog.clear()
+    for _ in range(int(2 * STEADY_REASON_S)):
+        failures.failed("refused")
+        clock.now_s += 1.0
+    loud = [index for index, level in enumerate(levels(caplog)) if level == "WARNING"]
+    assert loud == [STEADY_REASON_S]
 
 
 def test_a_new_period_of_failure_has_a_reminder_of_its_own(
