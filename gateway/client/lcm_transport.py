@@ -41,6 +41,7 @@ from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import DISCOVERY_S, missing_source
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
+from gateway.outputs.lcm.requests import is_presence
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
 
 _LISTEN_S: Final = 1.5
@@ -256,7 +257,8 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
     def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
-        if address.endswith(("_REQUEST", "_REPLY", "_REFILL", "_RECONNECTED")):
+        exchange = ("_REQUEST", "_REPLY", "_REFILL", "_RECONNECTED")
+        if address.endswith(exchange) or is_presence(address, message):
             return None
         key = _KEYS_BY_FINGERPRINT.get(message[:8])
         if key == POSE:

@@ -11,6 +11,7 @@ class command_request_t(object):
     """
     A command to the gateway about a source, on PREFIX_SOURCE_COMMAND_REQUEST.
     The reply on PREFIX_SOURCE_COMMAND_REPLY has the same request_id and requester.
+    Gateways show themselves to each other on PREFIX_SOURCE_GATEWAY: requester tells them apart, the rest is empty.
     """
 
     __slots__ = ["request_id", "requester", "command", "num_options", "options"]

@@ -16,7 +16,7 @@ import zenoh
 
 from tests.support.needs import need_programs
 
-_LCM_PORTS: Final = itertools.count(7720)
+_LCM_PORTS: Final = itertools.count(7720, 2)
 _PORTS: Final = itertools.cycle(range(10_000, 32_000))
 """By default, Linux chooses ports from 32768 on."""
 _OPEN_TIMEOUT_S: Final = 120.0
@@ -72,7 +72,7 @@ def wait_for_zenoh(endpoint: str) -> zenoh.Session:
 
 
 def lcm_url() -> str:
-    """Return a multicast URL that no other test of this run uses."""
+    """Return a multicast URL that no other test of this run uses, nor the next port, for requests."""
     return f"udpm://239.255.76.67:{next(_LCM_PORTS)}?ttl=0"
 
 

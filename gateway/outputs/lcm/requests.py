@@ -53,6 +53,9 @@ _REFILL_BURST_S: Final = 0.002
 PRESENCE_S: Final = 5.0
 """How often a gateway shows itself to others on the URL of requests."""
 
+_PRESENCE: Final = "GATEWAY"
+_PRESENCE_FINGERPRINT: Final[bytes] = rtc3d.command_request_t._get_packed_fingerprint()  # noqa: SLF001 - see decode.py
+
 MAX_REMEMBERED: Final = 64
 """How many commands are remembered with their results, for requests that are repeated."""
 
@@ -156,7 +159,7 @@ class LcmRequests:
                 self._show_presence(source)
 
     def _presence_channel(self, source: str) -> str:
-        return lcm_channel(self._prefix, source, "GATEWAY")
+        return lcm_channel(self._prefix, source, _PRESENCE)
 
     def _show_presence(self, source: str) -> None:
         message = rtc3d.command_request_t()
@@ -394,6 +397,14 @@ class LcmRequests:
             self._sender.send(lcm_channel(self._prefix, source, f"{kind.name}_REPLY"), reply.encode())
         except OutputError as error:
             self._losses[source].lost(error.cause, str(error), frames=0)
+
+
+def is_presence(channel: str, message: bytes) -> bool:
+    """Return whether a gateway shows itself to others with this message, which is for no subscriber.
+
+    The poses of a tool of that name are on such a channel, too.
+    """
+    return message[:8] == _PRESENCE_FINGERPRINT and channel.endswith(f"_{_PRESENCE}")
 
 
 def refill_channel(channel: str) -> str:

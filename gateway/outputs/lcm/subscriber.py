@@ -13,6 +13,7 @@ from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
 from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRequest
 from gateway.outputs.lcm.connection import Waiting, open_lcm, receiving_url, reconnect
 from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.requests import is_presence
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.outputs.lcm.settings import LcmSettings, effective_lcm_url
 
@@ -76,10 +77,24 @@ class LcmSubscriber:
             self._lcm.unsubscribe(self._subscription)
 
 
+def without_presence(receive: Receive) -> Receive:
+    """Return a function that passes all messages on but those with which gateways show themselves.
+
+    They are on the URL of requests, which may be that of the messages or that of another gateway's.
+    """
+
+    def receive_message(channel: str, message: bytes) -> None:
+        if not is_presence(channel, message):
+            receive(channel, message)
+
+    return receive_message
+
+
 def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
     """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
     channels = channel_pattern(request.prefix or DEFAULT_LCM_PREFIX, request.source, request.component)
-    return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)
+    connection = open_lcm(receiving_url(effective_lcm_url(request.address)))
+    return LcmSubscriber(connection, channels, without_presence(receive))
 
 
 def demo(use_network: bool) -> DemoSide:
@@ -88,7 +103,8 @@ def demo(use_network: bool) -> DemoSide:
     connection = open_lcm(receiving_url(settings.effective_url))
 
     def subscribe_here(source: str, receive: Receive) -> Subscription:
-        return LcmSubscriber(connection, channel_pattern(settings.prefix, source, None), receive)
+        channels = channel_pattern(settings.prefix, source, None)
+        return LcmSubscriber(connection, channels, without_presence(receive))
 
     # memq:// connects only users of one LCM object, so the output and the subscriber share it.
     return DemoSide(settings, LcmOutput(settings, None if use_network else connection), subscribe_here)

@@ -7,7 +7,9 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
+
+import rtc3d
 
 from gateway.errors import OutputError, TakeError
 from gateway.outputs.contract import Output
@@ -26,6 +28,10 @@ OPENING_S: Final = 5.0
 
 LISTENING_S: Final = 1.5
 """How long to listen for others before the replay; a gateway publishes its status every second."""
+
+_REQUEST_TYPES: Final[tuple[type[Any], ...]] = (rtc3d.parameters_request_t, rtc3d.command_request_t)
+_REQUESTS: Final = {each._get_packed_fingerprint() for each in _REQUEST_TYPES}  # noqa: SLF001 - see decode.py
+"""What begins the messages of programs that ask a gateway, maybe on the URL of its messages."""
 
 _MAX_NAMED: Final = 3
 _POLL_S: Final = 0.02
@@ -86,16 +92,20 @@ async def until_open(destination: Destination) -> None:
 async def require_silence(destinations: Sequence[Destination]) -> None:
     """Listen for LISTENING_S, and raise TakeError if somebody publishes under one of the prefixes.
 
-    Otherwise subscribers would take recorded data for live data, or mix two replays.
+    Otherwise subscribers would take recorded data for live data, or mix two replays. Programs that ask for
+    something publish nothing: they may be waiting for this replay.
     """
     heard: dict[str, None] = {}
+
+    def receive(name: str, message: bytes) -> None:
+        if message[:8] not in _REQUESTS:
+            heard.setdefault(name)
+
     with ExitStack() as stack:
         for destination in destinations:
             subscribe = destination.kind.subscribe
             if subscribe is not None:
-                listen = partial(
-                    subscribe, destination.request, lambda name, _message: heard.setdefault(name)
-                )
+                listen = partial(subscribe, destination.request, receive)
                 subscription = await WorkerThread(f"listen {destination.kind.name}").run(listen)
                 stack.callback(subscription.close)
         await asyncio.sleep(LISTENING_S)

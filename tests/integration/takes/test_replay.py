@@ -21,6 +21,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, Tool
 from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.takes.replay.replay import lcm_destination, require_silence
 from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.support.commands import run_in_process
 from tests.support.errors import names
@@ -187,6 +188,23 @@ async def test_a_replay_does_not_mix_with_somebody_else(tmp_path: Path, subscrib
         lambda: by_channel(subscribers.messages, "SITE_TWO")["SITE_TWO_LAB_3D"] == expected
     )
     await subscribers.wait_for("site/two/lab/3d", expected)
+
+
+async def test_programs_that_wait_for_a_replay_do_not_prevent_it() -> None:
+    """They ask for parameters or takes on LCM, maybe on the URL of the messages; gateways show themselves."""
+    url = lcm_url()
+    requests = {
+        "REPLAY_LAB_PARAMETERS_REQUEST": rtc3d.parameters_request_t().encode(),
+        "REPLAY_LAB_COMMAND_REQUEST": rtc3d.command_request_t().encode(),
+        "REPLAY_LAB_GATEWAY": rtc3d.command_request_t().encode(),
+    }
+    others = lcm.LCM(url)
+    listening = asyncio.create_task(require_silence([lcm_destination("REPLAY", url)]))
+    while not listening.done():
+        for channel, message in requests.items():
+            others.publish(channel, message)
+        await asyncio.sleep(0.02)
+    await listening
 
 
 async def test_an_output_that_does_not_open_is_left_out(tmp_path: Path, subscribers: Subscribers) -> None:

@@ -86,6 +86,16 @@ def test_what_is_no_message_of_a_gateway_is_left_out(lab: Lab) -> None:
     assert not {"MOCAP_LAB_ANALOG", "MOCAP_LAB_PARAMETERS_REQUEST"} & set(channels)
 
 
+def test_what_programs_ask_and_how_gateways_show_themselves_is_nothing_foreign(lab: Lab) -> None:
+    """It may be on the URL of the messages. A count of foreign messages would look like a fault."""
+    lab.lcm.publish("MOCAP_LAB_PARAMETERS_REQUEST", rtc3d.parameters_request_t().encode())
+    for end in ("COMMAND_REQUEST", "GATEWAY"):
+        lab.lcm.publish(f"MOCAP_LAB_{end}", rtc3d.command_request_t().encode())
+    lab.lcm.publish("MOCAP_LAB_3D", lab.markers(1))
+    wait_until(lambda: lab.recording.num_messages)
+    assert lab.recording.num_foreign == 0
+
+
 def test_sources_are_bounded(lab: Lab) -> None:
     for number in range(300):
         lab.lcm.publish(f"MOCAP_S{number}_3D", lab.markers(1))

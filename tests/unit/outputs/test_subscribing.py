@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import lcm
 import pytest
+import rtc3d
 
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
@@ -164,6 +165,21 @@ def test_no_message_is_lost_while_a_receiver_of_lcm_pauses() -> None:
     wait_until(lambda: len(received) == len(sent))
     subscription.close()
     assert received == sent
+
+
+@pytest.mark.netns
+def test_how_gateways_show_themselves_on_lcm_is_no_message(received: list[tuple[str, bytes]]) -> None:
+    """The URL of requests may be that of the messages. A tool may have the name of that channel."""
+    url = lcm_url()
+    subscription = subscribed("lcm", SubscriptionRequest(address=url), received)
+    publisher = lcm.LCM(url)
+    publisher.publish("MOCAP_LAB_GATEWAY", rtc3d.command_request_t().encode())
+    shown = [("MOCAP_LAB_6D_GATEWAY", rtc3d.tool_pose_t().encode()), ("MOCAP_LAB_3D", b"message")]
+    for channel, message in shown:
+        publisher.publish(channel, message)
+    wait_until(lambda: len(received) >= len(shown))
+    subscription.close()
+    assert received == shown
 
 
 def test_an_endpoint_without_zenoh_is_named_with_what_to_check(received: list[tuple[str, bytes]]) -> None:
