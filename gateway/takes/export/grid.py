@@ -8,9 +8,9 @@ from itertools import pairwise
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from gateway.takes.export.period import RunTimes, measured_period_us, number_step, rate_changes
+from gateway.takes.export.row_shifts import MAX_INT32, is_near, line_period_us, numbered_rows, shifts_of
 from gateway.takes.files.component_rows import NO_TIMES_US, Array
 from gateway.takes.files.series import Series
 from gateway.takes.files.spool import pieces
@@ -24,14 +24,6 @@ _TOLERANCE: Final = 0.005
 For half of the announced rate it is half as much, and so on."""
 
 _MAX_TOLERANCE: Final = 0.02
-
-_WINDOW: Final = 9
-"""The median of so many frames says where they belong: single ones that are late or early have no effect."""
-
-_MAX_SPREAD: Final = 0.75
-"""Time stamps that differ by no more rows than this from where the numbers place the frames leave them
-there."""
-
 
 Frames: TypeAlias = Array | slice
 """Indices of frames: of a recording without gaps, a slice, which takes no memory."""
@@ -80,8 +72,8 @@ class Grid(NamedTuple):
 def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     """Return the places of a run's frames, in several grids if there are gaps of more than 10 s.
 
-    The row of a frame is the time since the first one, divided by the period and rounded: no error adds up.
-    A frame that is late or early beside its neighbours has the place that its number gives it. The period is
+    The row of a frame is what its number says, as long as the time stamps agree; otherwise, it is the time
+    since the first one, divided by the period and rounded: no error adds up. The period is
     that of the time stamps, so a server's clock that is a little fast or slow leaves no rows empty. If the
     time stamps do not progress (field note 25), or are not to be used, the sequence numbers place the frames.
     Frames that come faster than the rate for a while have a grid of their own.
@@ -130,7 +122,7 @@ def _grids(
     run: RunTimes, frames: Frames, announced_hz: float | None, *, has_time_stamps: bool
 ) -> tuple[list[Grid], bool]:
     """Return the grids of frames, and whether there are more frames than rows in one of them."""
-    period_us = measured_period_us(run)
+    period_us = _period_us(run)
     rate_hz = _rate_hz(period_us, announced_hz, len(run))
     measured_hz = 1e6 / period_us if period_us and has_time_stamps else rate_hz
     max_gap = MAX_GAP_S * rate_hz
@@ -147,6 +139,19 @@ def _grids(
     return grids, is_any_dense
 
 
+def _period_us(run: RunTimes) -> float | None:
+    """Return the time from one row to the next; None if it is not known.
+
+    If the time stamps agree with the numbers, it is that of the line through all frames. Otherwise, there are
+    gaps that the numbers do not show, or the rate changes, and the period is measured in blocks.
+    """
+    rows = numbered_rows(run, RunTimes.counted)
+    period_us = line_period_us(run, rows)
+    if period_us is not None and is_near(shifts_of(run, rows, period_us)):
+        return period_us
+    return measured_period_us(run)
+
+
 def _cuts(run: RunTimes, period_us: float | None, max_gap: float) -> list[int]:
     """Return the frames but the first with which a grid begins."""
     cuts: list[int] = []
@@ -160,27 +165,18 @@ def _cuts(run: RunTimes, period_us: float | None, max_gap: float) -> list[int]:
 def _rows(run: RunTimes, period_us: float | None) -> tuple[Array, bool]:
     """Return the rows of frames, and whether the frames come faster than rows.
 
-    Each frame has its place by the numbers, moved by what the time stamps say: the middle between the
-    largest shift before it and the smallest one after it, so that the rows increase.
+    If the time stamps agree with the numbers, these say the rows. Otherwise, each frame is moved by what the
+    time stamps say: the middle between the largest shift before it and the smallest one after it, so that
+    the rows increase.
     """
-    rows: Array = np.zeros(len(run), np.int32)
-    shifts = np.zeros(len(run) if period_us is not None else 0, np.float32)
-    newest = 0
-    for start, stop in pieces(len(run)):
-        first = max(start, 1)
-        near = run.part(first - 1, stop)
-        steps = np.diff(near.sequence) if period_us is None else near.steps(period_us)
-        found = newest + np.cumsum(steps, dtype=np.int64)
-        newest = int(found[-1]) if len(found) else newest
-        if newest > _MAX_INT32:
-            rows = rows.astype(np.int64)
-        rows[first:stop] = found
-        if period_us is not None:
-            shifts[first:stop] = (run.times_us[first:stop] - run.times_us[0]) / period_us - found
-    if period_us is None or np.ptp(shifts) <= _MAX_SPREAD:
+    if period_us is None:
+        return numbered_rows(run, lambda near: np.diff(near.sequence)), False
+    rows = numbered_rows(run, RunTimes.counted)
+    if is_near(shifts_of(run, rows, period_us)):
         return rows, False
-    shifts = _smoothed(shifts)
-    if np.ptp(shifts) <= _MAX_SPREAD:
+    rows = numbered_rows(run, lambda near: near.steps(period_us))
+    shifts = shifts_of(run, rows, period_us)
+    if is_near(shifts):
         return rows, False
     usual = np.median(shifts[:: 1 + len(shifts) // _MOST_COMPARED])
     largest_before = np.maximum.accumulate(shifts)
@@ -190,24 +186,10 @@ def _rows(run: RunTimes, period_us: float | None) -> tuple[Array, bool]:
     shifts /= 2
     rows = rows.astype(np.int64) + np.round(shifts - usual).astype(np.int64)
     rows -= rows[0]
-    return rows if rows[-1] > _MAX_INT32 else rows.astype(np.int32), is_dense
+    return rows if rows[-1] > MAX_INT32 else rows.astype(np.int32), is_dense
 
 
 _MOST_COMPARED: Final = 10_000
-
-
-def _smoothed(shifts: Array) -> Array:
-    """Return the median of each shift and its neighbours, as many before as after it, and two at least."""
-    side = _WINDOW // 2
-    result = shifts.copy()
-    for start, stop in pieces(max(len(shifts) - 2 * side, 0)):
-        near = shifts[start : stop + 2 * side]
-        result[start + side : stop + side] = np.median(sliding_window_view(near, _WINDOW), axis=1)
-    for place in range(min(side, len(shifts) // 2)):
-        width = max(2 * place + 1, 3)
-        result[place] = np.median(shifts[:width])
-        result[-1 - place] = np.median(shifts[-width:])
-    return result
 
 
 def _skipped_rows(run: RunTimes, rows: Array) -> Array:
@@ -288,9 +270,6 @@ def _rate_hz(period_us: float | None, announced_hz: float | None, num_frames: in
             return announced_hz / divisor
     rounded_hz = round(measured_hz)
     return float(rounded_hz) if abs(rounded_hz - measured_hz) <= 0.001 * measured_hz else measured_hz
-
-
-_MAX_INT32: Final = (1 << 31) - 1
 
 
 def bounds(rows: Array, start: int, stop: int) -> tuple[int, int]:

@@ -111,6 +111,19 @@ def test_nonsense_of_a_time_stamp_takes_no_memory(tmp_path: Path) -> None:
     assert [found.num_rows for found in grids] == [3, 3]
 
 
+def test_the_numbers_place_frames_on_both_sides_of_a_gap_whatever_their_jitter(tmp_path: Path) -> None:
+    """Of blocks of few frames, the jitter alone gave a period so wrong that frames moved by a row."""
+    random = np.random.default_rng(2886766720)
+    stamps = 10_020 * np.arange(287) + random.integers(-3000, 3000, 287, endpoint=True)
+    stamps[14::50] += 8000
+    is_kept = random.random(287) >= 0.3
+    is_kept[115:160] = False
+    kept = np.flatnonzero(is_kept).tolist()
+    found = grid(tmp_path, [(number, 10**6 + int(stamps[number])) for number in kept])
+    assert found.rows.tolist() == [number - kept[0] for number in kept]
+    assert found.measured_hz == pytest.approx(1e6 / 10_020, rel=5e-4)
+
+
 @pytest.mark.parametrize("step_us", [4900, 1, 0, -3000])
 def test_two_frames_never_share_a_row(tmp_path: Path, step_us: int) -> None:
     """A time stamp that is much too early would otherwise overwrite the frame before it."""
