@@ -139,6 +139,7 @@ _INDENTATION: Final = frozenset(
         "expected <block end>, but found '<scalar>'",
         "expected <block end>, but found '-'",
         "expected <block end>, but found '?'",
+        "expected '<document start>', but found '<block mapping start>'",
         "sequence entries are not allowed here",
     }
 )
@@ -150,7 +151,7 @@ _INDENTATION_TEXT: Final = (
 )
 
 _LOOKS_LIKE_SPACE: Final = re.compile("[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000\ufeff]")
-_QUOTED_OR_COMMENT: Final = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'|(?:^|\s)#.*')
+_QUOTED_OR_COMMENT: Final = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'|(?<=\S)\s+#.*|(?<!\S)#.*')
 
 
 class _WrongSpace(NamedTuple):

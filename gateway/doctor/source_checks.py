@@ -172,7 +172,9 @@ class SourceChecks:
                     open_ports.append(str(port))
         if not open_ports:
             return ""
-        return f" Port {' and '.join(open_ports)} of {self._source.host} accepts connections ({_PORTS})."
+        if len(open_ports) == 1:
+            return f" Port {open_ports[0]} of {self._source.host} accepts connections ({_PORTS})."
+        return f" Ports {' and '.join(open_ports)} of {self._source.host} accept connections ({_PORTS})."
 
     async def _check_protocol(self) -> Finding:
         for stream in self._streams:

@@ -2,8 +2,9 @@
 
 import ipaddress
 import os
+import re
 from typing import Annotated, Final
-from urllib.parse import parse_qsl, urlsplit, urlunsplit
+from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import AfterValidator, TypeAdapter
 
@@ -39,7 +40,10 @@ def _lcm_url(text: str) -> str:
     return text
 
 
-_UDPM_PARAMETERS: Final = ("ttl", "recv_buf_size", "transmit_only")
+_PARAMETERS: Final = {
+    "udpm": ("ttl", "recv_buf_size", "transmit_only"),
+    "mpudpm": ("ttl", "recv_buf_size", "nports"),
+}
 """Those that LCM knows. It ignores others, so that a misspelt ttl leaves messages on this computer."""
 
 _MAX_TTL: Final = 255
@@ -47,31 +51,41 @@ _MAX_BUFFER_BYTES: Final = 2**31 - 1
 
 
 def _check_multicast(url: str) -> str:
-    """Return a URL. Raises ValidationError for a multicast URL that LCM refuses, or takes for another one."""
+    """Return a URL. Raises ValidationError for a multicast URL that LCM refuses, or takes for another one.
+
+    LCM decodes no %, reads numbers that begin with 0 as octal, ignores what follows a #, and has defaults of
+    host and port only if both are missing.
+    """
     parts = urlsplit(url)
     if parts.scheme not in MULTICAST_SCHEMES:
         return url
     found = f"found {describe(url)}; expected"
+    host, _, port = parts.netloc.partition(":")
     try:
-        is_multicast = ipaddress.IPv4Address(parts.hostname or DEFAULT_GROUP).is_multicast
+        is_multicast = not parts.netloc or ipaddress.IPv4Address(host).is_multicast
     except ValueError:
         is_multicast = False
     if not is_multicast:
         raise validation_error(f"{found} a multicast address, 224.0.0.0 to 239.255.255.255, as the host")
-    try:
-        is_port = parts.port != 0
-    except ValueError:
-        is_port = False
-    if not is_port:
+    if parts.netloc and not _is_whole_number(port, 1, 65535):
         raise validation_error(f"{found} a port from 1 to 65535")
-    for name, value in parse_qsl(parts.query, keep_blank_values=True):
+    if parts.fragment:
+        raise validation_error(f"{found} no #, because LCM ignores what follows it")
+    for pair in filter(None, parts.query.split("&")):
+        name, _, value = pair.partition("=")
+        known = _PARAMETERS[parts.scheme]
+        if name not in known:
+            hint = spelling_hint(name, known)
+            raise validation_error(f"{found} only {join_or(known)} after the ?, not {name}{hint}")
         most = {"ttl": _MAX_TTL, "recv_buf_size": _MAX_BUFFER_BYTES}.get(name)
-        if most is not None and not (value.isascii() and value.isdecimal() and int(value[:20]) <= most):
+        if most is not None and not _is_whole_number(value, 0, most):
             raise validation_error(f"{found} a whole number from 0 to {most} as {name}")
-        if parts.scheme == "udpm" and name not in _UDPM_PARAMETERS:
-            hint = spelling_hint(name, _UDPM_PARAMETERS)
-            raise validation_error(f"{found} only {join_or(_UDPM_PARAMETERS)} after the ?, not {name}{hint}")
     return url
+
+
+def _is_whole_number(text: str, least: int, most: int) -> bool:
+    """Return whether ``text`` is a number in this range, in digits of ASCII without a 0 in front."""
+    return re.fullmatch("0|[1-9][0-9]{0,18}", text) is not None and least <= int(text) <= most
 
 
 LcmUrl = Annotated[

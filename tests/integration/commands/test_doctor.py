@@ -283,6 +283,13 @@ async def test_the_usual_port_that_answers_is_named(configured: int, answering: 
     assert re.findall(r"Port (\d+)", findings.of("TCP").remedy) == [str(answering)]
 
 
+@pytest.mark.netns
+async def test_both_usual_ports_are_named_if_both_answer() -> None:
+    with socket.create_server(("127.0.0.1", 3020)), socket.create_server(("127.0.0.1", 3030)):
+        findings = await run_doctor(lab(3021, connect_timeout_s=5.0))
+    assert re.findall(r"Ports (\d+) and (\d+)", findings.of("TCP").remedy) == [("3020", "3030")]
+
+
 @pytest.mark.parametrize("is_full", [False, True], ids=["refused", "no answer"])
 async def test_a_server_that_does_not_accept_connections_fails(is_full: bool) -> None:
     found, remedy, port = "refused", "RT server", free_port()

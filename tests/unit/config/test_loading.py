@@ -128,9 +128,16 @@ MISTAKES = [
     ("lcm:\n    enabled: true\n   url: memq://", "6:4: this line does not fit"),
     ("lcm: enabled: true", "4:13: this line does not fit"),
     ("lcm\nmetrics: {}", "5:1: this line does not fit"),
+    ("\t# a comment\nlcm: {}", "4:1: found a tab"),
     ("---\n{}", "4:1: not YAML: expected a single document"),
     ("lcm: \x07", "4:6: found the character U+0007"),
 ]
+
+
+def test_text_before_the_first_key_is_explained_where_the_keys_begin(file: Path) -> None:
+    """It is a comment that has lost its #."""
+    [found] = refused(file, f"a comment without its sign\n# and one with it\n{SERVER}")
+    assert found.startswith("3:1: this line does not fit")
 
 
 def test_every_one_of_several_equal_ports_and_names_is_reported(file: Path) -> None:
@@ -161,6 +168,14 @@ def test_every_one_of_several_equal_ports_and_names_is_reported(file: Path) -> N
         ("udpm://239.255.76.67:0", ["65535"]),
         ("udpm://239.255.76.67:70000", ["65535"]),
         ("udpm://239.255.76.67:lcm", ["65535"]),
+        ("udpm://239.255.76.67:07667", ["65535"]),
+        ("udpm://239.255.76.67?ttl=1", ["65535"]),
+        ("udpm://:7667", ["multicast"]),
+        ("udpm://239.255.76.67:7667?ttl=010", ["ttl", "255"]),
+        ("udpm://239.255.76.67:7667?ttl=1%30", ["ttl", "255"]),
+        ("udpm://239.255.76.67:7667?t%74l=1", ["t%74l"]),
+        ("udpm://239.255.76.67:7667#ttl=1", ["#"]),
+        ("mpudpm://239.255.76.67:7667?tttl=1", ["tttl", "'ttl'"]),
     ],
 )
 @pytest.mark.parametrize("key", ["url", "queries_url"])
@@ -178,9 +193,9 @@ def test_a_multicast_url_that_lcm_does_not_use_as_written_is_refused(
     [
         "udpm://",
         "udpm://?ttl=1&recv_buf_size=2000000",
-        "udpm://239.1.2.3",
+        "udpm://239.1.2.3:7000",
         "udpm://224.0.0.9:65535?ttl=255",
-        "udpm://:7667?transmit_only=true",
+        "udpm://239.255.76.67:7667?transmit_only=true",
         "mpudpm://239.255.76.67:7667?ttl=1&nports=4",
         "memq://",
         "tcpq://192.0.2.20:7700",
