@@ -14,6 +14,7 @@ import pytest
 from tests.support.commands import run_in_process
 from tests.support.configurations import write_config
 from tests.support.gateway_process import program
+from tests.support.needs import has_ipv6
 from tests.support.networks import free_port, lcm_url
 from tests.support.waiting import wait_until
 
@@ -108,7 +109,7 @@ def test_a_full_configuration_opens_nothing_that_is_not_listed(tmp_path: Path) -
         metrics={"enabled": True, "port": next(ports)},
         rtc3d={"enabled": True, "host": "127.0.0.1", "ports": {"lab": next(ports)}},
         vrpn={"enabled": True, "port": next(ports)},
-        foxglove={"enabled": True, "host": "::1", "port": next(ports)},
+        foxglove={"enabled": True, "host": "::1" if has_ipv6() else "127.0.0.1", "port": next(ports)},
         takes={"enabled": True, "directory": str(tmp_path / "takes")},
     )
     expected = listed("--config", config)

@@ -27,6 +27,7 @@ from tests.integration.raw_client import (
     until,
 )
 from tests.support.gateways import serving_gateway
+from tests.support.needs import need_ipv6
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
@@ -153,6 +154,7 @@ async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection
 async def test_names_of_clients_have_brackets_if_the_address_is_one_of_ipv6(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    need_ipv6()
     caplog.set_level(logging.INFO)
     async with RtServer(CountingScene(), host="::1") as server:
         reader, writer = await asyncio.open_connection("::1", server.port)

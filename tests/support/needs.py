@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import socket
 
 import pytest
 
@@ -18,3 +19,17 @@ def need_programs(*names: str, packages: str) -> None:
     """Go on if all programs are installed; ``packages`` are those of Debian."""
     missing = [name for name in names if shutil.which(name) is None]
     need(not missing, f"needs {' and '.join(missing)}: install Debian's {packages}")
+
+
+def has_ipv6() -> bool:
+    """Return whether the loopback interface has an address of IPv6."""
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+def need_ipv6() -> None:
+    """Go on if the loopback interface has an address of IPv6."""
+    need(has_ipv6(), "needs IPv6 on lo")

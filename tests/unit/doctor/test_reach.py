@@ -1,6 +1,5 @@
 """Who can reach a port, and which ports are in use."""
 
-import os
 import socket
 from typing import Final
 
@@ -9,7 +8,7 @@ import pytest
 from gateway.doctor.reach import Reach, interface_names, ports_in_use, reach_of
 from gateway.outputs.open_ports import Access, OpenPort
 from tests.support.errors import names
-from tests.support.needs import need
+from tests.support.needs import need_ipv6
 from tests.support.networks import free_port
 
 ALL_IPV4: Final = "0.0.0.0"  # noqa: S104 - not bound
@@ -74,6 +73,7 @@ def test_the_kernel_says_which_ports_are_in_use() -> None:
 
 
 def test_ports_of_ipv6_are_in_use_too() -> None:
-    need(os.path.exists("/proc/net/tcp6") and "::1" in interface_names(), "needs IPv6 on lo")  # noqa: PTH110
+    need_ipv6()
+    assert "::1" in interface_names()
     with socket.create_server(("::1", 0), family=socket.AF_INET6) as server:
         assert ("tcp", server.getsockname()[1]) in ports_in_use()

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from gateway.stream import tcp
 from tests.support.clocks import VirtualTimeLoop
 
 
@@ -39,6 +40,7 @@ class Resolver:
 @pytest.fixture
 def resolver(monkeypatch: pytest.MonkeyPatch) -> Iterator[Resolver]:
     resolver = Resolver()
+    tcp._look_ups.clear()  # one of a former test that has ended late would answer this one
     monkeypatch.setattr(socket, "getaddrinfo", resolver)
     yield resolver
     resolver.answers.set()
