@@ -150,7 +150,7 @@ class Completion:
         self._passes_until_s = math.inf
         # The end: nothing that arrives is taken, and the number to end with may not be known yet.
         self._is_ending = self._knows_end = False
-        # The past: when to give it up, and how many messages of it have come.
+        # The past: when to give it up, if anything waits for it, and how much has come since that waits.
         self._patience_s = math.inf if completeness.patience_s is None else completeness.patience_s
         self._past_until_s = math.inf
         self._num_past = 0
@@ -198,6 +198,8 @@ class Completion:
         run = self._later_runs[-1] if self._later_runs else self._run
         run.note(sequence, utime, session)
         self._newest_since = max(self._newest_since, sequence)
+        if self.is_past and self._past_until_s == math.inf:  # the first message that waits
+            self._past_until_s, self._num_past = now_s + self._patience_s, 0
         if self._state is State.BEGINNING and self.due_s == math.inf and self._last_s is None:
             self._next, self._state = sequence, State.FOLLOWING
             self._check.begin_at(sequence)
@@ -305,8 +307,6 @@ class Completion:
 
     def _begin_to_request(self, now_s: float, due_s: float) -> None:
         self._since_s, self.due_s = now_s, due_s
-        if self.is_past:
-            self._past_until_s = now_s + self._patience_s
 
     @property
     def _expires_s(self) -> float:
@@ -316,8 +316,8 @@ class Completion:
         return self._since_s + self._patience_s if self.due_s < math.inf else math.inf
 
     def reply_s(self, now_s: float) -> float:
-        """Return how long the next answer may take."""
-        return min(REPLY_S, max(self._expires_s - now_s, _MIN_REPLY_S))
+        """Return how long the next answer may take: other keys, of which messages wait, come after it."""
+        return min(REPLY_S, self._patience_s, max(self._expires_s - now_s, _MIN_REPLY_S))
 
     def expire(self, now_s: float) -> None:
         """Go on without what is missing, if that takes too long. Call it often while something is due."""

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.client.arrived_run import HeldBytes
-from gateway.client.completion import RETRY_S, Completion
+from gateway.client.completion import NOBODY_S, PATIENCE_S, RETRY_S, Completion
 from gateway.client.history_requests import (
-    BUSY_CODES,
     REPLY_S,
     RETRY_CODES,
     Completeness,
@@ -165,19 +164,21 @@ class Refill:
     # In the threads.
 
     def _run(self, source: Source, due: dict[Series, Completion]) -> None:
-        if self.completeness.last_s is not None:
-            self._begin_silent(source, self.completeness.last_s)
+        begin_s = self._monotonic()
+        silent_s = self._begin_silent(source, begin_s)
         while True:
             while not (self._reception.has_room or self._is_closed):
                 time.sleep(_WAIT_S)
             with self._changed:
-                series = self._wait(source, due)
+                series = self._wait(source, due, silent_s)
                 if self._is_closed:
                     return
-            if series is None:
-                self._look(source)
-            else:
+            if series is not None:
                 self._request(series, due[series])
+            elif self._monotonic() >= silent_s:
+                silent_s = self._begin_silent(source, begin_s)
+            else:
+                self._look(source)
 
     def _request(self, series: Series, completion: Completion) -> None:
         """Request what a series misses, and give it the answer."""
@@ -200,32 +201,37 @@ class Refill:
         with self._changed:
             now_s = self._monotonic()
             if answer is None:
-                is_connected = now_s - (source.heard_s or now_s) <= _SILENT_S
-                completion.fail(request, code, text, now_s, is_connected=is_connected)
+                completion.fail(request, code, text, now_s, is_connected=_is_connected(source, now_s))
             else:
                 completion.answer(request, answer, now_s)
 
-    def _begin_silent(self, source: Source, last_s: float) -> None:
-        """Begin the series of a source that had messages in the last seconds, and may have none now."""
-        end_s = self._monotonic() + min(REPLY_S, self.completeness.patience_s or REPLY_S)
+    def _begin_silent(self, source: Source, begin_s: float) -> float:
+        """Begin the series of a source that had messages in the last seconds, and may have none now.
+
+        Returns when to try again: infinite if that is not needed, or nobody has answered since ``begin_s``
+        for as long as other requests are repeated. Until then, no message says that there is such a series.
+        """
+        last_s, patience_s = self.completeness.last_s, self.completeness.patience_s
+        if last_s is None:
+            return math.inf
         found: list[KeptSeries] = []
-        while (left_s := end_s - self._monotonic()) > 0 and not self._is_closed:
-            try:
-                found = self._find(source, last_s, left_s)
-                break
-            except QueryError as error:
-                if error.code not in BUSY_CODES:
-                    return  # without it, only series that something arrives of are found
-            except Exception as defect:  # noqa: BLE001 - as in _run
-                self._reception.failed(defect)
-                return
-            time.sleep(RETRY_S)
+        code = ""
+        try:
+            found = self._find(source, last_s, min(REPLY_S, patience_s or REPLY_S))
+        except QueryError as error:
+            code = error.code
+        except Exception as defect:  # noqa: BLE001 - as in _request
+            self._reception.failed(defect)
         with self._changed:
+            now_s = self._monotonic()
             for series, *_ in found:
                 completion = self._completions.get(series)
                 if completion is not None:
-                    completion.begin(self._monotonic())
+                    completion.begin(now_s)
                     self.check(series)
+        is_nobody = code == "no-gateway" and _is_connected(source, now_s)
+        is_over = now_s - begin_s >= (NOBODY_S if is_nobody else PATIENCE_S)
+        return math.inf if is_over or code not in RETRY_CODES else now_s + RETRY_S
 
     def _look(self, source: Source) -> None:
         """Look for messages of a source that nothing which arrives shows: the first of a key, or the last."""
@@ -236,7 +242,7 @@ class Refill:
             found = self._find(source, begin_s - source.found_s + _MARGIN_S, REPLY_S)
         except QueryError as error:
             is_over = error.code not in RETRY_CODES or error.code == "no-gateway"
-        except Exception as defect:  # noqa: BLE001 - as in _run
+        except Exception as defect:  # noqa: BLE001 - as in _request
             self._reception.failed(defect)
         with self._changed:
             now_s = self._monotonic()
@@ -258,8 +264,11 @@ class Refill:
                 if completion.due_s < math.inf:
                     self.check(series)
 
-    def _wait(self, source: Source, due: dict[Series, Completion]) -> Series | None:
-        """Wait until there is something to request, and return of which series; None to look for some."""
+    def _wait(self, source: Source, due: dict[Series, Completion], silent_s: float) -> Series | None:
+        """Wait until there is something to request, and return of which series; None to look for some.
+
+        ``silent_s`` is when to look for those that are silent now.
+        """
         while not self._is_closed:
             now_s = self._monotonic()
             for completion in due.values():
@@ -269,9 +278,14 @@ class Refill:
             ready = [series for series in due if due[series].due_s <= now_s]
             if ready:  # so no series is far ahead of the others
                 return min(ready, key=lambda series: due[series].reached_utime)
-            look_s = self._look_s.get(source, math.inf)
+            look_s = min(silent_s, self._look_s.get(source, math.inf))
             if look_s <= now_s:
                 return None
             first_s = min([look_s, *(completion.due_s for completion in due.values())])
             self._changed.wait(None if first_s == math.inf else first_s - now_s)
         return None
+
+
+def _is_connected(source: Source, now_s: float) -> bool:
+    """Whether something of a source has arrived just now, at least its status, or nothing ever has."""
+    return now_s - (source.heard_s or now_s) <= _SILENT_S

@@ -199,7 +199,7 @@ class SourceScene:
         self._stopped.visible = bool(stopped)
         if not stopped:
             return
-        expected = [key for key in _NAMES if key in components]
+        expected = [key for key in _NAMES if key in components and components[key].age_s is not None]
         names = [_NAMES[key] for key in expected if key in stopped]
         what = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
         if len(names) == len(expected):

@@ -101,7 +101,10 @@ def data_state(source: LiveSource) -> State:
     age_s = source.age_s
     if age_s is None:
         return State(Level.WAITING, "no data yet")
-    components = {key: each for key, each in sorted([*source.components.items()]) if key != "event"}
+    known = {key: each for key, each in sorted([*source.components.items()]) if key != "event"}
+    components = {key: each for key, each in known.items() if each.age_s is not None}
+    if known and not components:  # only an event, and others that the history still has to send
+        return State(Level.WAITING, "no data yet")
     stopped = {key: each for key, each in components.items() if each.is_stopped}
     if not stopped:
         return State(Level.GOOD, "live")

@@ -665,11 +665,44 @@ def test_the_last_seconds_of_a_key_that_is_silent_now() -> None:
     assert not network.completion.is_past
 
 
-def test_of_a_silent_key_without_an_answer_the_first_message_is_handed_on_at_once() -> None:
+def test_the_last_seconds_of_a_silent_key_may_come_late() -> None:
+    """Nothing waits for them, so a gateway that is busy for a few seconds must not cost a display these."""
+    network = Network(completeness=DISPLAY)
+    for _ in range(10):
+        network.publish()
+    network.completion.begin(network.now_s)
+    for _ in range(4):
+        network.now_s = max(network.now_s, network.completion.due_s)
+        assert network.completion.reply_s(network.now_s) == DISPLAY.patience_s
+        request = network.completion.request()
+        network.now_s += 1.0
+        network.completion.fail(request, "timeout", "", network.now_s)
+        network.completion.expire(network.now_s)
+    network.ask_all()
+    assert network.numbers == [*range(4, 10)]
+
+
+def test_the_first_message_of_a_silent_key_without_an_answer_waits_for_the_patience() -> None:
     network = Network(completeness=DISPLAY)
     network.completion.begin(network.now_s)
+    network.now_s += 10.0
+    network.completion.expire(network.now_s)
+    network.arrives(7)
+    network.completion.expire(network.now_s + 0.9)
+    assert not network.numbers
     network.completion.expire(network.now_s + 1.0)
+    assert network.numbers == [7]
     assert network.completion.due_s == math.inf
+
+
+def test_of_a_silent_key_that_nobody_answers_for_the_first_message_is_handed_on_at_once() -> None:
+    network = Network(completeness=DISPLAY)
+    network.completion.begin(network.now_s)
+    begin_s = network.now_s
+    while network.completion.due_s < math.inf:
+        network.now_s = max(network.now_s, network.completion.due_s)
+        network.completion.fail(network.completion.request(), "no-gateway", "", network.now_s)
+    assert network.now_s == pytest.approx(begin_s + NOBODY_S, abs=0.2)
     network.arrives(7)
     assert network.numbers == [7]
 

@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
-from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.refill import Refill
+from gateway.client.completion import NOBODY_S, PATIENCE_S
+from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
+from gateway.client.refill import KeptSeries, Refill
+from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
 from gateway.messages.sequence_check import SequenceCheck
 from tests.support.waiting import wait_until
@@ -112,3 +114,26 @@ def test_a_series_that_has_got_what_was_late_delays_nothing() -> None:
         subscriber.arrives(1)
         assert subscriber.refill.reached_utime(subscriber.source) == math.inf
     subscriber.refill.close()
+
+
+@pytest.mark.parametrize(
+    ("code", "until_s"),
+    [("timeout", PATIENCE_S), ("busy", PATIENCE_S), ("no-gateway", NOBODY_S), ("disabled", 0.0)],
+)
+def test_how_long_a_gateway_is_asked_which_series_are_silent(code: str, until_s: float) -> None:
+    """Not for ever: the gateway may be one of an earlier version, and have no history."""
+    now_s = 100.0
+
+    def find(*_: Any) -> list[KeptSeries]:
+        raise QueryError("", code=code)
+
+    refill = Refill(
+        *(Subscriber(0, 0), threading.Lock(), None, find),  # type: ignore[arg-type] # not used
+        completeness=Completeness(last_s=10.0, patience_s=1.0),
+        monotonic=lambda: now_s,
+    )
+    source: Any = Source()
+    while (again_s := refill._begin_silent(source, 100.0)) < math.inf:
+        assert again_s > now_s
+        now_s = again_s
+    assert now_s == pytest.approx(100.0 + until_s, abs=0.2)

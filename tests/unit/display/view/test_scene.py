@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gateway.display.live import LiveComponent
 from gateway.display.view.scene import Scene, Sphere
 from gateway.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
 from gateway.display.view.viewer import ViewServer
@@ -117,6 +118,15 @@ def test_other_markers_have_no_last_places_of_former_ones(picture: Picture) -> N
     lab.send(MARKERS, [(1000, 0, 0, 0)] * 5)
     picture.show(0.1)
     assert len(picture.points("markers")) == 5
+
+
+def test_all_data_have_stopped_though_of_a_component_nothing_has_come(picture: Picture) -> None:
+    lab = picture.lab()
+    lab.send(MARKERS, [(500, 0, 0, 0)])
+    lab.source.components["6d"] = LiveComponent(ComponentType.TOOLS)
+    picture.show()
+    picture.show(3.0)
+    assert picture.node("stopped").text == "lab: no data for 3 s"
 
 
 def test_data_that_stop_are_grey_and_the_picture_says_so(picture: Picture) -> None:

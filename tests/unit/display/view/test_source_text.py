@@ -185,6 +185,18 @@ def test_data_that_have_stopped(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> No
     assert data_state(source) == State(Level.BAD, "no data for 12 s")
 
 
+def test_components_of_which_nothing_has_come_yet(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The history has some; until it answers, an event does not make a source live that has ended."""
+    lab.send(ComponentType.EVENT, [(1, 2, 3, 4, 5)])
+    source = lab.source
+    source.components["3d"] = LiveComponent(ComponentType.MARKERS)
+    assert data_state(source) == State(Level.WAITING, "no data yet")
+    lab.send(ComponentType.ANALOG, [1.5])
+    source = lab.source
+    wait(monkeypatch, 12)
+    assert data_state(source) == State(Level.BAD, "no data for 12 s")
+
+
 def test_one_component_that_has_stopped(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.send(ComponentType.ANALOG, [1.5])
     assert lab.source
