@@ -53,9 +53,14 @@ def zenoh_keys(mode: str, *, connect: str | None = None, listen: str | None = No
     }
 
 
-def open_zenoh(mode: str, *, connect: str | None = None, listen: str | None = None) -> zenoh.Session:
-    """Open a session. The caller must close it, because a process with an open session does not exit."""
-    keys = zenoh_keys(mode, connect=connect, listen=listen)
+def open_zenoh(
+    mode: str, *, connect: str | None = None, listen: str | None = None, **sections: Any
+) -> zenoh.Session:
+    """Open a session with these further ``sections`` of its configuration.
+
+    The caller must close it, because a process with an open session does not exit.
+    """
+    keys = {**zenoh_keys(mode, connect=connect, listen=listen), **sections}
     return zenoh.open(zenoh.Config.from_json5(json.dumps(keys)))
 
 

@@ -4,7 +4,7 @@ import html
 import itertools
 import threading
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 import pytest
 from playwright.sync_api import Page, expect
@@ -86,7 +86,12 @@ def shown(server: ViewServer) -> Iterator[Shown]:
 
 @pytest.fixture
 def page(shown: Shown, new_page: NewPage) -> Page:
-    page = new_page(viewport={"width": 800, "height": 400})
+    return open_page(shown, new_page, viewport={"width": 800, "height": 400})
+
+
+def open_page(shown: Shown, new_page: NewPage, **options: Any) -> Page:
+    """Open the panel in a page with these options."""
+    page = new_page(**options)
     page.set_default_timeout(TIMEOUT_MS)
     page.goto(shown.address)
     return page
@@ -115,26 +120,24 @@ def test_labels_are_text_wherever_they_are_shown(page: Page) -> None:
 def test_the_page_says_that_it_gets_nothing_any_more(page: Page, shown: Shown) -> None:
     line = page.get_by_text("This page gets nothing any more")
     expect(page.locator(".gateway").first).to_contain_text("● live lab", timeout=TIMEOUT_MS)
-    expect(line).to_have_count(0)
+    expect(line).to_have_count(0, timeout=TIMEOUT_MS)
     shown.stop_panel()
     expect(line).to_be_visible(timeout=TIMEOUT_MS)
 
 
 def test_in_a_narrow_window_the_panel_is_closed(shown: Shown, new_page: NewPage) -> None:
-    page = new_page(viewport={"width": 700, "height": 500})
-    page.goto(shown.address)
-    page.wait_for_function("document.querySelector('canvas')?.clientWidth > 600", timeout=TIMEOUT_MS)
+    page = open_page(shown, new_page, viewport={"width": 700, "height": 500})
+    page.wait_for_function("document.querySelector('canvas')?.clientWidth > 600")
     expect(page.get_by_role("tab", name="Sources")).to_have_count(0, timeout=TIMEOUT_MS)
-    page.wait_for_function("document.querySelector('canvas')?.clientWidth > 600", timeout=TIMEOUT_MS)
+    page.wait_for_function("document.querySelector('canvas')?.clientWidth > 600")
 
 
 def test_on_a_phone_the_panel_is_closed_until_somebody_taps_its_title(
     shown: Shown, new_page: NewPage
 ) -> None:
-    page = new_page(viewport={"width": 390, "height": 844}, has_touch=True)
-    page.goto(shown.address)
+    page = open_page(shown, new_page, viewport={"width": 390, "height": 844}, has_touch=True)
     page.wait_for_function("document.querySelector('.gateway')?.getClientRects().length === 0")
-    page.get_by_text("rtc3d-gateway").tap(timeout=TIMEOUT_MS)
+    page.get_by_text("rtc3d-gateway").tap()
     expect(page.get_by_role("tab", name="Sources")).to_be_visible(timeout=TIMEOUT_MS)
     assert page.evaluate("document.querySelector('.gateway').clientWidth") == 390
 

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser
 from gateway.takes.files.component_rows import Array
 from tests.support.browser import NewPage, chromium, new_page, pages
 from tests.support.gateway_process import gateway_process, simulator
-from tests.support.networks import free_port
+from tests.support.networks import free_endpoint, free_port, open_zenoh
 from tests.support.waiting import wait_until
 from tests.view.picture import Picture, Position
 from tests.view.published_scene import MISSING, PublishedScene, published_scene
@@ -139,14 +139,37 @@ SLOW = ("--rate", "50", "--analog-rate", "50")
 """Rendering in software leaves little of the machine for data, and a picture that lags is not live."""
 
 
+NO_DATA: Final = {
+    "enabled": True,
+    "default_permission": "allow",
+    "rules": [
+        {
+            "id": "no data",
+            "permission": "deny",
+            "flows": ["egress"],
+            "messages": ["put"],
+            "key_exprs": [f"mocap/lab/{key}" for key in ("3d", "6d", "analog", "force", "event")],
+        }
+    ],
+    "subjects": [{"id": "all"}],
+    "policies": [{"rules": ["no data"], "subjects": ["all"]}],
+}
+"""The access control of a router that passes on no data when they are published, but answers to queries."""
+
+
 def test_what_happened_before_the_view_was_opened_is_there(tmp_path: Path, new_page: NewPage) -> None:
-    """The server has ended: events and markers can only come from the gateway's history."""
+    """Behind this router, events and markers can only come from the gateway's history.
+
+    If the server ended instead, a view that needs 10 s to start, as on a busy computer, would be too late.
+    """
     with ExitStack() as stack:
-        port, server = stack.enter_context(simulator(*SLOW))
+        port, _ = stack.enter_context(simulator(*SLOW))
         gateway = stack.enter_context(gateway_process(tmp_path, port, hub="router"))
+        endpoint = free_endpoint()
+        router = open_zenoh("router", connect=gateway.endpoint, listen=endpoint, access_control=NO_DATA)
+        stack.callback(router.close)
         wait_until(lambda: gateway.headers["event"])
-        server.kill()
-        view = stack.enter_context(view_process("--connect", gateway.endpoint))
+        view = stack.enter_context(view_process("--connect", endpoint))
         picture = Picture(new_page(viewport=WINDOW), view.address)
         picture.wait_for_banner("lab: no data for")
         picture.wait_for_number_of_points(MARKERS, 10)
