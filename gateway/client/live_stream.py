@@ -26,7 +26,7 @@ from gateway.program_end import Process, close_at_end
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.reader import MessageBatch
-from gateway.takes.files.take import Take, TakeLoader
+from gateway.takes.files.take import Take, TakeLoader, check_components
 
 DESCRIBED_WITHIN_S: Final = 2.0
 """How long frames wait for the parameters that describe them."""
@@ -89,9 +89,7 @@ def live(  # noqa: PLR0913 - each is an option of its own, by name
     if not all(isinstance(source, str) for source in sources):
         raise SelectionError("name each source as an argument of its own: live('lab', 'stage')")
     components = [components] if isinstance(components, str) else components
-    unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
-    if unknown:
-        raise SelectionError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
+    check_components(components or ())
     config = None if zenoh_config is None else Path(zenoh_config)
     address = GatewayAddress(lcm or url is not None, connect, config, url, prefix)
     return Live(address, sources, components, join=join, complete=complete, last_s=last_s)
@@ -207,8 +205,9 @@ class Live:
 
         Returns None before the first, and if it is older than ``max_age_s``, counted from its capture.
         Nothing waits for it, so it also serves programs that are slower than the data. Its ``gap`` counts
-        only what was lost directly before it.
+        only what was lost directly before it. Raises SelectionError if there is no such component.
         """
+        check_components(() if component is None else (component,))
         self.open()
         arrivals = [
             series.newest

@@ -55,6 +55,10 @@ class SeriesContent(NamedTuple):
     parameters: Sequence[ParametersEntry]
     entries: Array
 
+    def __repr__(self) -> str:
+        """Return a summary."""
+        return f"<SeriesContent: {len(self.entries)} rows, {len(self.parameters)} parameters>"
+
 
 class Series(ItemValues):
     """A component of one source: arrays with one row per frame; of events, with one row per event.

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -66,7 +66,11 @@ class TakeSource:
         return {key: series for key, series in by_key.items() if series is not None}
 
     def runs(self, key: str) -> list[Series]:
-        """Return the parts of a component with constant labels, one measurement each: see ``Series.runs``."""
+        """Return the parts of a component with constant labels, one measurement each: see ``Series.runs``.
+
+        There are none if the take lacks the component. Raises SelectionError if there is no such component.
+        """
+        check_components([key])
         found = self.series.get(key)
         return [] if found is None else found.runs()
 
@@ -168,12 +172,7 @@ def open_take(
     """
     sources = [sources] if isinstance(sources, str) else sources
     components = [components] if isinstance(components, str) else components
-    unknown = set(components or ()) - COMPONENTS_BY_KEY.keys()
-    if unknown:
-        hint = spelling_hint(min(unknown), COMPONENTS_BY_KEY)
-        raise SelectionError(
-            f"{min(unknown)!r} is no component{hint}; choose from {', '.join(COMPONENTS_BY_KEY)}"
-        )
+    check_components(components or ())
     paths = [path] if isinstance(path, Path | str) else path
     readers = sorted((TakeReader(Path(each)) for each in paths), key=lambda reader: reader.start_utime)
     if not readers:
@@ -208,6 +207,14 @@ def open_take(
         hint = spelling_hint(min(missing), known)
         raise SelectionError(f"{opened} has no source {min(missing)!r}{hint}; its sources are: {names}")
     return takes[0] if len(takes) == 1 else _join_takes(takes)
+
+
+def check_components(components: Iterable[str]) -> None:
+    """Raise SelectionError, with the similar name, if one of ``components`` does not exist."""
+    for key in components:
+        if key not in COMPONENTS_BY_KEY:
+            hint = spelling_hint(key, COMPONENTS_BY_KEY)
+            raise SelectionError(f"{key!r} is no component{hint}; choose from {', '.join(COMPONENTS_BY_KEY)}")
 
 
 def utime_range(start_utime: int, from_s: float | None, to_s: float | None) -> tuple[float, float]:

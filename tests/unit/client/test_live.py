@@ -464,6 +464,14 @@ def test_an_unknown_component_is_refused(components: Any) -> None:
         live("lab", components=components)
 
 
+def test_a_misspelt_component_names_the_similar_one() -> None:
+    """``latest`` would return None for ever, as if nothing had arrived yet."""
+    with pytest.raises(SelectionError, match="did you mean '3d'"):
+        live("lab", components=["3D"])
+    with pytest.raises(SelectionError, match="did you mean '3d'"):
+        live("lab").latest("3D")
+
+
 def test_a_list_of_sources_is_refused_before_anything_is_opened() -> None:
     names: Any = ["lab", "stage"]
     with pytest.raises(SelectionError):

@@ -354,7 +354,15 @@ def test_summaries_are_short(tmp_path: Path) -> None:
     take = open_take(write_take(tmp_path / "a.lcmlog", messages))
     source = take.sources["lab"]
     assert source.markers is not None
-    for each in (take, source, source.parameters[0], source.markers, Reply("lab", (), bytes(10_000))):
+    content = source.markers.content
+    for each in (
+        take,
+        source,
+        source.parameters[0],
+        source.markers,
+        content,
+        Reply("lab", (), bytes(10_000)),
+    ):
         assert len(repr(each)) < 100
     assert "lab" in repr(take)
     take.sources = {f"source {number}": source for number in range(1000)}
@@ -366,3 +374,11 @@ def test_a_misspelt_choice_names_the_similar_one(tmp_path: Path, chosen: dict[st
     """A source or a component that does not exist is mostly a slip of the finger."""
     with pytest.raises(SelectionError, match=r"did you mean '(lab|3d)'"):
         open_take(recorded(tmp_path, "a", 0), **chosen)  # type: ignore[arg-type]
+
+
+def test_a_misspelt_component_has_no_runs(tmp_path: Path) -> None:
+    """An empty list would say that the take lacks it."""
+    source = open_take(recorded(tmp_path, "a", 0)).sources["lab"]
+    assert source.runs("6d") == []
+    with pytest.raises(SelectionError, match="choose from 3d"):
+        source.runs("markers")
