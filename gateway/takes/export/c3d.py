@@ -10,7 +10,6 @@ second of 55 markers and 69 analog channels), does not report a full disk, and c
 
 import struct
 import textwrap
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -36,7 +35,6 @@ from gateway.takes.export.measurements import (
     event_seconds,
     named_measurements,
     note_missing,
-    note_samples_left_out,
     utc_text,
 )
 from gateway.takes.export.plates import PlatePlan
@@ -75,16 +73,16 @@ _BLOCK_VALUES: Final = 500_000  # values in memory at once: 2 MB
 def export_c3d(job: ExportJob) -> None:
     """Write each measurement of each source to a file of its own."""
     belongs: dict[str, Array] = {}
-    written: Counter[tuple[str, str]] = Counter()
-    named = named_measurements(job, _KEYS, "markers, analog channels or forces")
-    for measurement, path in named:
+    for measurement, path in named_measurements(job, _KEYS, "markers, analog channels or forces"):
         content = content_of(job, measurement)
         _write(job, content, path)
         source = measurement.source.name
-        written[source, "analog"] += content.num_samples(content.analog)
-        written[source, "force"] += content.num_samples(content.forces)
-        belongs[source] = belongs.get(source, False) | _is_near(content, _event_seconds(content))
-    note_samples_left_out(job, (measurement for measurement, _ in named), written)
+        job.written[source, "3d"] += content.num_marker_frames
+        job.written[source, "analog"] += content.num_samples(content.analog)
+        job.written[source, "force"] += content.num_samples(content.forces)
+        is_near = _is_near(content, _event_seconds(content))
+        job.written[source, "event"] += min(int(is_near.sum()), MAX_LIST)
+        belongs[source] = belongs.get(source, False) | is_near
     for source, is_in_file in belongs.items():
         if not is_in_file.all():
             job.note(f"events of {source} far from all frames left out", amount=int((~is_in_file).sum()))

@@ -106,6 +106,15 @@ class C3dContent(NamedTuple):
         """The plates whose channels follow the server's own analog channels."""
         return [plan for plan in self.plates if plan.is_added]
 
+    @property
+    def num_marker_frames(self) -> int:
+        """How many recorded frames of markers are in the frames."""
+        return (
+            0
+            if self.markers is None
+            else self.markers.count(self.first_row, self.first_row + self.num_frames)
+        )
+
     def num_samples(self, placed: Placed | None) -> int:
         """Return how many recorded samples of a component are in the frames."""
         if placed is None:

@@ -25,7 +25,9 @@ def export_csv(job: ExportJob) -> None:
             files[table] = job.files.create(table.path)
             titles = distinct(map(_title, table.columns), lambda title, _: title)
             files[table].write(_record([*TIME_COLUMNS, *titles]))
-        files[table].write(b"\r\n".join([*_lines(part), b""]))
+        lines = [*_lines(part)]
+        files[table].write(b"\r\n".join([*lines, b""]))
+        job.written[table.source.name, table.key] += len(lines)
 
 
 def _title(column: Column) -> str:

@@ -4,6 +4,7 @@ The formats are imported when they are used: the command line lists them, and nu
 """
 
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -114,6 +115,7 @@ def export_take(job: "ExportJob") -> list[Path]:
                 f"install it: pip install 'rtc3d-gateway[{extra}]'"
             ) from error
         write(job)
+        job.note_rows()
         job.progress(f"saving {job.out.name}", 0, 0)
     return job.files.paths
 
@@ -186,6 +188,10 @@ class ExportJob:
     files: NewFiles = field(default_factory=NewFiles)
     stems: set[str] = field(default_factory=set)
     """The names of files so far, without extensions."""
+    recorded: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """How many rows the take has that could be in a file, by the name of the source and the component."""
+    written: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """How many of them are in files."""
 
     @property
     def chosen_format(self) -> Format:
@@ -248,9 +254,32 @@ class ExportJob:
         self.note_malformed(take)
         self._note_left_out(take)
         self._note_frames(take)
+        self._count_all(take)
         if components:
             self.progress(f"arranging the frames of {self.take.name}", 0, 0)
         return take
+
+    def _count_all(self, take: "Take") -> None:
+        """Count the rows of the components that are loaded; a row without items has nothing to write."""
+        for source in take.sources.values():
+            for key, series in source.series.items():
+                if series.labels or key == "event":
+                    self.count_recorded(source.name, key, len(series.without_empty_frames()))
+
+    def count_recorded(self, source: str, key: str, num_rows: int) -> None:
+        """Count rows of a component that the take has, if the format has the component."""
+        if key in self.chosen_format.components:
+            self.recorded[source, key] += num_rows
+
+    def note_rows(self) -> None:
+        """Report if the files have fewer or more rows than the take, whatever the reason."""
+        for (source, key), num_recorded in self.recorded.items():
+            num_written = self.written[source, key]
+            if num_written < num_recorded:
+                amount = f"{num_recorded - num_written} of {num_recorded}"
+                self.note(f"rows of {key} of {source} that are in no file", amount=amount)
+            elif num_written > num_recorded:
+                self.note(f"rows of {key} of {source} in several files", amount=num_written - num_recorded)
 
     def _note_left_out(self, take: "Take") -> None:
         """Report what a take has and the format has no place for."""

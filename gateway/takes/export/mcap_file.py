@@ -84,10 +84,15 @@ def export_to_mcap(
             for name, key, series in part:
                 if name not in exports:
                     exports[name] = new_export(take.sources[name])
+                job.count_recorded(name, key, len(series))
                 for run in series.runs():
                     note_labels(job, name, run, exports[name].labels_of(run))
+                    num_messages: Counter[Topic] = Counter()
                     for messages in exports[name].messages(key, run):
                         file.add(messages)
+                        num_messages[messages.topic] += len(messages.messages)
+                    # Not every topic has every row: there are tools that are not in view.
+                    job.written[name, key] += max(num_messages.values(), default=0)
             file.write_most()
         for source in take.sources.values():
             file.describe(source)

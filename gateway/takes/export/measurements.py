@@ -5,7 +5,7 @@ Each has a grid: see ``grid``.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -348,24 +348,6 @@ def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: in
             path.name,
             f"{num_skipped} of {count}",
         )
-
-
-def note_samples_left_out(
-    job: ExportJob, measurements: Iterable[Measurement], written: Mapping[tuple[str, str], int]
-) -> None:
-    """Report samples of analog channels and forces of the measurements' sources that are in no file.
-
-    ``written`` is how many are, by the name of the source and the key of the component.
-    """
-    for source in {measurement.source.name: measurement.source for measurement in measurements}.values():
-        for key in ("analog", "force"):
-            total = len(source.series[key].without_empty_frames()) if key in source.series else 0
-            count = written.get((source.name, key), 0)
-            if count < total:
-                job.note(
-                    f"samples of {key} of {source.name} that fit no frame left out",
-                    amount=f"{total - count} of {total}",
-                )
 
 
 def _limits(times: Array) -> tuple[int, int]:

@@ -4,7 +4,6 @@ Everything is in metres, newtons and Nm, with Y up, as OpenSim's models are. The
 person. They come from what readers of C3D would compute for the same take: see ``plates``.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -32,7 +31,6 @@ from gateway.takes.export.measurements import (
     Measurement,
     Placed,
     named_measurements,
-    note_samples_left_out,
     sampled,
     seconds_of_row,
     utc_text,
@@ -53,9 +51,8 @@ def export_opensim(job: ExportJob) -> None:
     # The names are in XML, too, which has no place for bytes that are not UTF-8.
     name = printable(job.take.absolute().name.removesuffix(SUFFIX)) or "take"
     job = replace(job, out=job.out / f"{name}.trc")
-    named = named_measurements(job, ("3d", "analog", "force"), "markers, analog channels or forces")
-    written: Counter[tuple[str, str]] = Counter()
-    for measurement, path in named:
+    keys, what = ("3d", "analog", "force"), "markers, analog channels or forces"
+    for measurement, path in named_measurements(job, keys, what):
         has_markers = measurement.base.key == "3d"
         analog = _Samples.of(job, measurement, "analog")
         forces = _Samples.of(job, measurement, "force")
@@ -75,9 +72,6 @@ def export_opensim(job: ExportJob) -> None:
             _write_external_loads(job, mot, loads.plans, bodies)
         if analog is not None:
             _write_sto(job, path.with_suffix(".sto"), analog)
-        for key, samples in (("analog", analog), ("force", forces)):
-            written[measurement.source.name, key] += 0 if samples is None else samples.num_placed
-    note_samples_left_out(job, (measurement for measurement, _ in named), written)
 
 
 def export_mot(job: ExportJob) -> None:
@@ -121,11 +115,6 @@ class _Samples(NamedTuple):
         """Return a component; None if there is none, or if it is left out, which is reported."""
         placed, per_frame = sampled(job, measurement, key, None)
         return None if placed is None or per_frame is None else cls(measurement, placed, per_frame)
-
-    @property
-    def num_placed(self) -> int:
-        """The number of samples that were recorded."""
-        return sum(len(part.rows) for part in self.placed.parts)
 
     def blocks(self, progress: Callable[[int, int], None]) -> Iterator[tuple[int, int, Array]]:
         """Yield the first row and the end of parts of the samples, and their times in s.
@@ -238,7 +227,8 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
             yield times, rounded(np.concatenate(vectors, axis=1))
 
     names = [f"{name}{axis}" for plan in loads.plans for name in _identifiers(plan) for axis in "xyz"]
-    _write_table(job, path, loads.samples, names, "", blocks())
+    num_rows = _write_table(job, path, loads.samples, names, "", blocks())
+    job.written[loads.samples.measurement.source.name, "force"] += num_rows
 
 
 def _identifiers(plan: PlatePlan) -> tuple[str, str, str]:
@@ -313,7 +303,8 @@ def _write_sto(job: ExportJob, path: Path, analog: _Samples) -> None:
 
     units = printable(series.unit or ",".join(series.units))
     labels = opensim_labels(job, path.name, analog.measurement.source.name, series)
-    _write_table(job, path, analog, labels, f"units={units}\n", blocks())
+    num_rows = _write_table(job, path, analog, labels, f"units={units}\n", blocks())
+    job.written[analog.measurement.source.name, "analog"] += num_rows
 
 
 _COUNT_WIDTH: Final = 12
@@ -326,10 +317,10 @@ def _write_table(
     labels: Sequence[str],
     more: str,
     blocks: Iterable[tuple[Array, Array]],
-) -> None:
+) -> int:
     """Write a file of OpenSim's Storage from blocks of times and values, shape (rows, labels).
 
-    The times say where rows are missing. ``more`` are lines of the header.
+    Return the number of rows. The times say where rows are missing. ``more`` are lines of the header.
     """
     file = job.files.create(path)
     file.write(f"{printable(path.stem)}\nversion=1\nnRows=".encode())
@@ -351,6 +342,7 @@ def _write_table(
             path.name,
             f"{num_expected - num_rows} of {num_expected}",
         )
+    return num_rows
 
 
 _FEET: Final = ("calcn_r", "calcn_l")

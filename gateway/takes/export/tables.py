@@ -47,6 +47,7 @@ def table_parts(job: ExportJob) -> Iterator[tuple[Table, Series]]:
     numbers: Counter[tuple[str, str]] = Counter()
     for name, key, series in chain.from_iterable(parts_of(job, take)):
         source = take.sources[name]
+        job.count_recorded(name, key, len(series))
         for run in series.runs():
             columns = value_columns(run)
             table = tables.get((name, key, columns))

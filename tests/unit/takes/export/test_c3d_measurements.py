@@ -83,7 +83,7 @@ def test_what_markers_and_analog_do_not_both_have_at_the_ends_is_left_out(
     assert np.array_equal(found.points[0], x_of(first, last), equal_nan=True)
     assert one_names(notes, "frames", "ends") == (last - first < len(markers))
     count, total = len(analog) - 10 * (last - first), len(analog)
-    left_out = f"samples of analog of lab that fit no frame left out | {count} of {total}"
+    left_out = f"rows of analog of lab that are in no file | {count} of {total}"
     assert (left_out in notes) == (count > 0)
 
 

@@ -153,6 +153,12 @@ def test_each_row_has_the_time_of_its_frame(tmp_path: Path, case: str, form: str
     assert not any("frames missing" in note for note in notes)
     assert not one_names(notes, "last row")
     assert any("left out" in note and str(NUM_FRAMES) in note for note in notes) == (repeats == 2)
+    lacking = [note for note in notes if note.startswith("rows of ")]
+    assert lacking == [
+        f"rows of {key} of lab that are in no file | {NUM_FRAMES} of {2 * NUM_FRAMES}"
+        for key in (job.chosen_format.components if repeats == 2 else ())
+        if key != "event"
+    ]
     assert one_names(notes, "grid") == (case == "late frames") or (case == "another rate")
 
 

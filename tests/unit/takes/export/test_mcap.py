@@ -171,7 +171,8 @@ def test_visible_tools_are_transforms_from_the_source_to_their_labels(tmp_path: 
         frame(ComponentType.TOOLS, [NO_TOOL, NO_TOOL], 1),
         frame(ComponentType.TOOLS, [NO_TOOL, (1, 0, 0, 0, 4, 5, 6, 0), (1, 0, 0, 0, 7, 8, 9, 0)], 2),
     ]
-    first, last = export(tmp_path, [parameters(described), *messages]).topics["/lab/tools"]
+    content = export(tmp_path, [parameters(described), *messages], notes=["rows of 6d of lab"])
+    first, last = content.topics["/lab/tools"]
     [cup] = first.content.transforms
     assert (cup.parent_frame_id, cup.child_frame_id) == ("lab", "lab/cup")
     assert (cup.translation.x, cup.translation.y, cup.translation.z) == (1.0, 2.0, 3.0)
@@ -327,7 +328,9 @@ def test_frames_with_very_many_channels_are_left_out_and_reported(tmp_path: Path
     values = np.arange(10_001).tolist()
     messages = [frame(ComponentType.ANALOG, values[1:]), frame(ComponentType.ANALOG, values, 1)]
     job = export_messages(tmp_path, messages, "walk.mcap")
-    assert each_names(notes_of(job)[1:], ["10000 numbers", "analog of lab", 1])
+    assert each_names(
+        notes_of(job)[1:], ["10000 numbers", "analog of lab", 1], ["rows of analog of lab", "1 of 2"]
+    )
     [log] = read_mcap(tmp_path / "walk.mcap").topics["/lab/analog"]
     assert list(floats_of(log.content).values()) == values[1:]
 
@@ -370,6 +373,7 @@ def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
         ["malformed", "parameters of lab", 1],
         ["1970", "2106", "3d of lab", 2],
         ["MOCAP_LAB_OTHER", 1],
+        ["rows of 3d of lab", "2 of 3"],
     )
     assert len(read_mcap(tmp_path / "walk.mcap").topics["/lab/markers"]) == 1
 

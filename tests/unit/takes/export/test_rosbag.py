@@ -108,7 +108,14 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     }
     points = np.frombuffer(bag.messages["/mocap/lab/markers"][0][1].data, "<f4").reshape(-1, 5)
     assert np.array_equal(points[:, 0], np.array([1e-3, NAN], np.float32), equal_nan=True)
-    assert each_names(notes_of(job), ["NaN of lab", 1], ["1970", "2106", "analog of lab", 1])
+    assert each_names(
+        notes_of(job),
+        ["NaN of lab", 1],
+        ["1970", "2106", "analog of lab", 1],
+        ["rows of 6d of lab", "1 of 2"],
+        ["rows of force of lab", "1 of 1"],
+        ["rows of analog of lab", "1 of 1"],
+    )
 
 
 def test_units_of_plates_are_converted_and_unknown_lengths_left_out(tmp_path: Path) -> None:
