@@ -39,6 +39,9 @@ QUERIES: Final = (
 )
 """What programs may ask: all keys and options, and questions with an error for an answer."""
 
+_KEPT: Final = {"3d", "6d", "6d/Tool 1", "analog", "force", "event", "status", "clock"}
+"""The keys of which the history has messages a second after the start."""
+
 PATIENCE_S: Final = 30.0
 """What is received takes a fifth of it."""
 
@@ -105,10 +108,12 @@ async def observe(
     take: Path, folder: Path, keys: Collection[str], channels: Collection[str], moments: Collection[str] = ()
 ) -> Observed:
     """Stream a take until each of ``keys``, ``channels`` and ``moments`` has been received."""
-    async with running_lab(TakeScene(take), folder) as lab:
-        network, answers, outputs, decoded = await asyncio.gather(
-            published(lab, keys, channels), answered(lab), printed(lab), received(lab, moments)
-        )
+    async with running_lab(TakeScene(take), folder) as lab, asyncio.TaskGroup() as group:
+        publication = group.create_task(published(lab, keys, channels))
+        reception = group.create_task(received(lab, moments))
+        answers = await answered(lab)
+        outputs = await printed(lab)  # they count the answers
+        network, decoded = await publication, await reception
         return Observed(network | {"answers": answers}, outputs, decoded)
 
 
@@ -165,11 +170,14 @@ async def published(lab: Lab, keys: Collection[str], channels: Collection[str]) 
 
 
 async def answered(lab: Lab) -> dict[str, Any]:
-    """Return what the gateway answers to QUERIES."""
+    """Return what the gateway answers to QUERIES, once its history has all keys."""
+    [source] = lab.gateway.sources
+    await wait_until_async(lambda: source.fan_out.history_overview["keys"].keys() >= _KEPT)
     answers: dict[str, Any] = {}
     with zenoh_peer(lab.endpoint) as peer:
         for selector in QUERIES:
             answers[selector] = [_answer(reply) for reply in await query_all(peer, f"mocap/lab/{selector}")]
+    source.publish_status()  # with the numbers of these answers
     return answers
 
 
