@@ -69,7 +69,7 @@ test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
 # The tests in other surroundings: a machine that has just booted or has been up for 400 days, other time zones, locales,
-# users, host names and Pythons, one core, random order. It needs root, and takes two hours; SURROUNDINGS="fresh user"
+# users, host names and Pythons, one core, random order. It needs root, and takes an hour; SURROUNDINGS="fresh user"
 # selects some, and SLOW= leaves the slow tests out. A release needs it; it is not part of the check.
 SURROUNDINGS ?=
 SLOW ?= --slow

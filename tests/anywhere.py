@@ -54,28 +54,27 @@ class Surroundings:
 
 SURROUNDINGS: Final = {
     "fresh": Surroundings(
-        "just booted, Pacific/Chatham, tr_TR.UTF-8, umask 077, a host name of 63 characters",
+        "just booted, Pacific/Chatham, tr_TR.UTF-8, umask 077, a host name of 63 characters, Python 3.13, "
+        "random order",
         time_zone="Pacific/Chatham",
         locale="tr_TR.UTF-8",
         umask=0o077,
         host_name="h" * 63,
-    ),
-    "old": Surroundings(
-        "up for 400 days, America/St_Johns, de_DE.UTF-8, no IPv6, tests in random order",
-        uptime_s=400 * _DAY_S,
-        time_zone="America/St_Johns",
-        locale="de_DE.UTF-8",
-        has_ipv6=False,
         order="1",
+        python=13,
     ),
     "user": Surroundings(
-        "the user `Läufer Ä` in a folder of that name, Python 3.11, LC_ALL=C",
+        "up for 400 days, America/St_Johns, LC_ALL=C, no IPv6, the user `Läufer Ä` in a folder of that name, "
+        "Python 3.11 of the system, random order",
+        uptime_s=400 * _DAY_S,
+        time_zone="America/St_Johns",
         locale="C",
+        has_ipv6=False,
+        order="2",
         user="Läufer Ä",
         python=11,
     ),
-    "python": Surroundings("Python 3.13, tests in random order", python=13, order="2"),
-    "core": Surroundings("one core", cores=1),
+    "core": Surroundings("one core, de_DE.UTF-8", locale="de_DE.UTF-8", cores=1),
 }
 
 
