@@ -163,6 +163,8 @@ def content_of(job: ExportJob, measurement: Measurement) -> C3dContent:
     parameters = base.series.parameters_of(0)
     unit = (base.series.unit if markers else parameters.markers and parameters.markers.unit) or "mm"
     plates = plan_plates(job, parameters, unit, analog, forces)
+    if plates:  # they have corners, also if nothing else has coordinates
+        job.note_frame(measurement.source)
     return C3dContent(
         measurement, parameters, unit, markers, analog, forces, samples, plates, first, stop - first
     )

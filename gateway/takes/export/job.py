@@ -19,7 +19,7 @@ from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.takes.files.new_file import NewFiles
 
 if TYPE_CHECKING:
-    from gateway.takes.files.take import Take
+    from gateway.takes.files.take import Take, TakeSource
 
 
 class Format(NamedTuple):
@@ -295,16 +295,18 @@ class ExportJob:
                 self.note(f"left out of {source.name}: {', '.join(left_out)}")
 
     def _note_frames(self, take: "Take") -> None:
-        """Report in which frame the coordinates are; all formats but ``ros2`` have those of the server."""
-        from gateway.takes.export.source_frame import frame_note  # noqa: PLC0415 - it imports numpy
-
-        if self.format == "ros2":
-            return
         with_coordinates = _WITH_COORDINATES.intersection(self.chosen_format.components)
         for source in take.sources.values():
-            note = frame_note(source)
-            if note and source.recorded & with_coordinates:
-                self.note(note)
+            if source.recorded & with_coordinates:
+                self.note_frame(source)
+
+    def note_frame(self, source: "TakeSource") -> None:
+        """Report in which frame coordinates are; all formats but ``ros2`` have those of the server."""
+        from gateway.takes.export.source_frame import frame_note  # noqa: PLC0415 - it imports numpy
+
+        note = "" if self.format == "ros2" else frame_note(source)
+        if note:
+            self.note(note)
 
     def note_malformed(self, take: "Take") -> None:
         """Report messages that could not be read."""

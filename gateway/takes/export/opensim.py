@@ -158,6 +158,7 @@ class _PlateLoads(NamedTuple):
         plates = [(plan, placed) for plan, placed in by_plan if placed is not None]
         if not plates:
             return None
+        job.note_frame(measurement.source)  # the forces may come from channels, which have none themselves
         for note in unit_notes((plan.plate for plan, _ in plates), f"N.{unit}"):
             job.note(note)
         return cls(plates, samples, _metres(job, unit))

@@ -4,12 +4,15 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pytest
 
+from gateway.rtc3d.parameters import Plate
 from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob
 from tests.support.errors import one_names
 from tests.support.takes import Message
 from tests.unit.takes.export.exported import C3d, export_messages, notes_of, scene
+from tests.unit.takes.export.test_c3d import CORNERS, plate_messages
 from tests.unit.takes.export.test_rosbag import status as status_of
 
 WITH_COORDINATES: Final = [".c3d", ".trc", ".mot", ".csv", ".parquet", ".mcap", "opensim", "bids"]
@@ -57,6 +60,17 @@ def test_the_table_of_changes_names_a_frame_that_somebody_has_chosen(tmp_path: P
 @pytest.mark.parametrize("name", [*FORMATS, *CHOSEN_FORMATS])
 def test_nothing_is_reported_if_the_frame_is_that_of_the_server(tmp_path: Path, name: str) -> None:
     assert not any("frame lab" in note for note in notes_of(export(tmp_path, name, status("lab", 1e-3))))
+
+
+@pytest.mark.parametrize("name", [".c3d", ".mot", "opensim"])
+def test_plates_whose_forces_come_from_channels_have_a_frame(tmp_path: Path, name: str) -> None:
+    """A server need not send the component Force: the corners of the plates are in its coordinates."""
+    plate = Plate("1", corners=CORNERS, analog_channel_ids=tuple("123456"))
+    messages = plate_messages(plate, np.full((20, 6), 30.0), np.zeros((20, 6)))
+    messages = [message for message in messages if not message[0].endswith("_FORCE")]
+    options: dict[str, Any] = {} if name.startswith(".") else {"format": name}
+    job = export_messages(tmp_path, [TRANSFORMS["turned"], *messages], f"out{name}", **options)
+    assert one_names(notes_of(job), "lab", "transform", "world", "not applied")
 
 
 def test_channels_alone_have_no_frame(tmp_path: Path) -> None:
