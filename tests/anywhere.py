@@ -114,6 +114,7 @@ def _run(target: str, surroundings: Surroundings) -> tuple[int, str]:
             "TZ": surroundings.time_zone,
             "LC_ALL": surroundings.locale,
             "LOCPATH": str(_make_locale(surroundings.locale)),
+            "CI": "",  # what the surroundings lack, such as root or IPv6, they lack on purpose: tests skip
         }
         if surroundings.user:
             environment |= {
@@ -150,8 +151,20 @@ def _checkout(surroundings: Surroundings) -> Iterator[tuple[Path, list[str]]]:
         if surroundings.user:
             Path(parent).chmod(0o755)
             subprocess.run(["chown", "--recursive", f"{_USER_ID}:{_USER_ID}", str(folder.parent)], check=True)
-        system = Path(f"/usr/bin/python3.{surroundings.python}")  # other users can run it
-        yield folder, [f"PYTHON={system if system.exists() else find_python(surroundings.python)}"]
+        yield folder, [f"PYTHON={_find_python(surroundings)}"]
+
+
+def _find_python(surroundings: Surroundings) -> Path:
+    assert surroundings.python is not None
+    system = Path(f"/usr/bin/python3.{surroundings.python}")
+    if system.exists():
+        return system
+    found = None if surroundings.user else find_python(surroundings.python)  # it may be in root's home folder
+    if found is None:
+        sys.exit(
+            f"Python 3.{surroundings.python} is missing: install it, with its headers, in /usr or by pyenv"
+        )
+    return found
 
 
 def _make_locale(name: str) -> Path:
