@@ -20,7 +20,7 @@ from hypothesis.database import DirectoryBasedExampleDatabase
 from xdist.scheduler import LoadScopeScheduling, Scheduling
 
 from gateway.logs.failures import HOLD_S
-from tests.support.needs import need
+from tests.support.needs import is_root, need
 
 # uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection
 # that finds a Zenoh session there waits for threads that the child does not have; the parent waits for it.
@@ -69,7 +69,7 @@ _NEEDS: Final = {
         "needs a browser: install Debian's package chromium",
     ),
     "systemd": (
-        os.geteuid() == 0 and Path("/lib/systemd/systemd").exists(),
+        is_root() and Path("/lib/systemd/systemd").exists(),
         "boots its own systemd: needs root and an installed systemd",
     ),
 }

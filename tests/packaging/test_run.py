@@ -1,4 +1,4 @@
-"""`make test` reports a worker that crashes, and gives the tests an uptime of their own."""
+"""`make test` reports a worker that crashes, sets the uptime for the tests, and knows who runs it."""
 
 import os
 import subprocess
@@ -58,3 +58,10 @@ def test_the_tests_and_their_processes_have_the_uptime_asked_for(tmp_path: Path)
     """Otherwise `make test` would say nothing about a machine that has just booted."""
     run = run_tests(tmp_path, UPTIME, RTC3D_UPTIME_S="34560001")
     assert run.returncode == 0, run.stdout
+
+
+def test_a_user_who_seems_to_be_root_in_the_namespace_of_the_tests_is_not() -> None:
+    """Tests that boot a machine of their own would fail for that user, and seem to have found something."""
+    script = "import os; from tests.support.needs import is_root; print(os.geteuid(), is_root())"
+    command = ["unshare", "--user", "--map-root-user", sys.executable, "-c", script]
+    assert subprocess.check_output(command, cwd=ROOT, text=True) == "0 False\n"

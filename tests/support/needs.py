@@ -3,6 +3,7 @@
 import os
 import shutil
 import socket
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,15 @@ def need_programs(*names: str, packages: str) -> None:
     """Go on if all programs are installed; ``packages`` are those of Debian."""
     missing = [name for name in names if shutil.which(name) is None]
     need(not missing, f"needs {' and '.join(missing)}: install Debian's {packages}")
+
+
+def is_root() -> bool:
+    """Return whether this is root, and not another user in the user namespace of ``tests/with-netns``.
+
+    That one has a single user, who seems to be root there.
+    """
+    ranges = Path("/proc/self/uid_map").read_text().splitlines()
+    return os.geteuid() == 0 and sum(int(each.split()[2]) for each in ranges) > 1
 
 
 def has_ipv6() -> bool:
