@@ -13,7 +13,7 @@ from gateway.cli.echo_output import MAX_WAITING, json_line, text_line, too_fast_
 from gateway.cli.echo_sources import EchoSources
 from gateway.cli.record_output import missing_texts, unknown_texts
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES, Reception
-from gateway.client.refill import Refill
+from gateway.client.refill import END_S, Refill
 from gateway.client.sources import POSE, Series, Source
 from gateway.client.transport import GatewaySubscriber, close_in_time
 from gateway.logs.safe_text import safe_text
@@ -23,9 +23,6 @@ from gateway.messages.topics import escape_key_chunk, lcm_channel
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 
 _POLL_S: Final = 0.1
-
-_REFILL_S: Final = 5.0
-"""How long the end waits for what is missing while none of it comes."""
 
 _MAX_NOTES: Final = 10
 
@@ -133,7 +130,7 @@ def print_complete(
                 if messages.is_ending:  # nothing has come for a while
                     refill.close()
                 messages.end(refill)
-                end_s = now_s + _REFILL_S
+                end_s = now_s + END_S
             is_all_here = messages.is_ending and not refill.num_incomplete
             try:
                 received = messages.waiting.get(timeout=_POLL_S)
@@ -146,7 +143,7 @@ def print_complete(
             print(line(*received), file=out, flush=True)
             num_printed += 1
             if messages.is_ending:
-                end_s = time.monotonic() + _REFILL_S
+                end_s = time.monotonic() + END_S
         has_all = not any(_problems(messages))
     return num_printed, has_all
 

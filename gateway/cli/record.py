@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 
 _TICK_S: Final = 0.1
 
-_REFILL_S: Final = 5.0
-"""How long the end waits for what is missing, while no key becomes complete."""
-
 
 @options.with_options
 def record(
@@ -103,11 +100,6 @@ def _refill(recording: "TakeRecording", progress: "RecordProgress") -> None:
     """Request what is missing until now."""
     if (refill := recording.refill) is not None:
         refill.end()
-        least, end_s = refill.num_incomplete, time.monotonic() + _REFILL_S
-        while (num_incomplete := refill.num_incomplete) and time.monotonic() < end_s:
-            if num_incomplete < least:
-                least, end_s = num_incomplete, time.monotonic() + _REFILL_S
-            time.sleep(_TICK_S)
-            progress.tick()
+        refill.wait_for_end(_TICK_S, progress.tick)
         time.sleep(_TICK_S)  # an answer can overtake the parameters that describe its messages
         refill.close()

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.client.completion import Unknown
+from gateway.client.completion_states import Unknown
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES
 from gateway.client.sources import POSE, Series
 from gateway.client.transport import GatewaySubscriber

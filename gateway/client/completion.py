@@ -4,83 +4,30 @@ This decides what to hold, what to request and what to hand on. It does no I/O, 
 clock: ``gateway.client.refill`` requests.
 """
 
-import enum
 import math
 from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
-from gateway.client.arrived_run import ArrivedRun, HeldBytes, RecentTimes
+from gateway.client.arrived_run import ArrivedRun, HeldBytes
+from gateway.client.completion_states import End, State, Unknown
+from gateway.client.delivery import Delivery
 from gateway.client.history_requests import (
     COMPLETE,
-    REPLY_S,
+    KEEPS_NOTHING_CODES,
     RETRY_CODES,
     Completeness,
     HistoryAnswer,
     HistoryRequest,
 )
 from gateway.client.publisher_watch import PublisherWatch
-from gateway.messages.history import sequence_of, utime_of
+from gateway.client.request_timing import GRACE_S, RequestTiming
+from gateway.client.restart_check import RestartCheck, Verdict
+from gateway.messages.history import sequence_of
 from gateway.messages.sequence_check import SequenceCheck
-
-GRACE_S: Final = 0.05
-"""How long a message may be late before it is requested: LCM can deliver in another order."""
-
-RETRY_S: Final = 0.1
-"""When a request is repeated that brought nothing."""
-
-PATIENCE_S: Final = 60.0
-"""How long requests that bring nothing are repeated: as long as a gateway keeps messages by default."""
-
-NOBODY_S: Final = 3.0
-"""The same if messages arrive and nobody takes the requests: the gateway is one of an earlier version."""
 
 PASSING_S: Final = 10.0
 """After a refusal, gaps are not filled for so long: a reload of the gateway may end its reason."""
-
-_KEEPS_NOTHING: Final = frozenset({"disabled", "bad-request"})
-"""The codes of a gateway without a history."""
-
-_MIN_REPLY_S: Final = 0.05
-
-_ESTIMATE_SHARE: Final = 0.3
-_SAFE_SHARE: Final = 0.5
-"""After which share of the patience it shows how much of the past will come; how much of that to count on."""
-
-_SILENCE_S: Final = 1.0
-"""If nothing has arrived for longer, the connection was lost, and patience begins again."""
-
-_MAX_RUNS: Final = 1000
-"""How many restarts in a row may wait to be checked: the numbers come from the network."""
-
-
-class State(enum.Enum):
-    """What a Completion does with a message that arrives."""
-
-    BEGINNING = enum.auto()
-    """The number to begin with is not known: the first message says it, or the history if that is asked."""
-    FOLLOWING = enum.auto()
-    """Nothing is missing: hand on the next number."""
-    FILLING = enum.auto()
-    """Some are missing, and requested: hold the later ones."""
-    CHECKING = enum.auto()
-    """The numbers look as if the gateway had restarted: hold what arrives until the history has said so."""
-    PASSING = enum.auto()
-    """Gaps are not filled: hand on each message when it arrives."""
-    ENDED = enum.auto()
-    """Take nothing more."""
-
-
-class Unknown(enum.Enum):
-    """Places where nobody knows whether messages are missing."""
-
-    RESTART = "restart"
-    """Between two runs of the gateway: what it published last, or while it was not heard, went with it."""
-    TWO_GATEWAYS = "two gateways"
-    BEGINNING = "beginning"
-    """Before the first message of a key that came later than others: the history has not answered."""
-    END = "end"
-    """After the last message: the history has not answered."""
 
 
 class Completion:
@@ -105,62 +52,56 @@ class Completion:
         held_bytes: HeldBytes,
         completeness: Completeness = COMPLETE,
     ) -> None:
-        self.is_past = completeness.last_s is not None
-        """Whether what is handed on is of the time before the first message, or has waited for it."""
-        self.due_s = math.inf
-        """When to request something; infinite if nothing is missing."""
-        self.reached_utime = 0
-        """The time of the newest message that was handed on; 0 before the first."""
-        self.num_refilled = 0
-        """How many messages came from the history because they were missing before others that arrived."""
-        self.num_damaged = 0
-        """How many messages were left out, because the gateway has not published their numbers."""
         self.problem = ""
         """Why gaps are not filled now; "" if they are."""
         self.last_problem = ""
         """Why gaps were not filled last."""
         self.unknown: Counter[Unknown] = Counter()
         """In how many places it is not known whether messages are missing."""
-        self._hand_on = hand_on
-        self._check = check
-        self._held_bytes = held_bytes
+        is_past = completeness.last_s is not None
         self._fills_gaps = completeness.is_complete
-        self._state = State.BEGINNING
+        self._state = State.BEGINNING if self._fills_gaps or is_past else State.PASSING
+        self._end = End.OPEN
+        self._delivery = Delivery(hand_on, check, held_bytes)
+        self._timing = RequestTiming(completeness.patience_s, is_past=is_past)
+        self._requested = 0  # the number of the newest request; only its answer counts
+        self._newest_since = -1  # the largest number that has arrived since that request was made
+        # BEGINNING: what the history is asked to begin with; None if the first message says it.
+        self._first_request = HistoryRequest(0, last_s=completeness.last_s) if is_past else None
+        self._restart = RestartCheck(held_bytes)  # CHECKING
         self._watch = PublisherWatch()
-        self._run = ArrivedRun(held_bytes)
-        self._next = -1  # the number to hand on next; -1 if the history is to say where to begin
-        self._reached: tuple[int, int] | None = None  # the message of this run that was handed on last
-        self._recent = RecentTimes()
-        self._requested = 0  # the number of the newest request
-        self._newest_since = -1  # the largest number that has arrived since that
-        self._since_s = 0.0  # since when requests have brought nothing
-        self._heard_s = -math.inf
-        self._nobody_s = NOBODY_S
-        # BEGINNING: where the history is to begin, if it is asked.
-        self._last_s = completeness.last_s
-        self._begin_utime: int | None = None
-        # FILLING: the known message may be so long that an answer has only that; and a new run begins later
-        # than the former one has ended, so that no mistake repeats the past.
-        self._asks_known = True
-        self._after_utime: int | None = None
-        # CHECKING: what has arrived since the numbers went back, and whether the time is asked.
-        self._later_runs: list[ArrivedRun] = []
-        self._checks_time = False
-        # PASSING: until when.
-        self._passes_until_s = math.inf
-        # The end: nothing that arrives is taken, and the number to end with may not be known yet.
-        self._is_ending = self._knows_end = False
-        # The past: when to give it up, if anything waits for it, and how much has come since that waits.
-        self._patience_s = math.inf if completeness.patience_s is None else completeness.patience_s
-        self._past_until_s = math.inf
-        self._num_past = 0
-        if not (self._fills_gaps or self.is_past):
-            self._state = State.PASSING
+        self._passes_until_s = math.inf  # PASSING because of a problem
+
+    @property
+    def due_s(self) -> float:
+        """When to request something; infinite if nothing is missing."""
+        return self._timing.due_s
+
+    @property
+    def is_past(self) -> bool:
+        """Whether what is handed on is of the time before the first message, or has waited for it."""
+        return self._timing.is_past
+
+    @property
+    def reached_utime(self) -> int:
+        """The time of the newest message that was handed on; 0 before the first."""
+        return self._delivery.reached_utime
+
+    @property
+    def num_refilled(self) -> int:
+        """How many messages came from the history because they were missing before others that arrived."""
+        return self._delivery.num_refilled
+
+    @property
+    def num_damaged(self) -> int:
+        """How many messages were left out, because the gateway has not published their numbers."""
+        return self._delivery.num_damaged
 
     @property
     def has_begun(self) -> bool:
         """Whether anything has arrived, or was requested."""
-        return self._state is not State.BEGINNING or self._run.until >= 0 or self.due_s < math.inf
+        has_arrived = self._delivery.arrived.until >= 0
+        return self._state is not State.BEGINNING or has_arrived or self._timing.is_due
 
     # What arrives.
 
@@ -171,97 +112,99 @@ class Completion:
 
         Unless ``has_room``, it is let go, and is requested later.
         """
-        if self._is_ending or self._state is State.ENDED:
+        if self._end is not End.OPEN or self._state is State.ENDED:
             return
-        if self._state is not State.PASSING and self._recent.utime_of(sequence, -1) == utime:
+        delivery = self._delivery
+        if self._state is not State.PASSING and delivery.recent.utime_of(sequence, -1) == utime:
             return  # it comes again, or late: that shows nothing, however often
         self._watch_publishers(sequence, utime, session, now_s)
-        run = self._later_runs[-1] if self._later_runs else self._run
-        is_next_run = not run.is_continued_by(sequence, utime, session) or (
-            run is self._run and self._recent.contradict(sequence, utime)
+        arrived = self._arriving
+        # A new run can have reached the same number when it is heard again. Then the time differs.
+        is_next_run = not arrived.is_continued_by(sequence, utime, session) or (
+            arrived is delivery.arrived and delivery.recent.contradict(sequence, utime)
         )
         if is_next_run and self._state is not State.PASSING:
             self._suspect_restart(now_s)
         elif is_next_run and self.problem and not self._watch.sees_two(now_s):
-            self._check.begin_at(0, is_restart=True)
-            self._run = ArrivedRun(self._held_bytes)
-            self._resume(now_s)  # the gateway that has restarted may keep messages
+            # The gateway that has restarted may keep messages, even if the former one did not. No history
+            # says whether it has; but nothing is held, so nothing can be repeated.
+            delivery.check.begin_at(0, is_restart=True)
+            delivery.begin_run()
+            self._resume(now_s)
         if self._state is State.PASSING:
-            self._pass_on(run, message, sequence, utime, session)
+            if not arrived.is_continued_by(sequence, utime, session):
+                delivery.begin_run()
+                arrived = delivery.arrived
+            arrived.note(sequence, utime, session)
+            delivery.hand_on(message)
         else:
             self._keep(message, sequence, utime, session, now_s, has_room=has_room)
+
+    @property
+    def _arriving(self) -> ArrivedRun:
+        """The run of the messages that arrive: after a suspected restart, a later one."""
+        later_runs = self._restart.later_runs
+        return later_runs[-1] if later_runs else self._delivery.arrived
 
     def _keep(
         self, message: bytes, sequence: int, utime: int, session: int, now_s: float, *, has_room: bool
     ) -> None:
         """Hand a message on if it is the next one, or hold it, or let it go."""
-        run = self._later_runs[-1] if self._later_runs else self._run
-        run.note(sequence, utime, session)
+        delivery, arrived = self._delivery, self._arriving
+        arrived.note(sequence, utime, session)
         self._newest_since = max(self._newest_since, sequence)
-        if self.is_past and self._past_until_s == math.inf:  # the first message that waits
-            self._past_until_s, self._num_past = now_s + self._patience_s, 0
-        if self._state is State.BEGINNING and self.due_s == math.inf and self._last_s is None:
-            self._next, self._state = sequence, State.FOLLOWING
-            self._check.begin_at(sequence)
+        self._timing.wait_for_past(now_s)
+        if self._state is State.BEGINNING and self._first_request is None:
+            delivery.next, self._state = sequence, State.FOLLOWING
+            delivery.check.begin_at(sequence)
         if not has_room:
-            self._since_s = now_s  # patience begins when requests can be made again
-        elif sequence in run.held and run.held[sequence] != message:
-            self.num_damaged += 1  # one of both; the history has the other one
-            run.release(sequence)
-        elif self._state in {State.BEGINNING, State.CHECKING} or sequence > self._next:
-            run.hold(sequence, message)
-        elif sequence == self._next:
-            self._pass(sequence, message)
-        self._look(now_s, is_live=True)
+            self._timing.wait_from(now_s)  # nothing is requested until there is room
+        elif sequence in arrived.held and arrived.held[sequence] != message:
+            # One of the two has a false number, and nothing here says which. The history has the other one.
+            delivery.num_damaged += 1
+            arrived.release(sequence)
+        elif self._state in {State.BEGINNING, State.CHECKING} or sequence > delivery.next:
+            arrived.hold(sequence, message)
+        elif sequence == delivery.next:
+            delivery.pass_on(sequence, message)
+        self._advance(now_s, is_live=True)
         self.expire(now_s)
 
-    def _pass_on(self, run: ArrivedRun, message: bytes, sequence: int, utime: int, session: int) -> None:
-        if not run.is_continued_by(sequence, utime, session):
-            self._run = run = ArrivedRun(self._held_bytes)
-        run.note(sequence, utime, session)
-        self._hand_on(message)
-
-    def _pass(self, sequence: int, message: bytes) -> None:
-        self.reached_utime = utime = utime_of(message)
-        self._next, self._reached = sequence + 1, (sequence, utime)
-        self._asks_known, self._after_utime = True, None
-        self._recent.add(sequence, utime)
-        self._hand_on(message)
-
-    def _look(self, now_s: float, *, is_live: bool = False) -> None:
+    def _advance(self, now_s: float, *, is_live: bool = False) -> None:
         """Hand on what is held and follows, and note when to request what is missing, if it is."""
-        held = self._run.held
+        delivery = self._delivery
         if self._state in {State.FOLLOWING, State.FILLING}:
-            while self._next in held:
-                self._pass(self._next, self._run.release(self._next))
-            if self._next <= self._run.until or (self._is_ending and not self._knows_end):
+            delivery.pass_on_held()
+            # What was lost last, no later message shows: at the end, only the history knows it.
+            if delivery.next <= delivery.arrived.until or self._end is End.ENDING:
                 self._state = State.FILLING
             else:
-                self._state, self.due_s, self._asks_known = State.FOLLOWING, math.inf, True
+                self._state, delivery.asks_known = State.FOLLOWING, True
+                self._timing.stop()
                 self._end_past()
         is_incomplete = self._state in {State.FILLING, State.CHECKING} or (
-            self._state is State.BEGINNING and self._run.until >= 0
+            self._state is State.BEGINNING and delivery.arrived.until >= 0
         )
-        if self.due_s == math.inf:
-            if is_incomplete:
-                is_late = is_live and self._state is State.FILLING
-                self._begin_to_request(now_s, now_s + (GRACE_S if is_late else 0.0))
-        elif is_live and now_s - self._heard_s > _SILENCE_S:
-            self._since_s = now_s
+        if is_incomplete and not self._timing.is_due:
+            # A message that the network delivers late comes by itself: to request each would cost more.
+            is_late = is_live and self._state is State.FILLING
+            self._timing.begin(now_s, GRACE_S if is_late else 0.0)
         if is_live:
-            self._heard_s = now_s
+            self._timing.hear(now_s)
 
     def notice(self, newest: int, utime: int, now_s: float) -> None:
         """Take the number and the time of the newest message that the history has: it may never arrive."""
-        run = self._run
-        if self._state not in {State.FOLLOWING, State.FILLING} or utime <= run.newest_utime:
+        arrived = self._delivery.arrived
+        if self._state not in {State.FOLLOWING, State.FILLING} or utime <= arrived.newest_utime:
             return
-        if newest > run.until:
-            run.until = newest
-            self._look(now_s, is_live=True)  # it may only be on its way
-        elif newest <= run.newest:
+        if newest > arrived.until:
+            arrived.until = newest
+            self._advance(now_s, is_live=True)  # it may only be on its way
+        elif newest <= arrived.newest:
+            # Later, but with a smaller number: a restart. If all of the next run fell into an outage, as a
+            # short trial does, nothing that arrives will ever show it.
             self._suspect_restart(now_s, has_arrived=False)
-            self._look(now_s)
+            self._advance(now_s)
 
     # Only passing on.
 
@@ -277,185 +220,97 @@ class Completion:
 
     def _pass_on_only(self, problem: str, until_s: float) -> None:
         """Hand on what is held, and then each message when it arrives."""
-        self._flush(has_restarted=False)
+        self._delivery.flush(self._restart.take_runs(), has_restarted=False)
         self.problem = self.last_problem = problem
         self._passes_until_s = until_s
-        self.is_past, self._last_s = False, None
-        self._state, self.due_s = State.PASSING, math.inf
+        self._state, self._first_request = State.PASSING, None
+        self._timing.stop()
+        self._timing.end_past()
         self._requested += 1
 
     def _resume(self, now_s: float) -> None:
         """Fill gaps again, from the newest message on."""
-        run = self._run
         self.problem = ""
-        self._state, self._next, self._since_s = State.FOLLOWING, run.newest + 1, now_s
-        self._reached = (run.newest, run.newest_utime) if run.newest >= 0 else None
-        self._recent.clear()
+        self._delivery.resume()
+        self._state = State.FOLLOWING
+        self._timing.wait_from(now_s)
 
     # What is requested.
 
     def begin(self, now_s: float) -> None:
         """Request the time before the first message now: the gateway has some of it."""
-        if self.is_past and self.due_s == math.inf:
-            self._begin_to_request(now_s, now_s)
+        if self.is_past and not self._timing.is_due:
+            self._timing.begin(now_s)
 
     def begin_since(self, utime: int, now_s: float) -> None:
         """Request what was published since a time: a first message may have fallen into an outage."""
-        if not self.has_begun and self._last_s is None:
-            self._begin_utime = utime
-            self._begin_to_request(now_s, now_s)
-
-    def _begin_to_request(self, now_s: float, due_s: float) -> None:
-        self._since_s, self.due_s = now_s, due_s
-
-    @property
-    def _expires_s(self) -> float:
-        """When to go on without what is missing."""
-        if self.is_past:
-            return self._past_until_s
-        return self._since_s + self._patience_s if self.due_s < math.inf else math.inf
+        if not self.has_begun and self._first_request is None:
+            self._first_request = HistoryRequest(0, since_utime=utime)
+            self._timing.begin(now_s)
 
     def reply_s(self, now_s: float) -> float:
         """Return how long the next answer may take: other keys, of which messages wait, come after it."""
-        return min(REPLY_S, self._patience_s, max(self._expires_s - now_s, _MIN_REPLY_S))
+        return self._timing.reply_s(now_s)
 
     def expire(self, now_s: float) -> None:
         """Go on without what is missing, if that takes too long. Call it often while something is due."""
-        if now_s >= self._expires_s:
+        if self._timing.is_expired(now_s):
             self._give_up(now_s)
 
     def request(self) -> HistoryRequest:
         """Return what to request; only if something is due."""
         self._requested += 1
         self._newest_since = -1
-        number, known = self._requested, self._reached
         if self._state is State.CHECKING:
-            known = known or (self._run.newest, self._run.newest_utime)
-            if self._checks_time:
-                return HistoryRequest(number, since_utime=known[1], known=known)
-            return HistoryRequest(number, known[0], known[0], known=known, asks_known=True)
+            return self._restart.request(self._requested, self._delivery)
         if self._state is State.BEGINNING:
-            return HistoryRequest(number, last_s=self._last_s, since_utime=self._begin_utime)
-        last = None
-        if self._run.held:
-            last = self._run.first  # which shows whether that is of this run, and has its own number
-        elif self._knows_end or not self._is_ending:
-            last = self._run.until
-        if self._after_utime is not None:
-            return HistoryRequest(number, self._next, last, since_utime=self._after_utime)
-        return HistoryRequest(number, self._next, last, known=known, asks_known=self._asks_known)
+            return (self._first_request or HistoryRequest(0))._replace(number=self._requested)
+        return self._delivery.request(self._requested, knows_last=self._end is not End.ENDING)
 
     def answer(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Take the answer to a request."""
         if request.number != self._requested:
             return
-        self._nobody_s = NOBODY_S
+        self._timing.note_answer()
         if self._state is State.CHECKING:
-            self._check_run(request, answer, now_s)
+            self._take_verdict(request, answer, now_s)
         elif request.is_contradicted_by(answer):
-            # Only a restart, or a message with a false number that was handed on, explains that.
+            # Only a restart explains that, or a false number that was handed on. The number of the known
+            # message was in this request: go on with the question for its time.
             self._suspect_restart(now_s, has_arrived=False)
-            self._checks_time = True
-        else:
+            self._restart.begin(asks_for_time=True)
+        elif self._delivery.is_of_this_run(request, answer, self._newest_of(answer)):
             self._take(request, answer, now_s)
+        elif self._delivery.reached is not None:
+            self._suspect_restart(now_s, has_arrived=False)
+        else:
+            # Nothing of the run was handed on, so there is no message to ask for: another restart, whose
+            # numbers are past those that are held.
+            self._begin_run(answer, now_s, is_held_before=True)
+
+    def _newest_of(self, answer: HistoryAnswer) -> int:
+        """Return the largest number that the gateway has published: some can have overtaken the answer."""
+        return max(answer.newest, self._newest_since)
 
     def _take(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Hand on, or hold, what the history has."""
-        run, former = self._run, self._next
-        numbered = [(sequence_of(message), message) for message in answer.messages]
-        if not self._confirms(request, answer, now_s):
-            return
+        delivery, former = self._delivery, self._delivery.next
         if self._state is State.BEGINNING:
-            self._next = min([answer.first, *run.held])
-            self._state = State.FILLING
-        if former < 0 or (self._is_ending and not self._knows_end):
-            run.until = max(run.until, answer.newest)
-            self._knows_end = self._is_ending
-        if request.since_utime is not None and answer.is_whole:
-            self._skip_to(answer.first)
-        for number, message in numbered:
-            if answer.is_whole:
-                self._skip_to(number)
-            self._refill(number, message)
-        if answer.is_whole:
-            self._skip_to((answer.last if request.last is None else min(answer.last, request.last)) + 1)
-        if self.is_past and self._patience_s < math.inf:
-            self._num_past += len(numbered)
-            self._shorten_past(now_s)
-        has_helped = self._next != former
-        if not has_helped and request.asks_known and answer.last < self._next <= answer.newest:
-            self._asks_known = False  # it is so long that an answer has only that
+            delivery.next = min([answer.first, *delivery.arrived.held])
+            self._state, self._first_request = State.FILLING, None
+        if former < 0 or self._end is End.ENDING:
+            delivery.arrived.until = max(delivery.arrived.until, answer.newest)
+        if self._end is End.ENDING:
+            self._end = End.KNOWN
+        delivery.take(request, answer)
+        delivery.shorten_past(self._timing.past_still_to_come(len(answer.messages), now_s))
+        has_helped = delivery.next != former
+        if not has_helped and request.asks_known and answer.last < delivery.next <= answer.newest:
+            # The known message is so long that an answer has only that: each would bring it again.
+            delivery.asks_known = False
             has_helped = True
-        self._look(now_s)
+        self._advance(now_s)
         self._repeat(now_s, has_helped=has_helped)
-
-    def _confirms(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> bool:
-        """Return whether an answer can be of this run, and leave out what it shows to be damaged."""
-        run = self._run
-        numbered = [(sequence_of(message), message) for message in answer.messages]
-        newest = max(answer.newest, self._newest_since)
-        if request.is_confirmed_by(answer) or any(run.held.get(each[0]) == each[1] for each in numbered):
-            self._leave_out_beyond(newest)
-        elif run.is_older_than(numbered, newest):
-            if self._reached is not None:
-                self._suspect_restart(now_s, has_arrived=False)
-            else:  # another restart, whose numbers are past those that are held
-                self._begin_run(answer, now_s, is_held_before=True)
-            return False
-        return True
-
-    def _refill(self, number: int, message: bytes) -> None:
-        """Take a message of the history, which may be one that has arrived meanwhile."""
-        run = self._run
-        if number == self._next:
-            if number in run.held:
-                if run.release(number) != message:
-                    self.num_damaged += 1
-                    run.let_go_between(number, math.inf)  # more of them may be damaged
-            else:
-                self.num_refilled += number < run.newest  # later ones were not missed
-            self._pass(number, message)
-        elif number > self._next and run.hold(number, message):
-            self.num_refilled += number < run.newest
-
-    def _skip_to(self, number: int) -> None:
-        """Go on at a number: what is missing before it exists no more."""
-        if number > self._next:
-            held = self._run.held
-            for each in sorted(each for each in held if each < number):
-                self._pass(each, self._run.release(each))
-            self._next, self._after_utime = number, None
-
-    def _leave_out_beyond(self, newest: int) -> None:
-        """Leave out what has arrived with numbers that the gateway has not published."""
-        run = self._run
-        if run.until <= newest:
-            return
-        for number in [number for number in run.held if number > newest]:
-            run.release(number)
-            self.num_damaged += 1
-        run.until = newest
-        if run.newest > newest and self._reached is not None:
-            run.newest, run.newest_utime = self._reached
-
-    def _shorten_past(self, now_s: float) -> None:
-        """Leave out the beginning of the past if all of it would take too long.
-
-        What is missing directly before the live messages would be worse for a display.
-        """
-        left_s = max(self._past_until_s - now_s, 0.0)
-        taken_s = self._patience_s - left_s
-        if taken_s < _ESTIMATE_SHARE * self._patience_s:
-            return
-        num_possible = int(self._num_past * left_s / taken_s)
-        first = self._run.first
-        if first - self._next > num_possible:
-            self._skip_past(first - int(_SAFE_SHARE * num_possible))
-
-    def _skip_past(self, number: int) -> None:
-        """Go on at a number, of the past or the first that is live: nobody has missed those before it."""
-        self._check.skip(number)
-        self._skip_to(number)
 
     def fail(
         self, request: HistoryRequest, code: str, text: str, now_s: float, *, is_connected: bool = True
@@ -467,185 +322,122 @@ class Completion:
         if request.number != self._requested:
             return
         if code in RETRY_CODES:
-            # What has just arrived shows that there is a connection, however long nothing follows.
-            has_arrived = self._state is State.CHECKING or self._begin_utime is not None
+            # Without a connection, nobody takes a request either: only if messages arrive, the gateway is one
+            # of an earlier version. What has made the request shows a connection, however long none follows.
+            has_arrived = self._state is State.CHECKING or self._asks_for_first
             is_nobody = code == "no-gateway" and (is_connected or has_arrived)
-            if (
-                not self._repeat(
-                    now_s,
-                    has_helped=False,
-                    patience_s=self._nobody_s if is_nobody else PATIENCE_S,
-                    knows_end=is_nobody and is_connected,
-                )
-                and code == "no-gateway"
-            ):
-                self._nobody_s = 0.0  # until somebody takes a request, each is made once
+            is_over = not self._repeat(
+                now_s, has_helped=False, is_nobody=is_nobody, knows_end=is_nobody and is_connected
+            )
+            if is_over and code == "no-gateway":
+                self._timing.note_nobody()
         elif code == "nothing-yet":
             self._give_up(now_s, knows_end=True)
         else:
-            if self._is_ending:
-                self._knows_end = True
-                self.unknown[Unknown.END] += code not in _KEEPS_NOTHING
+            if self._end is not End.OPEN:
+                self._end = End.KNOWN
+                self.unknown[Unknown.END] += code not in KEEPS_NOTHING_CODES
             self._pass_on_only(text, now_s + PASSING_S)
 
+    @property
+    def _asks_for_first(self) -> bool:
+        """Whether the history is asked for the first messages of a key that came later than others."""
+        return self._first_request is not None and self._first_request.since_utime is not None
+
     def _repeat(
-        self, now_s: float, *, has_helped: bool, patience_s: float = PATIENCE_S, knows_end: bool = False
+        self, now_s: float, *, has_helped: bool, is_nobody: bool = False, knows_end: bool = False
     ) -> bool:
         """Request again what is still missing; give it up and return False if that takes too long."""
-        if has_helped:
-            self._since_s = now_s
-        if self.due_s < math.inf:
-            if now_s - self._since_s >= patience_s and not has_helped:
-                self._give_up(now_s, knows_end=knows_end)
-                return False
-            self.due_s = now_s if has_helped else now_s + RETRY_S
-        return True
+        if self._timing.repeat(now_s, has_helped=has_helped, is_nobody=is_nobody):
+            return True
+        self._give_up(now_s, knows_end=knows_end)
+        return False
 
     def _give_up(self, now_s: float, *, knows_end: bool = False) -> None:
         """Go on with the next message that there is."""
-        self.due_s = math.inf
+        self._timing.stop()
+        arrived = self._delivery.arrived
         if self._state is State.CHECKING:
-            self._begin_run(None, now_s)  # as the numbers say
+            # Nobody denies the restart that the numbers show. If they are false, the past is not repeated
+            # either: the history does not answer.
+            self._begin_run(None, now_s)
             return
         if self._state is State.BEGINNING:
-            self.unknown[Unknown.BEGINNING] += self._begin_utime is not None and not knows_end
-            self._last_s = self._begin_utime = None
-            if self._run.until >= 0:
-                self._next, self._state = self._run.first, State.FOLLOWING
+            self.unknown[Unknown.BEGINNING] += self._asks_for_first and not knows_end
+            self._first_request = None
+            if arrived.until >= 0:
+                self._delivery.next, self._state = arrived.first, State.FOLLOWING
+        elif self.is_past:
+            self._delivery.skip_past_to(arrived.first)
         else:
-            first = self._run.first
-            (self._skip_past if self.is_past else self._skip_to)(first)
-        if self._is_ending and not self._knows_end:
-            self._knows_end = True
+            self._delivery.skip_to(arrived.first)
+        if self._end is End.ENDING:
+            self._end = End.KNOWN
             self.unknown[Unknown.END] += not knows_end
-        self._look(now_s)
+        self._advance(now_s)
         self._end_past()
 
     def _end_past(self) -> None:
         """Go on with what arrives now; without filling gaps, if that is not wanted."""
         if self.is_past and not self._fills_gaps:
             self._flush()
-            self._state, self.due_s = State.PASSING, math.inf
-        self.is_past = False
+            self._state = State.PASSING
+            self._timing.stop()
+            self._requested += 1  # the past may still come, and would be handed on after what is live
+        self._timing.end_past()
 
     # Restarts.
 
     def _suspect_restart(self, now_s: float, *, has_arrived: bool = True) -> None:
         """Ask the history whether the gateway has restarted; a message ``has_arrived`` that says so."""
         if has_arrived:
-            self._later_runs.append(ArrivedRun(self._held_bytes))
-            if len(self._later_runs) > _MAX_RUNS:
+            self._restart.add_run()
+            if self._restart.has_too_many_runs:
                 self._pass_on_only("the numbers of its messages have no order", now_s + PASSING_S)
                 return
         if self._state is not State.CHECKING:
-            self._state, self._checks_time = State.CHECKING, False
-            self._since_s = self.due_s = now_s
-        self._requested += 1  # an answer from before this would not say it
+            self._state = State.CHECKING
+            self._restart.begin()
+            self._timing.request_now(now_s)
+        self._requested += 1  # an answer that is on its way may be of before the restart, and would deny it
 
-    def _check_run(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
-        """Decide by an answer of the history whether the gateway has restarted."""
-        if not self._checks_time:
-            if request.is_confirmed_by(answer):
-                self._continue_run(answer.newest, now_s)
-            elif not answer.is_whole:
-                self._repeat(now_s, has_helped=False)
-            else:
-                # The known number may be false. A restart does not change when a message was published.
-                self._checks_time = True
-                self._since_s = self.due_s = now_s
-            return
-        if not answer.is_whole:
+    def _take_verdict(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
+        """Go on as an answer of the history says."""
+        newest = self._newest_of(answer)
+        verdict = self._restart.judge(request, answer, self._delivery, newest)
+        if verdict is Verdict.ASK_AGAIN:
             self._repeat(now_s, has_helped=False)
-            return
-        assert request.known is not None  # noqa: S101 - it is what was asked
-        number, utime = request.known
-        first = answer.messages[0] if answer.messages else None
-        if first is not None and utime_of(first) == utime:
-            self._correct_number(sequence_of(first))
-            self._continue_run(answer.newest, now_s)
-        elif first is not None and sequence_of(first) > number and self._is_consistent(number, answer):
-            self._continue_run(answer.newest, now_s)  # it goes on where the known message is too old
-        else:
+        elif verdict is Verdict.ASK_FOR_TIME:
+            self._timing.request_now(now_s)
+        elif verdict is Verdict.RESTARTED:
             self._begin_run(answer, now_s)
-
-    def _is_consistent(self, number: int, answer: HistoryAnswer) -> bool:
-        """Whether an answer with later messages than a known one can be of the same run."""
-        numbered = [(sequence_of(message), message) for message in answer.messages]
-        is_older = self._run.is_older_than(numbered, max(answer.newest, self._newest_since))
-        return not is_older and all(run.newest > number for run in self._later_runs)
-
-    def _correct_number(self, number: int) -> None:
-        """Take this as the number of the known message: the other one was damaged."""
-        if self._reached is not None:
-            false_number, utime = self._reached
-            while number + 1 != false_number and self._recent.has(number + 1):
-                number += 1  # it was handed on after the messages that it is a copy of
-            self._check.correct(number)
-            self._reached, self._next = (number, self._recent.utime_of(number, utime)), number + 1
-        self._run.newest = number
-
-    def _continue_run(self, newest: int, now_s: float) -> None:
-        """Go on as before: the gateway has not restarted."""
-        newest = max(newest, self._newest_since)
-        run, later_runs, self._later_runs = self._run, self._later_runs, []
-        self._leave_out_beyond(newest)
-        for later in later_runs:
-            run.let_go_between(later.first, later.newest_utime)
-            if later.until <= newest:
-                run.until = max(run.until, later.until)
-            for number in sorted(later.held):
-                message = later.release(number)
-                if number <= newest and number >= self._next:
-                    run.hold(number, message)
-                    run.note(number, utime_of(message), run.newest_session)
-                else:
-                    self.num_damaged += 1
-        self._state = State.BEGINNING if self._next < 0 else State.FILLING
-        self._since_s = self.due_s = now_s
-        self._look(now_s)
+        else:
+            if verdict is Verdict.FALSE_NUMBER:
+                self._delivery.correct_known(sequence_of(answer.messages[0]))
+            self._restart.rejoin(self._delivery, newest)
+            self._state = State.BEGINNING if self._delivery.next < 0 else State.FILLING
+            self._timing.request_now(now_s)
+            self._advance(now_s)
 
     def _begin_run(self, answer: HistoryAnswer | None, now_s: float, *, is_held_before: bool = False) -> None:
         """Go on with the numbers of the gateway that has restarted, which has given this answer, if any."""
-        later_runs = self._later_runs
-        utimes = [] if answer is None else [utime_of(message) for message in answer.messages]
-        known_utime = self._run.newest_utime if self._reached is None else self._reached[1]
-        if later_runs:
-            run = later_runs.pop()
-        elif is_held_before and utime_of(self._run.held[self._run.first]) >= min(utimes):
-            run = ArrivedRun(self._held_bytes)  # the clock was set back
-        elif utimes:  # its numbers are past those of before, or nothing of it has arrived
-            run = self._run.split(lambda utime: utime >= min(utimes))
-        else:
-            run = self._run.split(lambda utime: utime < known_utime)
-        # What is requested of it begins after the former runs, so that no mistake repeats the past.
-        former = [utime_of(held) for each in (self._run, *later_runs) for held in each.held.values()]
-        reached_utime = max(former, default=0) if self._reached is None else self._reached[1]
-        later_utimes = [*utimes, *([run.newest_utime] if run.newest >= 0 else [])]
-        is_clock_set_back = min(later_utimes, default=0) <= reached_utime
-        after_utime = max([reached_utime, *former]) + 1 if utimes and not is_clock_set_back else None
-        self.unknown[Unknown.RESTART] += 1 + len(later_runs)
+        new = self._restart.take_new_run(self._delivery, answer, is_held_before=is_held_before)
+        after_utime = self._restart.time_before(self._delivery, new, answer)
+        self.unknown[Unknown.RESTART] += 1 + len(self._restart.later_runs)
         self._flush()
-        self._check.begin_at(0, is_restart=True)
+        self._delivery.check.begin_at(0, is_restart=True)
+        self._delivery.begin_run(new, after_utime=after_utime)
         self._requested += 1
-        self._run, self._knows_end = run, False
-        if answer is not None and not run.held:
-            run.until = max(run.until, answer.newest)
-        self._next, self._reached, self._asks_known, self._after_utime = 0, None, True, after_utime
-        self._recent.clear()
-        self._state, self.due_s = State.FOLLOWING, math.inf
-        self._look(now_s)
+        if self._end is End.KNOWN:
+            self._end = End.ENDING  # that was the end of the former run
+        self._state, self._first_request = State.FOLLOWING, None
+        self._timing.stop()
+        self._advance(now_s)
         self._end_past()
 
-    def _flush(self, *, has_restarted: bool = True) -> None:
-        """Hand on what is held; what is missing there is lost. ``has_restarted``: so has each later run."""
-        later_runs, self._later_runs = self._later_runs, []
-        for run in (self._run, *later_runs):
-            if has_restarted and run is not self._run:
-                self._check.begin_at(0, is_restart=True)
-            for number in sorted(run.held):
-                self._hand_on(run.release(number))
-            if has_restarted or not later_runs:
-                self._check.end(run.until + 1)
+    def _flush(self) -> None:
+        """Hand on what is held, each run after the other."""
+        self._delivery.flush(self._restart.take_runs(), has_restarted=True)
 
     # The end.
 
@@ -653,15 +445,16 @@ class Completion:
         """Take nothing more that is published, and request everything until now."""
         if self._state in {State.PASSING, State.ENDED} or not self.has_begun:
             return
-        self._is_ending = True
-        self.due_s = min(self.due_s, now_s)
-        self._since_s = now_s
-        self._look(now_s)
+        if self._end is End.OPEN:
+            self._end = End.ENDING
+        self._timing.begin_end(now_s)
+        self._advance(now_s)
 
     def abandon(self) -> None:
         """Hand on what is held, and request nothing more."""
         if self._state is not State.PASSING:
             self._flush()
-        self.unknown[Unknown.END] += self._is_ending and not self._knows_end
-        self._state, self.due_s = State.ENDED, math.inf
+        self.unknown[Unknown.END] += self._end is End.ENDING
+        self._state = State.ENDED
+        self._timing.stop()
         self._requested += 1

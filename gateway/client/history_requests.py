@@ -15,6 +15,9 @@ BUSY_CODES: Final = frozenset({"busy", "rate"})
 RETRY_CODES: Final = BUSY_CODES | {"timeout", "no-gateway", "zenoh"}
 """With these codes, the same request may be answered later; a gateway answered none with the last three."""
 
+KEEPS_NOTHING_CODES: Final = frozenset({"disabled", "bad-request"})
+"""The codes of a gateway without a history."""
+
 
 class Completeness(NamedTuple):
     """What comes from the history: what is missing, if it ``is_complete``, and at first ``last_s`` seconds.

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.client.arrived_run import HeldBytes
-from gateway.client.completion import NOBODY_S, PATIENCE_S, RETRY_S, Completion
+from gateway.client.completion import Completion
 from gateway.client.history_requests import (
     REPLY_S,
     RETRY_CODES,
@@ -16,6 +16,7 @@ from gateway.client.history_requests import (
     HistoryAnswer,
     HistoryRequest,
 )
+from gateway.client.request_timing import NOBODY_S, PATIENCE_S, RETRY_S
 from gateway.client.sources import Series, Source
 from gateway.errors import QueryError
 from gateway.workers import thread_starts
@@ -44,6 +45,9 @@ _SILENT_S: Final = 2.5
 
 _WAIT_S: Final = 0.05
 """When to look again whether the program can take more messages."""
+
+END_S: Final = 5.0
+"""How long the end waits while nothing of what is missing comes: the gateway may have ended before."""
 
 
 class KeptSeries(NamedTuple):
@@ -93,6 +97,7 @@ class Refill:
         self._due: dict[Source, dict[Series, Completion]] = {}
         self._look_s: dict[Source, float] = {}  # when to look for series of which nothing has arrived
         self._looked_s: dict[Source, float] = {}
+        self._helped_s = -math.inf  # when an answer has brought something
         self._is_ending = self._is_closed = False
 
     # Under the lock, which the caller holds.
@@ -153,6 +158,22 @@ class Refill:
                         self._look_s[series.source] = -math.inf
             self._changed.notify_all()
 
+    def wait_for_end(self, interval_s: float, tick: Callable[[], object] = lambda: None) -> None:
+        """After ``end``, wait until nothing is missing, or nothing of it has come for END_S.
+
+        A computer that is too busy may need much longer for all of it. As long as messages come, to give up
+        would lose what is there. ``tick`` is called every ``interval_s``.
+        """
+        least, changed_s = self.num_incomplete, self._monotonic()
+        while (num_incomplete := self.num_incomplete) > 0:
+            now_s = self._monotonic()
+            if num_incomplete < least:
+                least, changed_s = num_incomplete, now_s
+            if now_s >= max(changed_s, self._helped_s) + END_S:
+                return
+            time.sleep(interval_s)
+            tick()
+
     def close(self) -> None:
         """Hand on what is held, and request nothing more."""
         with self._changed:
@@ -203,7 +224,10 @@ class Refill:
             if answer is None:
                 completion.fail(request, code, text, now_s, is_connected=_is_connected(source, now_s))
             else:
+                before = completion.reached_utime
                 completion.answer(request, answer, now_s)
+                if completion.reached_utime != before:
+                    self._helped_s = now_s
 
     def _begin_silent(self, source: Source, begin_s: float) -> float:
         """Begin the series of a source that had messages in the last seconds, and may have none now.

@@ -183,14 +183,27 @@ class SequenceCheck:
     def correct(self, number: int) -> None:
         """Take ``number`` as that of the newest message: the one that it had was damaged."""
         self.num_implausible += 1
-        if self._current is not None:
-            self._current.newest = number
+        if (current := self._current) is None:
+            return
+        current.newest = number
+        # What seemed to be missing up to the false number was not.
+        for gap in current.gaps:
+            if gap.stop > number:
+                first = gap.stop - gap.missing - gap.late.bit_count()
+                num_before = gap.missing
+                gap.missing, gap.stop, gap.late = min(num_before, max(0, number - first)), number, 0
+                self.num_lost -= num_before - gap.missing
+                self.num_gaps -= num_before > 0 and not gap.missing
 
     def _fill_gap(self, current: _Numbering, sequence: int, utime: int) -> bool:
         """Return whether a message was missing, and was only overtaken by others."""
         if not (0 < current.newest - sequence <= MAX_LATE and utime <= current.utime):
             return False
         for gap in current.gaps:
+            # A numbering can share a gap with another one, of which it does not reach the end: a damaged
+            # number. To fill that would take a bit for each of the numbers between, which can be 2^62.
+            if gap.stop > current.newest + 1:
+                continue
             # The missing and the late messages of a gap are all of it.
             if gap.stop - gap.missing - gap.late.bit_count() <= sequence < gap.stop and gap.fill(sequence):
                 self.num_late += 1

@@ -9,16 +9,11 @@ from hypothesis import given, note, settings
 from hypothesis import strategies as st
 
 from gateway.client.arrived_run import HeldBytes
-from gateway.client.completion import (
-    GRACE_S,
-    NOBODY_S,
-    PASSING_S,
-    PATIENCE_S,
-    Completion,
-    Unknown,
-)
+from gateway.client.completion import PASSING_S, Completion
+from gateway.client.completion_states import Unknown
 from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.publisher_watch import TWO_GATEWAYS_S
+from gateway.client.request_timing import GRACE_S, NOBODY_S, PATIENCE_S
 from gateway.messages.encode import PREFIX
 from gateway.messages.history import utime_of
 from gateway.messages.sequence_check import SequenceCheck
@@ -419,6 +414,23 @@ def test_a_refusal_is_over_after_a_while(code: str) -> None:
     assert network.completion.last_problem == "no"
 
 
+def test_after_a_refusal_a_gap_is_requested_by_its_numbers() -> None:
+    """From the restart on, which was found before, an answer has the oldest messages, and never the gap."""
+    network = Network()
+    network.arrives(5)
+    network.restart()
+    network.arrives(9)
+    while network.completion.request().known is not None:  # until the restart is known
+        network.ask()
+    network.completion.fail(network.completion.request(), "refused", "no", network.now_s)
+    network.arrives(20)
+    network.now_s += PASSING_S
+    network.arrives(30)
+    network.ask(3)
+    network.ask(3)
+    assert network.numbers == [5, 9, *range(20, 25)]
+
+
 def test_what_came_before_the_first_message_that_arrives_is_requested() -> None:
     """The first event of a source may fall into an outage; the second one shows that there was one."""
     network = Network()
@@ -428,6 +440,25 @@ def test_what_came_before_the_first_message_that_arrives_is_requested() -> None:
     network.ask_all()
     assert network.numbers == [0, 1, 2]
     assert not network.completion.unknown.total()
+
+
+def test_a_key_that_began_late_does_not_give_up_soon_without_a_connection() -> None:
+    """A router that is started again and again takes no requests for longer than NOBODY_S."""
+    network = Network()
+    messages = [network.publish() for _ in range(3)]
+    network.completion.begin_since(1, network.now_s)
+    network.arrive(messages[2])
+    network.ask_all()
+    network.arrives(9)
+    start_s = network.now_s
+    while network.now_s < start_s + 2 * NOBODY_S:
+        network.now_s = network.completion.due_s
+        network.completion.fail(
+            *(network.completion.request(), "no-gateway", "", network.now_s), is_connected=False
+        )
+    assert network.numbers == [0, 1, 2]
+    network.ask_all()
+    assert network.numbers == [*range(10)]
 
 
 def test_what_came_before_the_first_message_is_unknown_if_nobody_says_it() -> None:
@@ -740,3 +771,16 @@ def test_a_past_that_stops_coming_counts_as_lost_for_nobody() -> None:
     network.completion.expire(network.now_s + 1.0)
     assert network.numbers == [15, 16, 20]
     assert network.check.num_lost == 0
+
+
+def test_a_past_that_comes_after_the_patience_is_left_out() -> None:
+    """A display would show the messages twice, and go back in time."""
+    network = Network(completeness=DISPLAY)
+    network.arrives(20)
+    request = network.completion.request()
+    network.completion.expire(network.now_s + 1.0)
+    network.arrive(network.publish(), network.publish())
+    answer = network.find(request)
+    assert answer is not None
+    network.completion.answer(request, answer, network.now_s)
+    assert network.numbers == [20, 21, 22]

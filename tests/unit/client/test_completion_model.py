@@ -12,7 +12,8 @@ from hypothesis import assume, given, note, settings
 from hypothesis import strategies as st
 
 from gateway.client.arrived_run import HeldBytes
-from gateway.client.completion import Completion, Unknown
+from gateway.client.completion import Completion
+from gateway.client.completion_states import Unknown
 from gateway.client.history_requests import HistoryAnswer, HistoryRequest
 from gateway.messages.encode import PREFIX
 from gateway.messages.history import sequence_of, utime_of

@@ -2,17 +2,19 @@
 
 import math
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
 
-from gateway.client.completion import NOBODY_S, PATIENCE_S
 from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
-from gateway.client.refill import KeptSeries, Refill
+from gateway.client.refill import END_S, KeptSeries, Refill
+from gateway.client.request_timing import NOBODY_S, PATIENCE_S
 from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
 from gateway.messages.sequence_check import SequenceCheck
+from tests.support.clocks import Clock
 from tests.support.waiting import wait_until
 
 
@@ -39,7 +41,9 @@ class Series:
 class Subscriber:
     """A subscriber to ``num_series`` of one source. Answers have ``answer_size`` messages."""
 
-    def __init__(self, num_series: int, answer_size: int) -> None:
+    def __init__(
+        self, num_series: int, answer_size: int, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
         self.lock = threading.Lock()
         self.num_looks = 0
         self.rooms: Sequence[bool] = ()
@@ -49,7 +53,9 @@ class Subscriber:
         self.source: Any = Source()
         self.series: Any = [Series(self.source) for _ in range(num_series)]
         self._answer_size = answer_size
-        self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE)
+        self.answers: threading.Semaphore | None = None
+        """How many more requests are answered; None for all."""
+        self.refill = Refill(self, self.lock, self._ask, lambda *_: [], COMPLETE, monotonic)
         self.completions = [self.refill.add(each, self._hand_on) for each in self.series]
 
     @property
@@ -65,8 +71,10 @@ class Subscriber:
 
     def _ask(self, series: Series, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
         self.asked.append(series)
+        if self.answers is not None and not self.answers.acquire(timeout=60):
+            raise QueryError("no answer", code="timeout")
         first = int(request.options["from"])
-        last = min(first + self._answer_size - 1, int(request.options["to"]))
+        last = min(first + self._answer_size - 1, int(request.options.get("to", 99)))
         return HistoryAnswer([message(number) for number in range(first, last + 1)], first, last, 99)
 
     def arrives(self, number: int) -> None:
@@ -137,3 +145,34 @@ def test_how_long_a_gateway_is_asked_which_series_are_silent(code: str, until_s:
         assert again_s > now_s
         now_s = again_s
     assert now_s == pytest.approx(100.0 + until_s, abs=0.2)
+
+
+@pytest.mark.parametrize("num_answers", [0, 30, 99])
+def test_the_end_waits_as_long_as_messages_come(num_answers: int) -> None:
+    """A busy computer may need a minute for all of a key; of a gateway that has ended, nothing comes."""
+    clock = Clock()
+    subscriber = Subscriber(1, answer_size=2, monotonic=clock)  # the known message, and the next one
+    subscriber.answers = answers = threading.Semaphore(0)
+    with subscriber.lock:
+        subscriber.arrives(0)
+    subscriber.refill.end()
+    answered_s = clock()
+
+    def tick() -> None:
+        """Give one answer, and wait until it is there: each takes most of the patience."""
+        nonlocal answered_s
+        num_handed_on = len(subscriber.handed_on)
+        if num_handed_on == 100:
+            return  # whatever else ends now takes no time
+        clock.now_s += 0.7 * END_S
+        if num_handed_on <= num_answers:
+            answers.release()
+            wait_until(lambda: len(subscriber.handed_on) > num_handed_on)
+            answered_s = clock()
+
+    subscriber.refill.wait_for_end(0.0, tick)
+    assert subscriber.handed_on == [*range(1 + num_answers)]
+    assert (subscriber.refill.num_incomplete == 0) == (num_answers == 99)
+    assert num_answers == 99 or END_S <= clock() - answered_s <= 1.5 * END_S
+    subscriber.refill.close()
+    answers.release()

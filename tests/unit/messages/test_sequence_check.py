@@ -154,6 +154,23 @@ def test_any_numbers_are_taken() -> None:
     check_of(*(choice.choice([*numbers, choice.getrandbits(60)]) for _ in range(1000)), utimes=[0] * 1000)
 
 
+@pytest.mark.parametrize("number", [2, 5])
+def test_nothing_is_missing_up_to_a_number_that_was_damaged(number: int) -> None:
+    """A recording would be called incomplete by 2^62 messages that never existed."""
+    check = check_of(0, 1, 2**62)
+    check.correct(number)
+    check.add(number + 1, 4)
+    assert (check.num_lost, check.num_gaps, check.num_implausible) == (number - 2, number > 2, 1)
+    check.add(2, 3)
+    assert (check.num_lost, check.num_gaps) == (max(number - 3, 0), number > 3)
+
+
+def test_a_late_message_takes_no_memory_for_all_numbers_up_to_a_damaged_one() -> None:
+    """They can be 2^62, and the subscriber would end with MemoryError, or without memory."""
+    check = check_of(5, 7, 2**62, 6, 7, 8, 10, 9, utimes=(0, 2, 3, 1, 2, 4, 6, 5))
+    assert check.num_late == 1
+
+
 def test_two_runs_of_one_message_each_are_told_apart() -> None:
     """Events are rare: a gateway may restart after its first one."""
     check = check_of(0, 0, 2, utimes=(1, 2, 3))

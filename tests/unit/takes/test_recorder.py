@@ -8,9 +8,9 @@ import pytest
 import rtc3d
 
 from gateway.client import reception
-from gateway.client.completion import GRACE_S
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.reception import MAX_SOURCES
+from gateway.client.request_timing import GRACE_S
 from gateway.client.sources import FINGERPRINTS
 from gateway.errors import TakeError
 from gateway.messages.decode import decode
