@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from tests.support.source_texts import scopes, texts, with_values
+from tests.support.source_texts import Sources, texts, with_values
 
 _EVENT_LOGS: Final = {"events", "_events"}
 """Their second argument is the text."""
@@ -73,14 +73,15 @@ def messages(package: Path) -> list[Message]:
     """Return each message that can be logged at WARNING and above, in the order of the source code."""
     found: dict[str, Message] = {}
     modules = {path: _parsed(path) for path in sorted(package.rglob("*.py"))}
+    sources = Sources(list(modules.values()))
     for path, module in modules.items():
         if path.relative_to(package).parts[0].removesuffix(".py") in _PRINTING_PACKAGES:
             continue
         if path.name in _PRINTING_MODULES:
             continue
-        for scope in scopes(module):
-            for node in chain(_logging_calls(scope), _problems(scope)):
-                for text in _texts_of(node, scope, module, list(modules.values())):
+        for scope in sources.scopes(module):
+            for node in chain(_logging_calls(scope, sources), _problems(scope, sources)):
+                for text in _texts_of(node, scope, module, sources):
                     new = Message(text, _level(node), f"{path.relative_to(package)}:{node.lineno}")
                     former = found.setdefault(text, new)
                     if new.level == "ERROR" != former.level:
@@ -105,9 +106,7 @@ def _is_sentence(text: str) -> bool:
     return " " in words.strip() and re.search("[a-z]{3}", words) is not None and text.count("<…>") < 2
 
 
-def _texts_of(
-    node: ast.expr, scope: ast.AST, module: ast.Module, modules: Sequence[ast.Module]
-) -> Iterator[str]:
+def _texts_of(node: ast.expr, scope: ast.AST, module: ast.Module, sources: Sources) -> Iterator[str]:
     """Yield the texts of a call that logs, or of a problem, with placeholders."""
     arguments: Sequence[ast.expr] = [node]
     keywords: list[ast.expr] = []
@@ -116,7 +115,7 @@ def _texts_of(
         keywords = [keyword.value for keyword in node.keywords if keyword.arg in _KEYWORDS]
     has_text = False
     for index, argument in enumerate([*arguments, *keywords]):
-        for text in texts(argument, scope, module, modules):
+        for text in texts(argument, scope, module, sources):
             filled = with_values(text, arguments[index + 1 :])
             if _is_sentence(filled):
                 yield filled
@@ -164,8 +163,8 @@ def _arguments(call: ast.Call) -> Sequence[ast.expr]:
     return arguments
 
 
-def _logging_calls(scope: ast.AST) -> Iterator[ast.Call]:
-    return (node for node in ast.walk(scope) if isinstance(node, ast.Call) and _is_loud(node))
+def _logging_calls(scope: ast.AST, sources: Sources) -> Iterator[ast.Call]:
+    return (node for node in sources.nodes(scope) if isinstance(node, ast.Call) and _is_loud(node))
 
 
 def _is_loud(call: ast.Call) -> bool:
@@ -183,11 +182,13 @@ def _is_loud(call: ast.Call) -> bool:
     return False
 
 
-def _problems(scope: ast.AST) -> Iterator[ast.expr]:
+def _problems(scope: ast.AST, sources: Sources) -> Iterator[ast.expr]:
     """Yield what the health names: what attributes ``problem`` are set to, and what such functions return."""
-    for node in ast.walk(scope):
+    for node in sources.nodes(scope):
         match node:
             case ast.Assign(targets=[ast.Attribute(attr=name)], value=value) if name.strip("_") in _PROBLEMS:
                 yield value
     if isinstance(scope, ast.FunctionDef) and scope.name.strip("_") in _PROBLEMS:
-        yield from (node.value for node in ast.walk(scope) if isinstance(node, ast.Return) and node.value)
+        yield from (
+            node.value for node in sources.nodes(scope) if isinstance(node, ast.Return) and node.value
+        )

@@ -2,8 +2,8 @@
 
 import ast
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from typing import Final
 
 _TRANSPARENT_CALLS: Final = {
@@ -50,14 +50,39 @@ _MOST_NESTED: Final = 3
 """Limits of what replaces a placeholder: texts in one f-string, and f-strings within each other."""
 
 
-def scopes(module: ast.Module) -> Iterator[ast.AST]:
-    """Yield the functions, and the assignments outside functions."""
-    for node in ast.walk(module):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield node
-    for node in module.body:
-        if isinstance(node, ast.Assign | ast.AnnAssign):
-            yield node
+class Sources:
+    """Modules in which texts are looked up thousands of times: each syntax tree is walked only once."""
+
+    def __init__(self, modules: Sequence[ast.Module]) -> None:
+        self.constants: defaultdict[str, list[ast.expr]] = defaultdict(list)
+        """The values of constants, such as ``CLOSED: Final = "…"``, in all modules, by name."""
+        self.functions: defaultdict[str, list[ast.FunctionDef]] = defaultdict(list)
+        """The functions outside classes, in all modules, by name."""
+        self._nodes: dict[ast.AST, list[ast.AST]] = {}
+        self._scopes: dict[ast.Module, list[ast.AST]] = {}
+        for module in modules:
+            for statement in module.body:
+                match statement:
+                    case ast.AnnAssign(target=ast.Name(name), value=ast.expr() as value):
+                        self.constants[name].append(value)
+                    case ast.FunctionDef(name):
+                        self.functions[name].append(statement)
+
+    def nodes(self, scope: ast.AST) -> list[ast.AST]:
+        """Return what ``ast.walk`` yields."""
+        if scope not in self._nodes:
+            self._nodes[scope] = list(ast.walk(scope))
+        return self._nodes[scope]
+
+    def scopes(self, module: ast.Module) -> list[ast.AST]:
+        """Return the functions, and the assignments outside functions."""
+        if module not in self._scopes:
+            functions = (ast.FunctionDef, ast.AsyncFunctionDef)
+            self._scopes[module] = [
+                *(node for node in self.nodes(module) if isinstance(node, functions)),
+                *(node for node in module.body if isinstance(node, ast.Assign | ast.AnnAssign)),
+            ]
+        return self._scopes[module]
 
 
 def with_values(text: str, values: Sequence[ast.expr]) -> str:
@@ -70,7 +95,7 @@ def texts(
     node: ast.expr,
     scope: ast.AST,
     module: ast.Module,
-    modules: Sequence[ast.Module],
+    sources: Sources,
     outer: frozenset[ast.expr] = frozenset(),
 ) -> Iterator[str]:
     """Yield each text that ``node`` can have, following names and calls to literals.
@@ -87,13 +112,13 @@ def texts(
             case ast.Constant(str(text)):
                 yield text
             case ast.JoinedStr():
-                yield from _filled(node, scope, module, modules, outer | {node})
+                yield from _filled(node, scope, module, sources, outer | {node})
             case _:
-                pending += _values(node, scope, module, modules)
+                pending += _values(node, scope, module, sources)
 
 
 def _values(
-    node: ast.expr, scope: ast.AST, module: ast.Module, modules: Sequence[ast.Module]
+    node: ast.expr, scope: ast.AST, module: ast.Module, sources: Sources
 ) -> Iterator[tuple[ast.expr, ast.AST]]:
     """Yield the expressions that ``node`` can have the value of, each with the function that it is in."""
     match node:
@@ -102,23 +127,23 @@ def _values(
         case ast.IfExp(body=body, orelse=orelse):
             yield from ((body, scope), (orelse, scope))
         case ast.Name(name):
-            yield from ((value, scope) for value in _assigned(name, scope, ast.Name))
-            yield from ((value, scope) for value in _constants(name, module, modules))
-            yield from _passed(name, scope, module)
+            yield from ((value, scope) for value in _assigned(name, scope, sources, ast.Name))
+            yield from ((value, scope) for value in _constants(name, module, sources))
+            yield from _passed(name, scope, module, sources)
         case ast.Attribute(attr=name):
-            for where in scopes(module):
-                yield from ((value, where) for value in _assigned(name, where, ast.Attribute))
+            for where in sources.scopes(module):
+                yield from ((value, where) for value in _assigned(name, where, sources, ast.Attribute))
         case ast.Call(func=ast.Name("safe_text"), args=[text, *_]):
             yield text, scope
         case ast.Call(func=ast.Name(name)):
-            yield from _returned(name, modules)
+            yield from _returned(name, sources)
 
 
 def _filled(
     text: ast.JoinedStr,
     scope: ast.AST,
     module: ast.Module,
-    modules: Sequence[ast.Module],
+    sources: Sources,
     outer: frozenset[ast.expr],
 ) -> list[str]:
     """Return an f-string with placeholders; one for each combination of texts that its values can be."""
@@ -130,7 +155,7 @@ def _filled(
             case ast.FormattedValue(value=value, conversion=conversion):
                 choices = []
                 if len(outer) <= _MOST_NESTED and conversion != ord("r"):
-                    choices = list(dict.fromkeys(texts(value, scope, module, modules, outer)))
+                    choices = list(dict.fromkeys(texts(value, scope, module, sources, outer)))
                 choices = _choices(choices, value)
                 if not choices or len(variants) * len(choices) > _MOST_VARIANTS:
                     choices = [f"'{_placeholder(value)}'" if conversion == ord("r") else _placeholder(value)]
@@ -152,7 +177,9 @@ def _choices(candidates: Sequence[str], value: ast.expr) -> list[str]:
     return [" or ".join(sorted(found))] if are_words else []  # "answer or acknowledge"
 
 
-def _passed(name: str, scope: ast.AST, module: ast.Module) -> Iterator[tuple[ast.expr, ast.AST]]:
+def _passed(
+    name: str, scope: ast.AST, module: ast.Module, sources: Sources
+) -> Iterator[tuple[ast.expr, ast.AST]]:
     """Yield what calls in the module pass for a parameter of the function ``scope``."""
     if not isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef):
         return
@@ -160,8 +187,8 @@ def _passed(name: str, scope: ast.AST, module: ast.Module) -> Iterator[tuple[ast
     if name not in parameters:
         return
     index = parameters.index(name)
-    for caller in scopes(module):
-        for node in ast.walk(caller):
+    for caller in sources.scopes(module):
+        for node in sources.nodes(caller):
             match node:
                 case ast.Call(func=ast.Name(function) | ast.Attribute(attr=function), args=arguments) if (
                     function == scope.name and len(arguments) > index
@@ -218,9 +245,11 @@ def _telling_part(node: ast.expr) -> ast.expr | None:
     return next((part for part in parts if isinstance(part, ast.expr)), None)
 
 
-def _assigned(name: str, scope: ast.AST, kind: type[ast.Name] | type[ast.Attribute]) -> Iterator[ast.expr]:
+def _assigned(
+    name: str, scope: ast.AST, sources: Sources, kind: type[ast.Name] | type[ast.Attribute]
+) -> Iterator[ast.expr]:
     """Yield the values that are assigned to a variable or an attribute."""
-    for node in ast.walk(scope):
+    for node in sources.nodes(scope):
         match node:
             case ast.Assign(targets=targets, value=value):
                 for target in targets:
@@ -230,24 +259,23 @@ def _assigned(name: str, scope: ast.AST, kind: type[ast.Name] | type[ast.Attribu
                                 yield value
 
 
-def _constants(name: str, module: ast.Module, modules: Sequence[ast.Module]) -> Iterator[ast.expr]:
-    """Yield the value of a constant, such as ``CLOSED: Final = "…"``, of the module or else of any other."""
-    for where in ([module], modules):
-        found = [
-            statement.value
-            for statement in chain.from_iterable(each.body for each in where)
-            if isinstance(statement, ast.AnnAssign) and statement.value is not None
-            if isinstance(statement.target, ast.Name) and statement.target.id == name
-        ]
-        if found or name.startswith("_"):
-            yield from found
-            return
+def _constants(name: str, module: ast.Module, sources: Sources) -> Iterator[ast.expr]:
+    """Yield the value of a constant of the module or else of any other."""
+    own = [
+        statement.value
+        for statement in module.body
+        if isinstance(statement, ast.AnnAssign) and statement.value is not None
+        if isinstance(statement.target, ast.Name) and statement.target.id == name
+    ]
+    if own or name.startswith("_"):
+        yield from own
+    else:
+        yield from sources.constants[name]
 
 
-def _returned(name: str, modules: Sequence[ast.Module]) -> Iterator[tuple[ast.expr, ast.AST]]:
+def _returned(name: str, sources: Sources) -> Iterator[tuple[ast.expr, ast.AST]]:
     """Yield the values that a function returns, in any module."""
-    for function in chain.from_iterable(module.body for module in modules):
-        if isinstance(function, ast.FunctionDef) and function.name == name:
-            for node in ast.walk(function):
-                if isinstance(node, ast.Return) and node.value is not None:
-                    yield node.value, function
+    for function in sources.functions[name]:
+        for node in sources.nodes(function):
+            if isinstance(node, ast.Return) and node.value is not None:
+                yield node.value, function
