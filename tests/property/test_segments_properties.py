@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from gateway.errors import QueryError
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.segments import Save
+from tests.support.examples import examples
 from tests.unit.outputs.takes.test_segments import Rolling, numbers
 
 KEEP_S = 30.0
@@ -123,7 +124,7 @@ ACTIONS = st.tuples(
 )
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.lists(ACTIONS, min_size=5, max_size=25))
 def test_segments_keep_and_save_what_a_list_would(actions: list[tuple[str, int]]) -> None:
     """The last seconds before a fall must be there, complete, or counted as lost."""

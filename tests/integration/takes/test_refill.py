@@ -2,6 +2,7 @@
 
 import os
 import signal
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -65,13 +66,22 @@ def test_a_recorder_on_lcm_that_stands_still_loses_nothing(tmp_path: Path) -> No
 TRIAL = (MARKERS, *(f"MOCAP_LAB_1_{name}" for name in ("6D", "ANALOG", "FORCE", "6D_TOOL_1", "6D_TOOL_2")))
 
 
-@pytest.mark.parametrize("waits", [True, False], ids=["has caught up", "ends at once"])
+@pytest.mark.parametrize(
+    ("side", "waits"),
+    [("zenoh", True), ("zenoh", False), ("lcm", True)],
+    ids=["zenoh, has caught up", "zenoh, ends at once", "lcm, has caught up"],
+)
 def test_a_short_trial_after_a_restart_of_the_gateway_is_not_lacking_unsaid(
-    tmp_path: Path, *, waits: bool
+    tmp_path: Path, side: str, *, waits: bool
 ) -> None:
-    """Nothing arrives live of its keys: the recorder stands still until the server has ended."""
+    """Little or nothing arrives live: the recorder stands still until the server has ended."""
     path = tmp_path / "walk.lcmlog"
-    with lab(tmp_path) as gateway, recording(path, *gateway.options) as record:
+    with ExitStack() as stack:
+        gateway = stack.enter_context(lab(tmp_path, side))
+        options = gateway.options
+        if side == "lcm":
+            options = (*options[:-1], f"{options[-1]}&recv_buf_size=60000")
+        record = stack.enter_context(recording(path, *options))
         wait_until_it_hears_everything(path)
         os.kill(record.process.pid, signal.SIGSTOP)
         gateway.restart()

@@ -18,6 +18,7 @@ from gateway.client.history_requests import HistoryAnswer, HistoryRequest
 from gateway.messages.encode import PREFIX
 from gateway.messages.history import sequence_of, utime_of
 from gateway.messages.sequence_check import SequenceCheck
+from tests.support.examples import examples
 
 _ID: Final = slice(8 + PREFIX.size, None)
 _STEP_US: Final = 1000
@@ -225,7 +226,7 @@ def schedules(*events: str) -> st.SearchStrategy[list[str]]:
     return st.lists(st.sampled_from(events), max_size=50)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.one_of(schedules(*USUAL, *ASKING, *RESTARTS), schedules(*USUAL, *ASKING, *RESTARTS, *FALSE)),
     st.sampled_from([10**9, 10**9, 15, 3]),
@@ -240,7 +241,7 @@ def test_nothing_comes_twice_and_what_is_called_complete_is(
         assert not world.missing()
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(schedules(*USUAL, *ASKING, *RESTARTS), st.sampled_from([10**9, 1000]))
 def test_what_is_published_since_a_restart_comes(events: list[str], limit: int) -> None:
     """Also of a key of which nothing arrives after it, and while the program has no room."""
@@ -266,7 +267,7 @@ def played(events: list[str], window: int, limit: int, *, is_in_order: bool = Tr
     return world
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(schedules(*USUAL, *ASKING, *FALSE), st.sampled_from([10**9, 1000]))
 def test_without_a_restart_false_numbers_change_nothing(events: list[str], limit: int) -> None:
     """No loss is reported that was none, and no message comes from the past."""

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from gateway.client import live_join
 from gateway.client.live_join import MAX_WAIT_S, Join
+from tests.support.examples import examples
 
 
 @dataclass
@@ -73,7 +74,7 @@ EVENTS = st.lists(
 )
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(EVENTS)
 def test_each_frame_is_given_once_and_in_order_or_counted(events: list[str]) -> None:
     """A plain model: every frame is either given, given with another, still waiting, or dropped."""
