@@ -17,6 +17,7 @@ from rich.text import Text
 
 from gateway.display.terminal import keys
 from gateway.logs.safe_text import safe_text
+from gateway.outputs.findings import counted
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.replay.play_list import Selection, take_length_us
@@ -156,9 +157,15 @@ def _notes(player: Player, publication: Publication, reader: TakeReader) -> Iter
             f"{reader.unknown.total():,} messages of other programs or versions were left out, on "
             f"{', '.join(channels)}{more}"
         )
+    yield from _file_notes(reader)
+
+
+def _file_notes(reader: TakeReader) -> Iterator[str]:
+    for source in reader.cut_off_sources():
+        yield f"INCOMPLETE: the recording of {safe_text(source)} was cut off, so its end is missing"
     for log in reader.logs:
         if log.damaged_bytes:
-            places = f"{log.num_damaged:,} places"
+            places = counted(log.num_damaged, "place")
             yield f"{log.path} is damaged: {log.damaged_bytes:,} bytes in {places} were left out"
     for problem in reader.empty_files.values():
         yield f"left out: {safe_text(problem)}"

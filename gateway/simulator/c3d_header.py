@@ -68,6 +68,16 @@ def corrections(head: bytes) -> list[Correction]:
     return [*corrector.of_rates(header), *corrector.of_counts(header), *corrector.of_scale(header)]
 
 
+def stated_frames(head: bytes) -> int | None:
+    """Return how many frames the header says that the file has; None if it does not say.
+
+    ``head`` is as for ``corrections``.
+    """
+    order = ">" if head[parameters_start(head) + 3] == BIG_ENDIAN else "<"
+    first, last = struct.unpack_from(f"{order}2H", head, 6)
+    return last - first + 1 if 0 < first <= last < _NO_NUMBER else None
+
+
 class _Corrector:
     """Compares the parameters in ``head`` with the header."""
 

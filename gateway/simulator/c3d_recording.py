@@ -33,7 +33,7 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d_server.scene import NO_EVENTS
 from gateway.simulator.bodies import force_channels
-from gateway.simulator.c3d_header import Correction, corrections
+from gateway.simulator.c3d_header import Correction, corrections, stated_frames
 
 _log = logging.getLogger(__name__)
 _ITEM_TEXTS: Final = ("LABELS", "DESCRIPTIONS")
@@ -71,6 +71,7 @@ def load_recording(path: Path) -> C3dRecording:
         content = _read(path, _corrected_copy(file, found) if found else path)
     try:
         recording = _convert(path, content, head)
+        _report_missing_frames(path, recording, stated_frames(head) if is_possible else None)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise TakeError(
             f"{path} lacks required C3D data ({type(error).__name__}: {error}); "
@@ -81,6 +82,13 @@ def load_recording(path: Path) -> C3dRecording:
     if min(*recording.rates_hz.values(), recording.measurement_rate_hz) <= 0:
         raise TakeError(f"{path} has no rate for its data (POINT:RATE, ANALOG:RATE); export it again")
     return recording
+
+
+def _report_missing_frames(path: Path, recording: C3dRecording, stated: int | None) -> None:
+    """Log that the file has fewer frames than its header ``stated``: somebody has not copied all of it."""
+    points = recording.items.get(ComponentType.MARKERS)
+    if stated is not None and points is not None and len(points) < stated:
+        _log.warning("%s is cut off: it has %d of its %d frames", path, len(points), stated)
 
 
 def _corrected_copy(file: BinaryIO, found: Sequence[Correction]) -> Path:

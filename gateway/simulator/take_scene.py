@@ -94,6 +94,9 @@ class TakeScene:
                 "numbers of items and the rates of the first frames, and numbers as labels",
                 *(safe_text(str(path)), safe_text(self._source)),
             )
+        if self._source in self._reader.cut_off_sources():
+            text = "%s is not complete: the recording of %s was cut off, so its end is missing"
+            _log.warning(text, *(safe_text(str(path)), safe_text(self._source)))
         for moment in preview:
             if not moment.parameters.xml:
                 moment.parameters = self._default

@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import math
 import stat
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
 from gateway.messages.topics import unique_name
+from gateway.takes.files.description import has_end
 from gateway.takes.files.event_log import Event, EventColumns, EventLogReader
 from gateway.takes.files.new_file import by_number
 
@@ -124,6 +125,10 @@ class TakeMessage(NamedTuple):
     message: bytes
 
 
+_END_BYTES: Final = 4096
+"""How much of the end of a file is searched for its ``take_end_t``."""
+
+
 class Place(NamedTuple):
     """Where an event begins: the number of the file in ``TakeReader.logs``, and the offset in it in bytes."""
 
@@ -189,6 +194,17 @@ class TakeReader:
                     utimes.append(utime)
                 described.add(channel)
         return min(utimes)
+
+    def cut_off_sources(self) -> list[str]:
+        """Return the sources of files that were not ended in order, by their first and their last events."""
+        names: dict[str, None] = {}
+        for log in self.logs:
+            with contextlib.suppress(OSError, ProtocolError, StopIteration, TakeError):
+                first = next(EventLogReader(log.path).events())
+                if _type_of(first) is rtc3d.take_t and not _has_ended(log.path):
+                    take = decode(first.message)
+                    names |= {take.source: None} if has_end(take) else {}
+        return [*names]
 
     @property
     def num_bytes(self) -> int:
@@ -359,6 +375,24 @@ class TakeReader:
                     route = self._names.source(channel.rpartition("_")[0]), _KEYS[kind]
             self._routes[identity] = route
         return self._routes[identity]
+
+
+def _has_ended(path: Path) -> bool:
+    """Return whether the last event of a file is a ``take_end_t``. Raises OSError."""
+    first_byte = max(0, path.stat().st_size - _END_BYTES)
+    try:
+        last = deque(EventLogReader(path).events(first_byte), maxlen=1)
+    except TakeError:  # there is no event in these bytes
+        return False
+    return bool(last) and _type_of(last[0]) is rtc3d.take_end_t
+
+
+def _type_of(event: Event) -> type[Any] | None:
+    """Return the type of an event's message; None if it is none of a gateway's."""
+    try:
+        return message_type(event.message)
+    except ProtocolError:
+        return None
 
 
 def log_paths(path: Path) -> list[Path]:

@@ -21,6 +21,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, Tool
 from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.takes.files.description import SourceDescription
 from gateway.takes.replay.replay import lcm_destination, require_silence
 from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.support.commands import run_in_process
@@ -239,6 +240,15 @@ def test_what_is_left_out_of_a_bad_take_is_reported(tmp_path: Path) -> None:
         ended = run_in_process("replay", tmp_path / name, "--lcm", "--url", "memq://", "--rate", "max")
         assert ended.returncode == status, ended.stderr
         assert [text for text in texts if text not in ended.stderr] == []
+
+
+def test_the_replay_of_a_take_that_was_cut_off_says_so(tmp_path: Path) -> None:
+    about = SourceDescription("lab", "MOCAP_LAB")
+    begin = [(channel.decode(), message) for channel, message in about.beginning("walk", START_UTIME)]
+    path = write_take(tmp_path / "walk.lcmlog", begin + some_messages(frames=20)[2:])
+    ended = run_in_process("replay", path, "--lcm", "--url", "memq://", "--rate", "max")
+    assert ended.returncode == 0, ended.stderr
+    assert "INCOMPLETE" in ended.stderr
 
 
 @pytest.mark.parametrize(

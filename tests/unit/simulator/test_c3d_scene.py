@@ -412,8 +412,10 @@ def test_the_error_about_an_invalid_file_names_it(path: Path, content: bytes | N
         C3dScene(path.parent)
 
 
-def test_a_file_cut_short_before_its_data_is_refused_and_one_cut_in_it_plays_up_to_there(path: Path) -> None:
-    """ezc3d would read beyond the end."""
+def test_a_file_cut_short_before_its_data_is_refused_and_one_cut_in_it_plays_up_to_there(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """ezc3d would read beyond the end, and says nothing about frames that are missing."""
     whole = path.read_bytes()
     for length in (1, 100, 511, 512, 600, 1000, 1500):
         path.write_bytes(whole[:length])
@@ -421,6 +423,7 @@ def test_a_file_cut_short_before_its_data_is_refused_and_one_cut_in_it_plays_up_
             C3dScene(path)
     path.write_bytes(whole[:-600])
     assert C3dScene(path).num_frames == 4
+    assert names(caplog.text, "4 of its 5", path)
 
 
 def test_a_file_with_an_impossible_size_is_refused_before_it_is_read(path: Path) -> None:

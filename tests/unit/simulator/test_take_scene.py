@@ -17,6 +17,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
 from gateway.rtc3d_server.scene import NOT_YET_US
 from gateway.simulator.take_frames import RecordedFrames
 from gateway.simulator.take_scene import TakeScene
+from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.event_log import SYNC
 from tests.support.errors import raises
 from tests.support.records import levels, logged
@@ -222,6 +223,16 @@ def test_damage_is_left_out_and_reported_once(path: Path, caplog: pytest.LogCapt
     player.scene.stop()
     [record] = logged(caplog)
     assert (record.level, record.args[1], *record.args[3:]) == ("WARNING", 1, 1, 1)
+
+
+def test_a_take_that_was_cut_off_is_reported(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Whoever plays it to others must know that there was more."""
+    about = SourceDescription("lab", "MOCAP_LAB")
+    begin = [(channel.decode(), message) for channel, message in about.beginning("walk", START_UTIME)]
+    write_take(path, begin + take_of(5))
+    TakeScene(path)
+    [record] = logged(caplog)
+    assert (record.level, record.args[1]) == ("WARNING", "lab")
 
 
 def test_a_file_that_cannot_be_read_on_ends_the_take(path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -33,7 +33,16 @@ from gateway.takes.files.series import Series
 from gateway.takes.files.statistics import take_statistics
 from gateway.takes.files.take import TakeSource
 from tests.support.errors import raises
-from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+from tests.support.takes import (
+    START_UTIME,
+    Message,
+    description,
+    encode_event,
+    frame,
+    markers,
+    parameters,
+    write_take,
+)
 
 NAN = math.nan
 PARAMETERS = Parameters(
@@ -313,9 +322,24 @@ def test_a_take_says_what_its_recorder_lacks(
     source = take.sources["lab"]
     assert (source.num_lost, source.is_cut_off, take.was_cut_short) == expected
     assert not open_take(path, to_s=0.05).sources["lab"].is_cut_off  # nobody has looked there
+    assert TakeReader(path).cut_off_sources() == ([] if has_end else ["lab"])
     joined = open_take([recorded(tmp_path, "b", 20), path])
     source = joined.sources["lab"]
     assert (source.num_lost, source.is_cut_off, joined.was_cut_short) == expected
+
+
+def test_a_take_that_ends_within_a_long_message_is_cut_off(tmp_path: Path) -> None:
+    """A disk that is full writes a part of it."""
+    path = recorded(tmp_path, "a", 0, has_end=False)
+    channel, message = markers(1000, 10)
+    path.write_bytes(path.read_bytes() + encode_event(10, START_UTIME, channel.encode(), message)[:-100])
+    assert TakeReader(path).cut_off_sources() == ["lab"]
+
+
+def test_a_take_of_another_recorder_is_not_cut_off(tmp_path: Path) -> None:
+    """lcm-logger writes no end."""
+    reader = TakeReader(write_take(tmp_path / "a.lcmlog", [markers(1, 0)]))
+    assert reader.cut_off_sources() == []
 
 
 @pytest.mark.parametrize("order", ["ab", "ba", "aa", "bab"])
