@@ -20,8 +20,7 @@ from typing import Any, Final
 import lcm
 import zenoh
 
-from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.subscriber import QUEUE_MESSAGES
+from gateway.outputs.lcm.connection import QUEUE_MESSAGES, open_lcm, receiving_url
 from tests.support.networks import wait_for_zenoh
 
 FRAME_COMPONENTS: Final = ("3d", "6d", "analog", "force")

@@ -5,15 +5,16 @@ import shutil
 import socket
 from pathlib import Path
 
-import pytest
-
 
 def need(present: object, reason: str) -> None:
     """Go on if the machine has what the test needs; ``reason`` says what that is and how to get it."""
-    if not present and os.environ.get("CI") == "true":
+    if present:
+        return
+    import pytest  # noqa: PLC0415 - it takes long to import, and many processes that tests start import this file
+
+    if os.environ.get("CI") == "true":
         pytest.fail(f"CI must not skip this: {reason}", pytrace=False)
-    if not present:
-        pytest.skip(reason)
+    pytest.skip(reason)
 
 
 def need_programs(*names: str, packages: str) -> None:

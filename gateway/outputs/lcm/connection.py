@@ -34,6 +34,9 @@ _RMEM_MAX: Final = Path("/proc/sys/net/core/rmem_max")
 _SEND_BUFFER_BYTES: Final = 4 * 1024 * 1024
 _OPEN_FILES: Final = Path("/proc/self/fd")
 
+QUEUE_MESSAGES: Final = 10_000
+"""Messages that may wait. With LCM's own default, 30, a process that pauses for a moment loses messages."""
+
 BLOCKING_SCHEMES: Final = ("tcpq", "file")
 """Schemes that open and publish synchronously: a peer or disk that stalls blocks the caller."""
 

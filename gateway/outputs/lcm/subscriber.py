@@ -4,21 +4,17 @@ import contextlib
 import logging
 import re
 import threading
-from typing import Final
 
 import lcm
 
 from gateway.logs.failures import FailureLog
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
 from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRequest
-from gateway.outputs.lcm.connection import Waiting, open_lcm, receiving_url, reconnect
+from gateway.outputs.lcm.connection import QUEUE_MESSAGES, Waiting, open_lcm, receiving_url, reconnect
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.requests import is_presence
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.outputs.lcm.settings import LcmSettings, effective_lcm_url
-
-QUEUE_MESSAGES: Final = 10_000
-"""With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""
 
 logger = logging.getLogger(__name__)
 
