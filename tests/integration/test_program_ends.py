@@ -306,6 +306,18 @@ def test_a_program_ends_whatever_ends_it(
         ), errors
 
 
+RECEIVES_IN_A_THREAD: Final = """
+        data = live("lab", **where)
+        def receive():
+            for frame in data:
+                has_come.set()
+        has_come = threading.Event()
+        thread = threading.Thread(target=receive)
+        thread.start()
+        has_come.wait()
+"""
+
+
 def run_to_its_end(
     folder: Path, text: str, transport: str, places: dict[str, str], *options: str, **streams: Any
 ) -> tuple[int, str, str]:
@@ -333,19 +345,11 @@ def test_a_program_ends_by_an_exception_although_a_thread_receives(
 ) -> None:
     """Iterations in other threads end then: one Ctrl-C is enough."""
     text = """
-        data = live("lab", **where)
-        def receive():
-            for frame in data:
-                has_come.set()
-        has_come = threading.Event()
-        thread = threading.Thread(target=receive)
-        thread.start()
-        has_come.wait()
         ready()
         while thread.is_alive():
             thread.join(0.1)  # Python does not see a Ctrl-C that comes just before it waits
     """
-    process = started(tmp_path, text, "zenoh", places)
+    process = started(tmp_path, RECEIVES_IN_A_THREAD + text, "zenoh", places)
     status, _, errors = ended(process, interrupt=True)
     assert (status, exceptions(errors)) == (-signal.SIGINT, ["KeyboardInterrupt"])
 
@@ -355,14 +359,6 @@ def test_a_program_that_catches_ctrl_c_ends_although_it_joined_a_thread_that_rec
 ) -> None:
     """Python takes a thread as stopped when Ctrl-C interrupts its join, and does not wait for it again."""
     text = """
-        data = live("lab", **where)
-        def receive():
-            for frame in data:
-                has_come.set()
-        has_come = threading.Event()
-        thread = threading.Thread(target=receive)
-        thread.start()
-        has_come.wait()
         def interrupt():
             while thread.is_alive():
                 time.sleep(0.1)  # it may come just before Python waits
@@ -374,7 +370,7 @@ def test_a_program_that_catches_ctrl_c_ends_although_it_joined_a_thread_that_rec
         except KeyboardInterrupt:
             ready()
     """
-    status, output, errors = run_to_its_end(tmp_path, text, "zenoh", places)
+    status, output, errors = run_to_its_end(tmp_path, RECEIVES_IN_A_THREAD + text, "zenoh", places)
     assert (status, output, exceptions(errors)) == (0, "ready\n", []), errors
 
 
