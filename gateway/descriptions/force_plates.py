@@ -252,6 +252,9 @@ def force_on(plate: PlacedPlate, load: tuple[float, ...]) -> PlateForce | None:
 
     The moments are about the centre of the surface. The force F acts at n × M / (n · F) from there, where n
     is the normal: about this point, the moment has no component within the surface.
+
+    Either sign counts, and a single sample: a live view knows neither whether the server sends the force on
+    the plate or that on the person, nor what follows. Exports for OpenSim find both in the whole take.
     """
     fx, fy, fz, mx, my, mz = load
     nx, ny, nz = plate.normal

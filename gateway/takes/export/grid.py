@@ -73,9 +73,9 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     """Return the places of a run's frames, in several grids if there are gaps of more than 10 s.
 
     The row of a frame is what its number says, as long as the time stamps agree; otherwise, it is the time
-    since the first one, divided by the period and rounded: no error adds up. The period is
-    that of the time stamps, so a server's clock that is a little fast or slow leaves no rows empty. If the
-    time stamps do not progress (field note 25), or are not to be used, the sequence numbers place the frames.
+    since the first one, divided by the period and rounded: no error adds up. The period is that of the time
+    stamps, so a server's clock that is a little fast or slow leaves no rows empty. If the time stamps do not
+    progress (field note 25), or are not to be used, the sequence numbers place the frames.
     Frames that come faster than the rate for a while have a grid of their own.
     """
     order = _by_sequence(run.sequence)

@@ -229,7 +229,8 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
 
     names = [f"{name}{axis}" for plan in loads.plans for name in _identifiers(plan) for axis in "xyz"]
     num_rows = _write_table(job, path, loads.samples, names, "", blocks())
-    job.written[loads.samples.measurement.source.name, "force"] += num_rows
+    if loads.samples.placed.series.key == "force":  # and not the plates' channels
+        job.written[loads.samples.measurement.source.name, "force"] += num_rows
 
 
 def _identifiers(plan: PlatePlan) -> tuple[str, str, str]:
