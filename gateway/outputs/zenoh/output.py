@@ -407,6 +407,9 @@ class ZenohOutput(Output):
 
     def _put(self, source: str, put: Callable[..., None], *arguments: Any, **options: Any) -> None:
         """Publish, in the sending thread."""
+        if self._holder.is_clock_wrong:
+            self._losses[source].lost("put failed", str(self._holder.refusal), frames=0)
+            return
         try:
             put(*arguments, **options)
         except zenoh.ZError as error:

@@ -90,7 +90,8 @@ class SessionHolder:
         self._declare = declare
         self._on_link = on_link
         self._on_link_lost = on_link_lost
-        self._is_clock_wrong = False
+        self.is_clock_wrong = False
+        """Whether each put would panic, because Zenoh cannot express the time."""
         self._num_transports = 0
         self._counting = threading.Lock()  # of _num_transports, which several threads of Zenoh change
         self._problem = texts.not_open
@@ -157,8 +158,8 @@ class SessionHolder:
         self._update()
 
     def _update(self) -> None:
-        self._is_clock_wrong = time.time() >= _END_OF_TIME_S
-        self.is_cut_off = self.session is None or self.lacks_router or self._is_clock_wrong
+        self.is_clock_wrong = time.time() >= _END_OF_TIME_S
+        self.is_cut_off = self.session is None or self.lacks_router or self.is_clock_wrong
         self._on_link()
 
     @property
@@ -171,14 +172,14 @@ class SessionHolder:
         """Whether messages can be sent, and if not, what to do."""
         if self.session is None:
             return OutputHealth(False, self._problem)
-        if self._is_clock_wrong:
+        if self.is_clock_wrong:
             return OutputHealth(False, _WRONG_CLOCK)
         return OutputHealth(False, self._texts.no_router) if self.lacks_router else _HEALTHY
 
     @property
     def refusal(self) -> OutputError:
         """The error for a message that cannot be sent."""
-        if self.session is not None and self._is_clock_wrong:
+        if self.session is not None and self.is_clock_wrong:
             return OutputError(_WRONG_CLOCK, cause="put failed")
         if self.session is not None and self.lacks_router:
             return OutputError(self._texts.no_router, cause="no router")

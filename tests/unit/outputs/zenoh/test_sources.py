@@ -3,6 +3,7 @@
 import asyncio
 import json
 import logging
+import time
 from pathlib import Path
 from typing import Any
 
@@ -262,3 +263,15 @@ async def test_what_zenoh_does_not_publish_is_counted_and_logged(
     await late.stop()
     text = "lab, zenoh: Zenoh did not take parameters or an announcement: session closed"
     assert caplog.messages == [text]
+
+
+async def test_parameters_at_a_time_that_zenoh_cannot_express_are_lost_and_no_defect(
+    lab: QueriedLab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh would panic, and the log would ask the user to report that."""
+    monkeypatch.setattr(time, "time", lambda: 2.0**32)
+    lab.output.maintain()
+    arrived = lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
+    assert arrived is not None
+    await arrived
+    assert lab.lost == {"put failed": (1, 0)}
