@@ -6,11 +6,13 @@ A daemon thread that closes it may return from Zenoh during Python's shutdown, w
 """
 
 import atexit
+import contextlib
 import os
 import sys
 import threading
 import traceback
 import weakref
+from concurrent.futures import thread as _thread_pools  # noqa: F401 - what it registers must run after ours
 from typing import Any, Final, Protocol, TypeVar
 
 from gateway.errors import ForkError
@@ -49,6 +51,11 @@ class _OpenObjects:
             if self._closer is None:
                 self._closer = threading.Thread(target=self._close_at_end, name="close-at-end", daemon=False)
                 self._closer.start()
+                # Pools wait for their threads before the main thread counts as ended.
+                register = getattr(threading, "_register_atexit", None)
+                if register is not None:
+                    with contextlib.suppress(RuntimeError):  # the program is already ending
+                        register(self._close_after_exception)
 
     def close(self) -> None:
         """Close everything, the newest first."""
@@ -63,9 +70,13 @@ class _OpenObjects:
                 except Exception:  # noqa: BLE001 - the others must be closed nevertheless
                     traceback.print_exc()
 
+    def _close_after_exception(self) -> None:
+        if _has_raised():
+            self.close()
+
     def _close_at_end(self) -> None:
         threading.main_thread().join()
-        if getattr(sys, "last_type", None) is None:  # no exception has ended the program
+        if not _has_raised():
             self._join_others()
         self.close()
         for thread in threading.enumerate():
@@ -89,6 +100,11 @@ class _OpenObjects:
         self._lock = threading.Lock()
         self._opened = []
         self._closer = None
+
+
+def _has_raised() -> bool:
+    """Whether an exception, such as that of Ctrl-C, has ended the main thread."""
+    return getattr(sys, "last_type", None) is not None
 
 
 _open_objects: Final = _OpenObjects()

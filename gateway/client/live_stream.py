@@ -227,6 +227,7 @@ class Live:
     def __iter__(self) -> Iterator[Frame]:
         self._start_queueing()
         while not self._is_closed:
+            self._check_process()  # what waits here came for the parent
             if self._ready:
                 with contextlib.suppress(IndexError):  # another thread was faster
                     yield self._ready.popleft()
@@ -241,6 +242,7 @@ class Live:
         await asyncio.to_thread(self._start_queueing)
         loop = asyncio.get_running_loop()
         while not self._is_closed:
+            self._check_process()  # what waits here came for the parent
             if self._ready:
                 with contextlib.suppress(IndexError):  # another thread was faster
                     yield self._ready.popleft()

@@ -150,6 +150,24 @@ USES: Final = {
             END
         thread.join()
     """,
+    "a thread of a pool": """
+        from concurrent.futures import ThreadPoolExecutor
+        data = live("lab", **where)
+        def receive():
+            for frame in data:
+                has_come.set()
+                if is_over:
+                    break
+        has_come, is_over = threading.Event(), False
+        pool = ThreadPoolExecutor()
+        future = pool.submit(receive)
+        has_come.wait()
+        ready()
+        for _ in range(1):
+            is_over = ENDS_BY_ITSELF
+            END
+        future.result()
+    """,
 }
 """Programs, by the way in which they receive. END is a statement in a loop, after the first frame."""
 
@@ -451,6 +469,8 @@ def test_a_fork_is_refused_what_would_never_get_anything(
                 ("data.client.sources()", "data.client.takes()"),
             )
         ),
+        # The first answer of the history has several messages: those after the first wait in the program.
+        ("data = live('lab', last_s=1, **where); frames = iter(data); next(frames)", "next(frames)", 7),
         ("data = live('lab', **where); next(iter(data))", "data.close()", 0),
     ]
     texts = {
