@@ -43,6 +43,8 @@ class Completion:
 
     A restart of the gateway is believed only if the history no longer has the last known message. A message
     whose number the history does not know was damaged, or is of another program, and is left out.
+
+    Gateways publish a key that ``is_steady`` all the time: one that has nothing of it has just been started.
     """
 
     def __init__(
@@ -51,6 +53,8 @@ class Completion:
         check: SequenceCheck,
         held_bytes: HeldBytes,
         completeness: Completeness = COMPLETE,
+        *,
+        is_steady: bool = False,
     ) -> None:
         self.problem = ""
         """Why gaps are not filled now; "" if they are."""
@@ -60,6 +64,7 @@ class Completion:
         """In how many places it is not known whether messages are missing."""
         is_past = completeness.last_s is not None
         self._fills_gaps = completeness.is_complete
+        self._is_steady = is_steady
         self._state = State.BEGINNING if self._fills_gaps or is_past else State.PASSING
         self._end = End.OPEN
         self._delivery = Delivery(hand_on, check, held_bytes)
@@ -332,6 +337,8 @@ class Completion:
             if is_over and code == "no-gateway":
                 self._timing.note_nobody()
         elif code == "nothing-yet":
+            if self._is_steady and self._end is not End.OPEN and self._delivery.reached is not None:
+                self.unknown[Unknown.RESTART] += 1
             self._give_up(now_s, knows_end=True)
         else:
             if self._end is not End.OPEN:

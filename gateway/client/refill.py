@@ -104,7 +104,9 @@ class Refill:
 
     def add(self, series: Series, hand_on: Callable[[bytes], object]) -> Completion:
         """Return what completes a series, which hands its messages on."""
-        completion = Completion(hand_on, series.check, self._held_bytes, self.completeness)
+        completion = Completion(
+            *(hand_on, series.check, self._held_bytes, self.completeness), is_steady=series.key == "status"
+        )
         self._completions[series] = completion
         return completion
 

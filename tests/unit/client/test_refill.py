@@ -3,11 +3,13 @@
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
 
+from gateway.client.completion_states import Unknown
 from gateway.client.history_requests import COMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.refill import END_S, KeptSeries, Refill
 from gateway.client.request_timing import NOBODY_S, PATIENCE_S
@@ -32,6 +34,8 @@ class Source:
 
 class Series:
     """The series of a subscriber that the refill needs to know."""
+
+    key = "status"
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -176,3 +180,17 @@ def test_the_end_waits_as_long_as_messages_come(num_answers: int) -> None:
     assert num_answers == 99 or END_S <= clock() - answered_s <= 1.5 * END_S
     subscriber.refill.close()
     answers.release()
+
+
+def test_at_the_end_a_gateway_that_has_no_status_yet_has_been_started_again() -> None:
+    """It publishes one every second. Of events, it may have kept none."""
+    for key, unknown in (("status", Counter({Unknown.RESTART: 1})), ("event", Counter[Unknown]())):
+        subscriber = Subscriber(1, answer_size=100)
+        subscriber.series[0].key = key
+        completion = subscriber.refill.add(subscriber.series[0], subscriber.handed_on.append)
+        with subscriber.lock:
+            completion.receive(message(0), 0, 1000, 1, 0.0)
+            completion.end(1.0)
+            completion.fail(completion.request(), "nothing-yet", "", 1.0)
+        subscriber.refill.close()
+        assert +completion.unknown == unknown
