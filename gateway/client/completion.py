@@ -158,7 +158,8 @@ class Completion:
         delivery, arrived = self._delivery, self._arriving
         arrived.note(sequence, utime, session)
         self._newest_since = max(self._newest_since, sequence)
-        self._timing.wait_for_past(now_s)
+        if self.is_past:
+            self._timing.wait_for_past(now_s)
         if self._state is State.BEGINNING and self._first_request is None:
             delivery.next, self._state = sequence, State.FOLLOWING
             delivery.check.begin_at(sequence)
@@ -173,13 +174,15 @@ class Completion:
         elif sequence == delivery.next:
             delivery.pass_on(sequence, message)
         self._advance(now_s, is_live=True)
-        self.expire(now_s)
+        if self._timing.is_due:
+            self.expire(now_s)
 
     def _advance(self, now_s: float, *, is_live: bool = False) -> None:
         """Hand on what is held and follows, and note when to request what is missing, if it is."""
         delivery = self._delivery
         if self._state in {State.FOLLOWING, State.FILLING}:
-            delivery.pass_on_held()
+            while delivery.next in delivery.arrived.held:
+                delivery.pass_on(delivery.next, delivery.arrived.release(delivery.next))
             # What was lost last, no later message shows: at the end, only the history knows it.
             if delivery.next <= delivery.arrived.until or self._end is End.ENDING:
                 self._state = State.FILLING

@@ -81,11 +81,6 @@ class Delivery:
         self.recent.add(number, utime)
         self.hand_on(message)
 
-    def pass_on_held(self) -> None:
-        """Hand on what is held and comes next."""
-        while self.next in self.arrived.held:
-            self.pass_on(self.next, self.arrived.release(self.next))
-
     def skip_to(self, number: int) -> None:
         """Go on at a number: what is missing before it exists no more."""
         if number > self.next:

@@ -164,14 +164,16 @@ class Refill:
         """After ``end``, wait until nothing is missing, or nothing of it has come for END_S.
 
         A computer that is too busy may need much longer for all of it. As long as messages come, to give up
-        would lose what is there. ``tick`` is called every ``interval_s``.
+        would lose what is there; but not for longer than PATIENCE_S in all. ``tick`` is called every
+        ``interval_s``.
         """
         least, changed_s = self.num_incomplete, self._monotonic()
+        last_s = changed_s + PATIENCE_S
         while (num_incomplete := self.num_incomplete) > 0:
             now_s = self._monotonic()
             if num_incomplete < least:
                 least, changed_s = num_incomplete, now_s
-            if now_s >= max(changed_s, self._helped_s) + END_S:
+            if now_s >= min(max(changed_s, self._helped_s) + END_S, last_s):
                 return
             time.sleep(interval_s)
             tick()

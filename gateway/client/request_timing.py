@@ -132,7 +132,7 @@ class RequestTiming:
 
         As long as nothing waits, a gateway that is busy may take longer.
         """
-        if self.is_past and self._past_until_s == math.inf:
+        if self._past_until_s == math.inf:
             self._past_until_s, self._num_past = now_s + self._patience_s, 0
 
     def end_past(self) -> None:
