@@ -212,7 +212,8 @@ class Refill:
             if completion.due_s == math.inf:
                 return  # it has arrived
             request, reply_s = completion.request(), completion.reply_s(self._monotonic())
-            if self.completeness.is_complete:
+            # At the end, one look is enough: each would find what was published since, without end.
+            if self.completeness.is_complete and not self._is_ending:
                 self._look_s.setdefault(source, self._looked_s.get(source, -math.inf) + _LOOK_S)
         answer: HistoryAnswer | None = None
         code = text = ""

@@ -182,6 +182,31 @@ def test_the_end_waits_as_long_as_messages_come(num_answers: int) -> None:
     answers.release()
 
 
+def test_the_end_comes_though_a_gateway_goes_on_publishing() -> None:
+    clock = Clock()
+    subscriber = Subscriber(1, answer_size=100, monotonic=clock)
+    num_looks = 0
+
+    def find(*_: Any) -> list[KeptSeries]:
+        nonlocal num_looks
+        num_looks += 1
+        newest = 99 + num_looks
+        return [KeptSeries(subscriber.series[0], newest, 1000 + newest)]
+
+    subscriber.refill._find = find
+    with subscriber.lock:
+        subscriber.arrives(0)
+
+    def is_complete() -> bool:
+        clock.now_s += 0.1
+        return subscriber.refill.num_incomplete == 0
+
+    subscriber.refill.end()
+    wait_until(is_complete)
+    subscriber.refill.close()
+    assert num_looks == 1
+
+
 def test_at_the_end_a_gateway_that_has_no_status_yet_has_been_started_again() -> None:
     """It publishes one every second. Of events, it may have kept none."""
     for key, unknown in (("status", Counter({Unknown.RESTART: 1})), ("event", Counter[Unknown]())):
