@@ -56,6 +56,12 @@ def written(content: Any, folder: Path) -> Path:
     return path
 
 
+@pytest.fixture(autouse=True)
+def no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine, each file would take long to read, with a warning."""
+    monkeypatch.setattr(c3d_scene, "_NOTICE_S", 3600.0)
+
+
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return written(new_recording(), tmp_path)
