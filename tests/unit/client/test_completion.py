@@ -254,6 +254,18 @@ def test_one_request_shows_that_nothing_of_a_gap_exists_any_more() -> None:
     assert network.completion.due_s == math.inf
 
 
+def test_a_gap_ends_although_what_came_after_it_exists_no_more_either() -> None:
+    """An answer without any message settles it; otherwise, what has arrived would wait for a minute."""
+    network = Network(window=3)
+    network.arrives(0)
+    for number in range(5, 10):
+        network.arrives(number)
+    network.ask()
+    assert network.numbers == [0, *range(5, 10)]
+    assert network.check.num_lost == 4
+    assert network.completion.due_s == math.inf
+
+
 def test_messages_so_long_that_an_answer_has_only_one_are_refilled() -> None:
     """The message that shows that the gateway has not restarted must not take the place of all others."""
     network = Network()
@@ -524,6 +536,35 @@ def test_messages_of_a_restarted_gateway_without_room_come_once() -> None:
     assert network.handed_on == [(0, 3), (2, 0), (2, 1)]
     assert network.check.num_lost == 3 + 3
     assert network.completion.unknown[Unknown.RESTART] == 2
+
+
+def test_a_restart_is_found_although_the_new_numbers_in_the_history_are_past_the_known_one() -> None:
+    """Otherwise, the first message of the new run would be left out, and the recording called complete."""
+    network = Network(window=5)
+    network.arrives(5)
+    network.restart()
+    network.arrives(0)
+    for _ in range(20):
+        network.publish()
+    network.ask_all()
+    network.arrives(21)
+    network.ask_all()
+    assert network.handed_on == [(0, 5), (1, 0), *((1, number) for number in range(17, 22))]
+    assert network.completion.unknown[Unknown.RESTART] == 1
+    assert network.completion.num_damaged == 0
+
+
+def test_a_message_of_another_program_with_the_next_number_repeats_nothing() -> None:
+    """The history does not know it, which looks like a restart; a robot would repeat the last minute."""
+    network = Network()
+    network.arrive(*(network.publish() for _ in range(5)))
+    network._utime += 1
+    network._runs[network._utime] = -1
+    network.arrive(bytes(8) + PREFIX.pack(network._utime, 0, 5, 1, 0))
+    network.arrive(*(network.publish() for _ in range(3)))
+    network.ask_all()
+    assert network.handed_on == [*((0, number) for number in range(5)), (-1, 5), (0, 5), (0, 6), (0, 7)]
+    assert network.completion.unknown[Unknown.RESTART] == 1
 
 
 @pytest.mark.parametrize("number", [5000, 2**62, 1])
