@@ -62,6 +62,12 @@ class Network:
         self.history = [*self.history, message][-self._window :]
         return message
 
+    def publish_other(self, number: int) -> bytes:
+        """Return a message of another program, with the same key; its run is -1."""
+        self._utime += 1
+        self._runs[self._utime] = -1
+        return bytes(8) + PREFIX.pack(self._utime, 0, number, 1, 0)
+
     def arrive(self, *messages: bytes) -> None:
         for message in messages:
             utime, _, number, session, _ = PREFIX.unpack_from(message, 8)
@@ -539,7 +545,7 @@ def test_messages_of_a_restarted_gateway_without_room_come_once() -> None:
 
 
 def test_a_restart_is_found_although_the_new_numbers_in_the_history_are_past_the_known_one() -> None:
-    """Otherwise, the first message of the new run would be left out, and the recording called complete."""
+    """Otherwise, the first message of the new run would be left out, and no restart reported."""
     network = Network(window=5)
     network.arrives(5)
     network.restart()
@@ -554,16 +560,40 @@ def test_a_restart_is_found_although_the_new_numbers_in_the_history_are_past_the
     assert network.completion.num_damaged == 0
 
 
+def test_a_restart_is_found_although_no_message_has_arrived_since() -> None:
+    """What is held is of the former run: as one of the new run, it contradicts each answer, endlessly."""
+    network = Network(window=5)
+    network.arrives(5)
+    network.arrives(9)
+    network.restart()
+    for _ in range(11):
+        network.publish()
+    network.ask_all()
+    assert network.handed_on == [(0, 5), (0, 9), *((1, number) for number in range(6, 11))]
+    assert network.completion.unknown[Unknown.RESTART] == 1
+
+
 def test_a_message_of_another_program_with_the_next_number_repeats_nothing() -> None:
     """The history does not know it, which looks like a restart; a robot would repeat the last minute."""
     network = Network()
     network.arrive(*(network.publish() for _ in range(5)))
-    network._utime += 1
-    network._runs[network._utime] = -1
-    network.arrive(bytes(8) + PREFIX.pack(network._utime, 0, 5, 1, 0))
+    network.arrive(network.publish_other(5))
     network.arrive(*(network.publish() for _ in range(3)))
     network.ask_all()
     assert network.handed_on == [*((0, number) for number in range(5)), (-1, 5), (0, 5), (0, 6), (0, 7)]
+    assert network.completion.unknown[Unknown.RESTART] == 1
+
+
+def test_what_is_held_comes_once_although_another_program_makes_the_numbers_go_back() -> None:
+    """What was held is handed on at the seeming restart, so the history is asked for what is later."""
+    network = Network()
+    network.arrives(4)
+    network.arrive(network.publish_other(5))
+    network.arrives(7)
+    network.arrive(network.publish_other(5000))
+    network.arrives(8)
+    network.ask_all()
+    assert network.handed_on == [(0, 4), (-1, 5), (0, 7), (-1, 5000), (0, 8)]
     assert network.completion.unknown[Unknown.RESTART] == 1
 
 
