@@ -184,7 +184,10 @@ def _options(
 ) -> None:
     """Set what holds for all commands. The module of the command is imported before.
 
-    Until here, a signal ends the process at once.
+    Until here, a signal ends the process at once. Python imports unicodedata when it compiles a module with a
+    named character, and makes a SyntaxError of an interrupt there; so it is imported before.
     """
+    import unicodedata  # noqa: F401
+
     if context.obj is not None and context.invoked_subcommand != "run":  # which handles signals itself
         context.obj()
