@@ -11,7 +11,7 @@ from typing import Final, Generic, TypeVar
 
 from gateway.client.completion import Completion
 from gateway.client.history_requests import Completeness
-from gateway.client.refill import Ask, FindSeries, Refill
+from gateway.client.refill import SILENT_S, Ask, FindSeries, Refill
 from gateway.client.sources import FIELDS, Series, Source
 from gateway.messages.encode import FINGERPRINT_BYTES, VERSION_OFFSET
 from gateway.messages.host_time import now_utime
@@ -221,7 +221,15 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         source.running_take = str(running[0]) if running else ""
 
     def _hear(self, source: Source) -> float:
-        source.heard_s = now_s = self.monotonic()
+        now_s = self.monotonic()
+        if (
+            source.heard_s is not None
+            and now_s - source.heard_s > SILENT_S
+            and self.refill is not None
+            and not self._is_closed
+        ):
+            self.refill.look_after_silence(source)
+        source.heard_s = now_s
         if self.first_heard_s is None:
             self.first_heard_s = now_s
         return now_s

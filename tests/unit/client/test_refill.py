@@ -182,6 +182,23 @@ def test_the_end_waits_as_long_as_messages_come(num_answers: int) -> None:
     answers.release()
 
 
+def test_what_nothing_shows_is_looked_for_when_a_source_is_heard_again() -> None:
+    """All of a key may have been published in an outage, and the numbers of the others go on by chance."""
+    clock = Clock()
+    subscriber = Subscriber(1, answer_size=100, monotonic=clock)
+    subscriber.refill._find = lambda *_: [KeptSeries(subscriber.series[0], 50, 1050)]
+    with subscriber.lock:
+        subscriber.arrives(0)
+        subscriber.refill.look_after_silence(subscriber.source)
+
+    def has_come() -> bool:
+        clock.now_s += 0.1
+        return len(subscriber.handed_on) == 51
+
+    wait_until(has_come)
+    subscriber.refill.close()
+
+
 def test_the_end_comes_though_a_gateway_goes_on_publishing() -> None:
     clock = Clock()
     subscriber = Subscriber(1, answer_size=100, monotonic=clock)
