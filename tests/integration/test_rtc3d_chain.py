@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -38,9 +39,10 @@ async def two_gateways(
 ) -> AsyncIterator[tuple[ServingGateway, ServingGateway]]:
     """Run a gateway in front of a simulator, and another one in front of the first."""
     outputs = [zenoh_output(prefix, router) for prefix in ("first", "second")]
+    settings: Any = {"is_streaming": False, "stall_timeout_s": 60.0}  # a new connection would lose frames
     async with (
-        serving_gateway(simulator, outputs=outputs[:1], is_streaming=False) as first,
-        serving_gateway(first, outputs=outputs[1:], is_streaming=False, byte_order=byte_order) as second,
+        serving_gateway(simulator, outputs=outputs[:1], **settings) as first,
+        serving_gateway(first, outputs=outputs[1:], byte_order=byte_order, **settings) as second,
     ):
         for gateway in (first, second):
             await wait_until_async(
