@@ -84,7 +84,7 @@ check: .venv/installed
 	$(MAKE) --no-print-directory test-slow
 	$(MAKE) --no-print-directory test-compiled
 
-# Write the bytecode of the tests: six workers that start together would each compile all of them, in 10 s.
+# Write the bytecode of the tests: workers that start together would each compile all of them, in 10 s.
 bytecode: .venv/installed
 	-env --unset=PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest --collect-only -qq tests >/dev/null
 

@@ -22,8 +22,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-WORKERS_PER_CORE: Final = 3
-"""Most tests wait for most of their time."""
+WORKERS_PER_CORE: Final = 2
+"""Many tests wait for some of their time. With more workers, they wait for each other on a slow machine."""
 
 WORKERS_S: Final = 1.0
 """When the workers are killed after Ctrl-C. By then, pytest no longer counts what they run as failed."""

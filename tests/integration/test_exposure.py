@@ -1,5 +1,6 @@
 """``doctor --exposure`` against the sockets that the kernel has for a running gateway."""
 
+import contextlib
 import json
 import re
 import struct
@@ -33,19 +34,19 @@ def sockets(process: int) -> list[Socket]:
     """Return what ``ss -lntup`` prints of a process and of those that it has started."""
     inodes = set()
     for number in [process, *children(process)]:
-        for descriptor in Path(f"/proc/{number}/fd").iterdir():
-            try:
-                target = str(descriptor.readlink())
-            except OSError:
-                continue  # closed meanwhile
-            if found := re.fullmatch(r"socket:\[(\d+)\]", target):
-                inodes.add(found[1])
+        for descriptor in Path(f"/proc/{number}/fd").glob("*"):  # none, if it has ended meanwhile
+            with contextlib.suppress(OSError):  # closed meanwhile
+                if found := re.fullmatch(r"socket:\[(\d+)\]", str(descriptor.readlink())):
+                    inodes.add(found[1])
     return [found for inode, found in _table(process) if inode in inodes]
 
 
 def children(process: int) -> list[int]:
-    tasks = Path(f"/proc/{process}/task").iterdir()
-    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    found: list[int] = []
+    for task in Path(f"/proc/{process}/task").iterdir():
+        with contextlib.suppress(OSError):  # the thread has ended meanwhile
+            found.extend(map(int, (task / "children").read_text().split()))
+    return found
 
 
 def _table(process: int) -> Iterator[tuple[str, Socket]]:
