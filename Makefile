@@ -40,11 +40,11 @@ test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
 # What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
-# commands in the documents. They load the machine more than others: six workers on two cores took longer than five.
+# commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --workers 5 --dist loadgroup \
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup \
 	    -m 'not installation' $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
