@@ -95,8 +95,10 @@ class TakeScene:
                 *(safe_text(str(path)), safe_text(self._source)),
             )
         if self._source in self._reader.cut_off_sources():
-            text = "%s is not complete: the recording of %s was cut off, so its end is missing"
-            _log.warning(text, *(safe_text(str(path)), safe_text(self._source)))
+            _log.warning(
+                "%s is not complete: the recording of %s was cut off, so its end is missing",
+                *(safe_text(str(path)), safe_text(self._source)),
+            )
         for moment in preview:
             if not moment.parameters.xml:
                 moment.parameters = self._default

@@ -234,7 +234,8 @@ async def test_while_frames_come_as_fast_as_possible(site: Site, keeps: bool) ->
             await site.until_logged("→ streaming", 2)
             await asyncio.sleep(1)
             await site.stop()
-            assert not [*folder.glob(".rolling/*/*")]
+            is_too_busy = "did not stop within" in site.log  # the next start deletes them
+            assert is_too_busy or not [*folder.glob(".rolling/*/*")]
 
 
 async def test_with_an_lcm_peer_that_does_not_read(site: Site) -> None:
