@@ -315,6 +315,13 @@ def test_a_program_ends_whatever_ends_it(
         ended_by = text.replace("ENDS_BY_ITSELF", str(not exception)).replace("WAITS", str(is_interrupted))
         texts[use] = ended_by.replace("END", statement)
     found = ended_together(tmp_path, texts, transport, places, interrupt=is_interrupted)
+    # Python aborts if a thread of Zenoh calls it at its very end: possible on a busy machine, but rare.
+    aborted = {
+        use: texts[use] for use, (found_status, *_) in found.items() if found_status == -signal.SIGABRT
+    }
+    if aborted:
+        (tmp_path / "again").mkdir()
+        found |= ended_together(tmp_path / "again", aborted, transport, places, interrupt=is_interrupted)
     for use, (found_status, output, errors) in found.items():
         assert (use, output.startswith("ready"), found_status, exceptions(errors)) == (
             use,
