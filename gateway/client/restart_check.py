@@ -1,9 +1,10 @@
 """Whether a gateway has restarted: the question, what arrives meanwhile, and what an answer shows.
 
 The numbers of what arrives cannot decide this. They go back after a restart; but one message with a false
-number, damaged or of another program, looks the same: the next genuine one has a smaller number. Whoever
-believes that replays the last minute as if it were live. And the numbers of a new run may be larger than
-those of the last one, if much of it was missed. So the history decides, by the last known message.
+number, damaged or of another program, looks the same: the next genuine one has a smaller number. A subscriber
+that took this for a restart would hand on the last minute as if it were live. And the numbers of a new run
+may be larger than those of the last one, if much of it was missed. So the history decides, by the last known
+message.
 """
 
 import enum
@@ -131,8 +132,8 @@ class RestartCheck:
         if self.later_runs:
             new = self.later_runs.pop()
         elif is_held_before and utime_of(former.held[former.first]) >= min(utimes):
-            # The clock was set back at the restart, so times do not tell the two runs apart. All is of the
-            # former one: what arrives of the new one would have been a later run.
+            # The clock was set back at the restart, so times do not tell the two runs apart. All that is held
+            # is of the former one: what arrives of the new one would have been a later run.
             new = ArrivedRun(self._held_bytes)
         elif utimes:
             # Nothing went back: the new numbers are past the old ones, or nothing of the new run has arrived.

@@ -42,6 +42,17 @@ def wait():
         time.sleep(0.01)
 """
 
+RECEIVES: Final = """
+        data = live("lab", **where)
+        def receive():
+            for frame in data:
+                has_come.set()
+                if is_over:
+                    break
+        has_come, is_over = threading.Event(), False
+"""
+"""What two of the programs have in common: a function for another thread, which ends when ``is_over``."""
+
 USES: Final = {
     "iterate": """
         for frame in live("lab", components=["3d"], **where):
@@ -133,15 +144,7 @@ USES: Final = {
         for _ in range(1):
             END
     """,
-    "a thread that is joined": """
-        data = live("lab", **where)
-        def receive():
-            for frame in data:
-                has_come.set()
-                if is_over:
-                    break
-        has_come, is_over = threading.Event(), False
-        thread = threading.Thread(target=receive)
+    "a thread that is joined": f"""{RECEIVES}        thread = threading.Thread(target=receive)
         thread.start()
         has_come.wait()
         ready()
@@ -150,16 +153,8 @@ USES: Final = {
             END
         thread.join()
     """,
-    "a thread of a pool": """
-        from concurrent.futures import ThreadPoolExecutor
-        data = live("lab", **where)
-        def receive():
-            for frame in data:
-                has_come.set()
-                if is_over:
-                    break
-        has_come, is_over = threading.Event(), False
-        pool = ThreadPoolExecutor()
+    "a thread of a pool": f"""
+        from concurrent.futures import ThreadPoolExecutor{RECEIVES}        pool = ThreadPoolExecutor()
         future = pool.submit(receive)
         has_come.wait()
         ready()
