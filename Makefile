@@ -34,17 +34,20 @@ SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
 
+# In CI, tests that failed are run again, alone (tests/run.py).
+AGAIN :=
+
 # Unit, property, contract and integration tests. Without MAKEFLAGS, a make that a test runs does not look for the job
 # slots of this one.
 test: .venv/installed
-	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
+	MAKEFLAGS= exec $(BIN)/python tests/run.py $(AGAIN) $(ARGS)
 
 # What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
 # commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
 
 test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup \
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(AGAIN) --dist loadgroup \
 	    -m 'not installation' $(or $(ARGS),$(SLOW_TESTS))
 
 # The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
@@ -66,7 +69,7 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/logs/test_failures
     $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
 
 test-compiled: build/compiled/complete
-	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
+	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py $(AGAIN) --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
 # The tests in other surroundings: a machine that has just booted or has been up for 400 days, other time zones, locales,
 # users, host names and Pythons, one core, random order. It needs root, and takes an hour; SURROUNDINGS="fresh user"

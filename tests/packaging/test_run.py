@@ -1,4 +1,4 @@
-"""`make test` reports a worker that crashes, sets the uptime for the tests, and knows who runs it."""
+"""tests/run.py reports a worker that crashes, repeats failed tests in CI, sets the uptime, knows its user."""
 
 import os
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PLUGINS = ("-p", "tests.conftest", "-p", "no:cacheprovider")
+PLUGINS = ("-p", "tests.conftest")
 CRASH = """
 import os, time
 
@@ -21,6 +21,20 @@ def test_that_passes():
     pass
 """
 
+FAIL_ONCE = """
+from pathlib import Path
+import pytest
+
+@pytest.mark.parametrize("name", {names})
+def test_that_fails_once(name):
+    path = Path({folder!r}, name)
+    was_there = path.exists()
+    path.touch()
+    assert was_there and name != "always"
+
+def test_that_passes():
+    pass
+"""
 
 UPTIME = """
 import subprocess, sys, time
@@ -32,10 +46,12 @@ def test_of_a_machine_that_has_been_up_for_400_days():
 """
 
 
-def run_tests(folder: Path, content: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def run_tests(
+    folder: Path, content: str, *arguments: str, **environment: str
+) -> subprocess.CompletedProcess[str]:
     (folder / "test_one.py").write_text(content)
     return subprocess.run(
-        [sys.executable, "tests/run.py", "--workers", "3", *PLUGINS, str(folder)],
+        [sys.executable, "tests/run.py", "--workers", "3", *arguments, *PLUGINS, str(folder)],
         cwd=ROOT,
         env={**os.environ, **environment},
         capture_output=True,
@@ -51,6 +67,22 @@ def test_a_worker_that_crashes_while_its_child_lives_is_reported(tmp_path: Path)
     assert run.returncode == 1
     assert "crashed while running" in run.stdout
     assert "1 failed, 1 passed" in run.stdout
+
+
+@pytest.mark.parametrize(
+    ("names", "has_passed"),
+    [(("a",), True), (("a", "always"), False), (tuple("abcdef"), False)],
+)
+def test_a_few_tests_that_fail_once_are_run_again_and_named(
+    tmp_path: Path, names: tuple[str, ...], has_passed: bool
+) -> None:
+    """In CI, other work may delay a test; but a test that fails again, or many that fail, fail the run."""
+    content = FAIL_ONCE.format(names=names, folder=str(tmp_path))
+    run = run_tests(tmp_path, content, "--again")
+    assert (run.returncode == 0) is has_passed, run.stdout
+    _, _, named = run.stdout.partition("FAILED ONCE")
+    assert ("test_that_fails_once[a]" in named) is has_passed
+    assert "test_that_passes" not in named
 
 
 @pytest.mark.netns

@@ -127,14 +127,14 @@ async def recording_lab(directory: Path | None, **settings: Any) -> AsyncIterato
 
 @asynccontextmanager
 async def still_lab(
-    directory: Path, clock: Clock | None = None, **settings: Any
+    directory: Path, clock: Callable[[], float] | None = None, **settings: Any
 ) -> AsyncIterator[RecordingLab]:
-    """Run an output without threads; its clock is ``clock``, or else the event loop's.
+    """Run an output without threads; its clock is ``clock``, or else one that stands still.
 
-    Messages are written when somebody waits for the disk. The test calls ``maintain`` itself.
+    With a real clock, the folder is not checked for a while after a check that took long. Messages are
+    written when somebody waits for the disk. The test calls ``maintain`` itself.
     """
-    monotonic = clock or asyncio.get_running_loop().time
-    lab = RecordingLab(directory, host=still_host(monotonic), **settings)
+    lab = RecordingLab(directory, host=still_host(clock or Clock()), **settings)
     lab.output.start()
     try:
         yield lab

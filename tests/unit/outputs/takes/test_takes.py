@@ -373,7 +373,7 @@ def test_a_save_that_was_ended_does_not_end_again(tmp_path: Path) -> None:
     file.write_bytes(b"c3d")
 
     async def save_and_end() -> None:
-        async with still_lab(tmp_path, keep_last_s=60) as lab:
+        async with still_lab(tmp_path, asyncio.get_running_loop().time, keep_last_s=60) as lab:
             lab.publish()
             await lab.takes.save(60, 30, "fall")
             lab.takes.end_takes()
