@@ -37,6 +37,8 @@ class ArrivedRun:
         """The largest number that has arrived, with its time and its session."""
         self.newest_utime = 0
         self.newest_session = 0
+        self.smallest: tuple[int, int] | None = None
+        """The smallest number that has arrived, with its time."""
         self._room = room
 
     @property
@@ -53,6 +55,8 @@ class ArrivedRun:
     def note(self, sequence: int, utime: int, session: int) -> None:
         """Note that a message has arrived."""
         self.until = max(self.until, sequence)
+        if self.smallest is None or sequence < self.smallest[0]:
+            self.smallest = sequence, utime
         if sequence > self.newest:
             self.newest, self.newest_utime, self.newest_session = sequence, utime, session
 
@@ -85,6 +89,10 @@ class ArrivedRun:
             utime_of(each) > utime if number < first else number == first and each != message
             for number, each in numbered
         )
+
+    def goes_back_before(self, number: int, utime: int) -> bool:
+        """Whether it has a smaller number than this one, but a later time: then it is another run."""
+        return self.smallest is not None and self.smallest[0] <= number and self.smallest[1] > utime
 
     def let_go_between(self, number: int, utime: float) -> None:
         """Let go what has this number or a larger one, but is older than ``utime``: one of both is false."""

@@ -339,6 +339,8 @@ class Completion:
             )
             if is_over and code == "no-gateway":
                 self._timing.note_nobody()
+        elif code == "nothing-yet" and self._lacks_what_arrived:
+            self._begin_run(None, now_s)
         elif code == "nothing-yet":
             if self._is_steady and self._end is not End.OPEN and self._delivery.reached is not None:
                 self.unknown[Unknown.RESTART] += 1
@@ -348,6 +350,12 @@ class Completion:
                 self._end = End.KNOWN
                 self.unknown[Unknown.END] += code not in KEEPS_NOTHING_CODES
             self._pass_on_only(text, now_s + PASSING_S)
+
+    @property
+    def _lacks_what_arrived(self) -> bool:
+        """Whether a history without messages is of yet another run: of this one, some have arrived."""
+        delivery = self._delivery
+        return self._state is State.FILLING and delivery.reached is None and delivery.arrived.newest >= 0
 
     @property
     def _asks_for_first(self) -> bool:

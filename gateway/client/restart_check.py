@@ -83,22 +83,29 @@ class RestartCheck:
             self._asks_for_time = True
             return Verdict.ASK_FOR_TIME
         assert request.known is not None  # noqa: S101 - it is what was asked
-        number, utime = request.known
+        utime = request.known[1]
         first = answer.messages[0] if answer.messages else None
         if first is not None and utime_of(first) == utime:
             return Verdict.FALSE_NUMBER
         # After a long outage, the known message may be too old for the history, although the run goes on. All
         # numbers must fit: a wrong guess would join two runs, and hide what is missing between them.
-        is_later = first is not None and sequence_of(first) > number
-        if is_later and self._is_consistent(number, answer, delivery, newest):
+        if self._is_consistent(request.known, answer, delivery, newest):
             return Verdict.SAME_RUN
         return Verdict.RESTARTED
 
-    def _is_consistent(self, number: int, answer: HistoryAnswer, delivery: Delivery, newest: int) -> bool:
-        """Whether an answer with later messages than a known one can be of the same run."""
+    def _is_consistent(
+        self, known: tuple[int, int], answer: HistoryAnswer, delivery: Delivery, newest: int
+    ) -> bool:
+        """Whether an answer without the known message can be of its run: later ones have larger numbers."""
+        number, utime = known
+        if not answer.messages or sequence_of(answer.messages[0]) <= number:
+            return False
         numbered = [(sequence_of(message), message) for message in answer.messages]
-        is_older = delivery.arrived.is_older_than(numbered, newest)
-        return not is_older and all(later.newest > number for later in self.later_runs)
+        if delivery.arrived.is_older_than(numbered, newest):
+            return False
+        return not any(
+            later.newest <= number or later.goes_back_before(number, utime) for later in self.later_runs
+        )
 
     # What follows from the verdict.
 
