@@ -8,7 +8,7 @@ import itertools
 import math
 from typing import Final, NamedTuple
 
-from hypothesis import assume, given, note, settings
+from hypothesis import assume, example, given, note, settings
 from hypothesis import strategies as st
 
 from gateway.client.arrived_run import HeldBytes
@@ -234,6 +234,9 @@ def schedules(*events: str) -> st.SearchStrategy[list[str]]:
     st.sampled_from([10**9, 10**9, 15, 3]),
     st.sampled_from([10**9, 1000]),
 )
+@example(
+    ["full", "restart", *["arrives"] * 4], 3, 10**9
+)  # the first messages of the new run are held nowhere
 def test_nothing_comes_twice_and_what_is_called_complete_is(
     events: list[str], window: int, limit: int
 ) -> None:
@@ -245,6 +248,9 @@ def test_nothing_comes_twice_and_what_is_called_complete_is(
 
 @settings(max_examples=examples(300))
 @given(schedules(*USUAL, *ASKING, *RESTARTS), st.sampled_from([10**9, 1000]))
+@example(
+    ["full", "restart", "arrives", "room", "restart", "ask", "ask"], 10**9
+)  # the last run is still silent
 def test_what_is_published_since_a_restart_comes(events: list[str], limit: int) -> None:
     """Also of a key of which nothing arrives after it, and while the program has no room."""
     world = played(events, 10**9, limit)
