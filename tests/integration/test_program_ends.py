@@ -380,14 +380,17 @@ def test_a_program_that_catches_ctrl_c_ends_although_it_joined_a_thread_that_rec
     """Python takes a thread as stopped when Ctrl-C interrupts its join, and does not wait for it again."""
     text = """
         def interrupt():
-            while thread.is_alive():
-                time.sleep(0.1)  # it may come just before Python waits
+            time.sleep(0.1)
+            os.kill(os.getpid(), signal.SIGINT)
+            while not is_caught.wait(5.0):  # it may have come just before Python waits
                 os.kill(os.getpid(), signal.SIGINT)
         import signal
+        is_caught = threading.Event()
         try:
             threading.Thread(target=interrupt, daemon=True).start()
             thread.join()
         except KeyboardInterrupt:
+            is_caught.set()
             ready()
     """
     status, output, errors = run_to_its_end(tmp_path, RECEIVES_IN_A_THREAD + text, "zenoh", places)

@@ -120,7 +120,8 @@ class Machine:
         return value
 
     async def journal(self, unit: str = UNIT) -> list[dict[str, Any]]:
-        """Return the journal entries of the unit's current or last run."""
+        """Return the journal entries of the unit's current or last run, with all that was logged before."""
+        await self.run("journalctl", "--sync")
         invocation = await self.show("InvocationID", unit)
         matches = (f"_SYSTEMD_INVOCATION_ID={invocation}", "+", f"INVOCATION_ID={invocation}")
         text = (await self.run("journalctl", "--output=json", "--all", *matches)).text
