@@ -61,12 +61,12 @@ test-install: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
 # Left out are the properties of configurations, of parameters and of VRPN, whose code is not compiled.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/logs/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/runtime/test_failures.py $(wildcard tests/unit/outputs/test_*.py) \
     $(filter-out %/test_config_properties.py %_environment_properties.py %_parameters_properties.py %_vrpn_properties.py, \
         $(wildcard tests/property/test_*.py)) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d stream) \
-    $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/service/test_gateway.py
+    $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/daemon/test_gateway.py
 
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py $(AGAIN) --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
@@ -213,7 +213,7 @@ install-files:
 	install -m 644 systemd/tmpfiles.conf $(DESTDIR)$(USR)/lib/tmpfiles.d/rtc3d-gateway.conf
 	[ -e $(DESTDIR)$(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(DESTDIR)$(CONFIG)/gateway.yaml
 	install -m 644 config/gateway.schema.json $(DESTDIR)$(CONFIG)/gateway.schema.json
-	umask 022; $(PYTHON) -P -m gateway.cli.man_page >$(DESTDIR)$(MAN_PAGE)
+	umask 022; $(PYTHON) -P -m gateway.tools.cli.man_page >$(DESTDIR)$(MAN_PAGE)
 	umask 022; _RTC3D_GATEWAY_COMPLETE=source_bash $(PYTHON) -P -m gateway >$(DESTDIR)$(BASH_COMPLETION)
 	umask 022; _RTC3D_GATEWAY_COMPLETE=source_fish $(PYTHON) -P -m gateway >$(DESTDIR)$(FISH_COMPLETION)
 	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway $(DESTDIR)$(USR)/bin/rtc3d-gateway

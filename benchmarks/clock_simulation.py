@@ -12,7 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from gateway.stream.clock import ServerClock
+from gateway.session.clock import ServerClock
 from tests.support.clock_simulation import Frames, Numbers, Observed, observe, percentile_95_us, simulate
 
 PLOT: Final = Path(__file__).parent.parent / "docs" / "explanation" / "clocks.png"

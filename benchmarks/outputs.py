@@ -24,11 +24,11 @@ from benchmarks.workbench import lcm_url, relay_cuts
 from benchmarks.workloads import DENSE, Paced, send
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import MESSAGE_TYPES, Stamp
-from gateway.messages.ros2 import TF_MESSAGE
+from gateway.messages.ros2.encode import TF_MESSAGE
+from gateway.outputs.adapters.ros2.source import RosSource
+from gateway.outputs.adapters.ros2.topic import Declared, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.registry import OUTPUTS
-from gateway.outputs.ros2.source import RosSource
-from gateway.outputs.ros2.topic import Declared, RosTopic
 from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame

@@ -20,14 +20,14 @@ from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Pair, Progress, Table, table_cell
 from benchmarks.workloads import DENSE, Frames
 from gateway.config.settings import HistorySettings, MetricsSettings, SourceSettings, StreamSettings
+from gateway.daemon.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.service.gateway import Gateway
+from gateway.session.session import Session
+from gateway.session.state import StreamState
 from gateway.simulator.simulator import Simulator
-from gateway.stream.session import Session
-from gateway.stream.state import StreamState
 from tests.support.configurations import make_settings
 from tests.support.memory_output import MemoryOutput
 from tests.support.waiting import wait_until_async

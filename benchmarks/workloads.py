@@ -19,7 +19,7 @@ from gateway.messages.encode import CONTENT_OFFSET
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.measurement import FrameBuilder
+from gateway.session.server.measurement import FrameBuilder
 from gateway.simulator.synthetic import SyntheticScene
 
 _EVENT_US: Final = 500_000

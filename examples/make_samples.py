@@ -17,12 +17,12 @@ import rtc3d
 from walking import WalkingPerson
 
 from gateway.config.settings import MetricsSettings, Settings, SourceSettings
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.registry import settings_type
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.service.gateway import Gateway
+from gateway.session.state import StreamState
 from gateway.simulator.simulator import Simulator
-from gateway.stream.state import StreamState
 from gateway.takes.export.job import ExportJob, export_take
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.writer_thread import LogFile

@@ -10,14 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gateway.rtc3d.components import (
-    ITEM_DTYPES,
-    LONG_EVENT,
-    MISSING,
-    MISSING_MARKER,
-    ComponentType,
-    Items,
-)
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, MISSING, MISSING_MARKER, ComponentType, Items
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -31,8 +24,8 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
-from gateway.rtc3d_server.measurement import ComputedScene
-from gateway.rtc3d_server.scene import SampleNumbers
+from gateway.session.server.measurement import ComputedScene
+from gateway.session.server.scene import SampleNumbers
 from gateway.simulator.bodies import ForcePlates, Noise
 
 Floats = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ def main() -> "NoReturn":
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored by nohup, and by shells for `&`
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     _open_standard_streams()
-    from gateway.cli.main import main as run_command_line  # noqa: PLC0415 - see above
+    from gateway.tools.cli.main import main as run_command_line  # noqa: PLC0415 - see above
 
     run_command_line()
 

@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis.database import DirectoryBasedExampleDatabase
 from xdist.scheduler import LoadScopeScheduling, Scheduling
 
-from gateway.logs.failures import HOLD_S
+from gateway.runtime.failures import HOLD_S
 from tests.support.needs import is_root, need
 
 # uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection
@@ -128,4 +128,4 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture
 def no_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make FailureLog report a recovery at the first success: its clock advances by HOLD_S per reading."""
-    monkeypatch.setattr("gateway.logs.failures.monotonic", itertools.count(0.0, HOLD_S).__next__)
+    monkeypatch.setattr("gateway.runtime.failures.monotonic", itertools.count(0.0, HOLD_S).__next__)

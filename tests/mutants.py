@@ -28,25 +28,33 @@ ROOT: Final = Path(__file__).parents[1]
 LEAST_PERCENT: Final = 85
 
 TESTS: Final[dict[str, tuple[str, ...]]] = {
-    "stream": ("unit/stream/test_* unit/service/test_*source* property/*_clock_*",),
+    "session": ("unit/session/test_* unit/daemon/test_*source* property/*_clock_*",),
+    "session/server": ("unit/session/server/test_*",),
+    "session/c3d_files": ("unit/session/c3d_files/test_*",),
     "publish": ("unit/publish/test_* property/*_pacing_*",),
-    "queries": ("unit/queries/test_* unit/service/test_source*",),
+    "queries": ("unit/queries/test_* unit/daemon/test_source*",),
     "messages": ("unit/messages/test_*",),
+    "messages/descriptions": ("unit/messages/descriptions/test_*",),
     "client": ("unit/client/test_*",),
-    "gateway": ("unit/test_*",),  # the modules that are in no package
-    "takes/replay": ("unit/takes/replay/test_*",),
-    "descriptions": ("unit/descriptions/test_*",),
-    "doctor": ("unit/doctor/test_*",),
-    "display": ("unit/display/test_* unit/display/*/test_*",),
-    "rtc3d_server": ("unit/rtc3d_server/test_*",),
-    "c3d_files": ("unit/c3d_files/test_*",),
+    "runtime": ("unit/runtime/test_*",),
+    "tools/replay": ("unit/tools/replay/test_*",),
+    "tools/doctor": ("unit/tools/doctor/test_*",),
+    "tools/display": ("unit/tools/display/test_* unit/tools/display/*/test_*",),
+    "tools/cli": ("unit/tools/cli/test_*",),
     "config": ("unit/config/test_* property/*_config_*",),
-    "cli": ("unit/cli/test_*",),
-    "service/monitoring": ("unit/service/monitoring/test_*",),
+    "daemon/monitoring": ("unit/daemon/monitoring/test_*",),
     "takes/files": ("unit/takes/files/test_* property/*takes* property/*_components_*",),
 } | {
-    f"outputs/{name}": (f"unit/outputs/{name}/test_* unit/outputs/test_*", f"contract/test_* -k {name}")
-    for name in ("zenoh", "ros2", "rtc3d", "takes", "lcm", "vrpn", "lsl", "foxglove")
+    f"outputs/{path}": (
+        f"unit/outputs/{path}/test_* unit/outputs/test_*",
+        f"contract/test_* -k {path.split('/')[-1]}",
+    )
+    for path in (
+        "zenoh",
+        "lcm",
+        "takes",
+        *(f"adapters/{name}" for name in ("ros2", "rtc3d", "vrpn", "lsl", "foxglove")),
+    )
 }
 """The nearest tests of each package, in tests/: patterns of files for one pytest after the other."""
 

@@ -27,6 +27,7 @@ Everything else that gateways answer::
   ``live``, whose beginning is ``live_stream``: ``live_frames`` decodes, ``live_join`` joins components.
 - With ``complete``, each series has a ``completion``, which puts its messages in order and decides what to
   request; the threads of ``refill`` request it, on LCM with ``lcm_refill``.
+- ``recorder`` records what is received as takes.
 """
 
 from typing import TYPE_CHECKING, Any

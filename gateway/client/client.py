@@ -9,14 +9,7 @@ from typing import IO, Any, Final, NamedTuple, Self
 from gateway.client.history_requests import Completeness
 from gateway.client.lcm_transport import LcmTransport
 from gateway.client.reception import Reception
-from gateway.client.transport import (
-    FoundSources,
-    GatewaySubscriber,
-    Query,
-    Replies,
-    Reply,
-    Transport,
-)
+from gateway.client.transport import FoundSources, GatewaySubscriber, Query, Replies, Reply, Transport
 from gateway.client.zenoh_transport import ZenohTransport
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import DEFAULT_LCM_PREFIX
@@ -24,7 +17,7 @@ from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION
 from gateway.outputs.lcm.settings import effective_lcm_url, lcm_queries_url
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.outputs.zenoh.subscriber import open_zenoh
-from gateway.program_end import Process, close_at_end
+from gateway.runtime.program_end import Process, close_at_end
 from gateway.takes.files.description import NO_DETAILS, TakeDetails
 from gateway.takes.files.event_log import EventBoundary
 

@@ -35,7 +35,6 @@ from gateway.client.transport import (
     read_status,
 )
 from gateway.errors import OutputError, ProtocolError, QueryError
-from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
 from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
@@ -43,6 +42,7 @@ from gateway.outputs.kind import DISCOVERY_S, missing_source
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.requests import is_presence
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
+from gateway.runtime.safe_text import safe_text
 
 _LISTEN_S: Final = 1.5
 """Every gateway sends a status within this time. If none is heard, this listens for DISCOVERY_S."""

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple, cast
 import numpy as np
 
 from gateway.client.queued_reception import Arrival, DescribedSource, QueuedReception, QueuedSeries
-from gateway.descriptions.labels import Description, describe
+from gateway.messages.descriptions.labels import Description, describe
 from gateway.messages.host_time import STEP_US, clock_difference_us, now_steady_us, now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters

@@ -20,11 +20,11 @@ from gateway.client.live_join import Join
 from gateway.client.queued_reception import Arrival, QueuedSeries
 from gateway.client.transport import GatewaySubscriber, close_in_time, silence_text
 from gateway.errors import SelectionError
-from gateway.logs.safe_text import safe_text
 from gateway.messages.encode import VERSION_OFFSET
-from gateway.program_end import Process, close_at_end
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.parameters import Parameters
+from gateway.runtime.program_end import Process, close_at_end
+from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.reader import MessageBatch
 from gateway.takes.files.take import Take, TakeLoader, check_components
 

@@ -9,17 +9,11 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.client.arrived_run import HeldBytes
 from gateway.client.completion import Completion
-from gateway.client.history_requests import (
-    REPLY_S,
-    RETRY_CODES,
-    Completeness,
-    HistoryAnswer,
-    HistoryRequest,
-)
+from gateway.client.history_requests import REPLY_S, RETRY_CODES, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.request_timing import NOBODY_S, PATIENCE_S, RETRY_S
 from gateway.client.sources import Series, Source
 from gateway.errors import QueryError
-from gateway.workers import thread_starts
+from gateway.runtime.workers import thread_starts
 
 Ask = Callable[[Any, HistoryRequest, float], HistoryAnswer]
 """Requests messages of a series, and returns the answer. The last argument is how many seconds it may take.

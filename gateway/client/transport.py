@@ -13,10 +13,10 @@ from gateway.client.reception import MAX_SERIES, Reception
 from gateway.client.refill import KeptSeries
 from gateway.client.sources import FINGERPRINTS, POSE, TYPES_BY_KEY, Series, Source
 from gateway.errors import ProtocolError, QueryError
-from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode
 from gateway.messages.source_report import SourceReport, source_report
 from gateway.outputs.kind import DISCOVERY_S
+from gateway.runtime.safe_text import safe_text
 
 MAX_SOURCES: Final = 1000
 """How many sources are kept. Anybody on the network can send some."""

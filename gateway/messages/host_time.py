@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from gateway.logs.failures import Repeats
+from gateway.runtime.failures import Repeats
 
 STEP_US: Final = 1_000
 """A change of the wall clock by this much is a step: somebody has set it."""

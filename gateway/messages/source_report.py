@@ -11,7 +11,7 @@ from enum import Enum
 from itertools import islice
 from typing import Any, Final, NamedTuple, TypeVar
 
-from gateway.logs.safe_text import safe_text
+from gateway.runtime.safe_text import safe_text
 
 MAX_STREAMS: Final = 16
 """How many streams of a source are kept. A source of the gateway has one for each component at most."""
@@ -46,7 +46,7 @@ _STATES: Final = {
     "connecting": (Level.BAD, "waiting for {server}{tries}"),
     "waiting to reconnect": (Level.BAD, "waiting for {server}{tries}"),
 }
-"""What each state of a stream (gateway.stream.state) means. Other versions of the gateway may have others."""
+"""What each state of a stream (gateway.session.state) means. Other versions of the gateway may have more."""
 
 
 class LossReport(NamedTuple):

@@ -7,11 +7,11 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.errors import ParametersError
-from gateway.logs.losses import counts_text
 from gateway.messages.source_report import LossReport, SourceReport, source_report
 from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.runtime.losses import counts_text
 
 _MAX_SHOWN: Final = 4
 """The maximum number of channels, plates or events in a line."""

@@ -6,7 +6,7 @@ import struct
 from functools import cache
 from typing import Any, Final
 
-from gateway.logs.safe_text import safe_text
+from gateway.runtime.safe_text import safe_text
 
 _MAX_BITS: Final = {"int8_t": 7, "int16_t": 15, "int32_t": 31, "int64_t": 63}
 _MAX_FLOAT: Final = 3.4028234663852886e38

@@ -1,4 +1,4 @@
-"""The outputs: one contract for all, and a package for each.
+"""The outputs: one contract for all, and a package for each, those for other protocols in ``adapters``.
 
 Start with ``contract``: an ``Output`` opens (``start``), gives a ``Publisher`` for each topic, reports its
 health and closes. Everything else that an output can do has a default that does nothing. The tests in
@@ -12,8 +12,8 @@ tests/contract/ hold every output to it, and ``guard`` keeps an output that brea
 - ``checks``: what the doctor checks.
 
 What several outputs need is here: ``frame_output`` has what outputs of whole frames and servers have in
-common, with a thread that has an event loop of its own (``gateway.workers`` has one for calls that may
-block), ``query_admission`` limits the questions of peers, ``listen_address`` says who can connect to a
+common, with a thread that has an event loop of its own (``gateway.runtime.workers`` has one for calls that
+may block), ``query_admission`` limits the questions of peers, ``listen_address`` says who can connect to a
 server, and ``pacing`` leaves out frames.
 
 Calls of the contract come from the gateway's event loop and must not block there. An output that may wait for

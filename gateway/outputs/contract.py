@@ -16,7 +16,6 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import rtc3d
 
-from gateway.logs.losses import Loss, Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
 from gateway.messages.history import FoundMessages, WantedMessages
@@ -25,6 +24,7 @@ from gateway.messages.topics import Topic
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
+from gateway.runtime.losses import Loss, Losses
 
 WHOLE_FRAME: Final = "frame"
 """What stands for the component in the counters of an output that takes whole frames."""

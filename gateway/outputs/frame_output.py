@@ -1,7 +1,7 @@
 """What outputs of whole frames have in common, and those of them that serve clients in their own threads.
 
 What the clients do costs that thread time, not the gateway. Calls that may block need a WorkerThread instead
-(gateway/workers.py).
+(gateway/runtime/workers.py).
 """
 
 import asyncio
@@ -17,10 +17,10 @@ import uvloop
 
 from gateway.config.settings import OutputSettings
 from gateway.errors import PortError
-from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import IgnoringPublisher, Output, Publisher
-from gateway.workers import QueueRoom, thread_starts
+from gateway.runtime.failures import DefectLog, FailureLog, defect_text
+from gateway.runtime.workers import QueueRoom, thread_starts
 
 _FIRST_RETRY_S: Final = 0.2
 _MAX_RETRY_S: Final = 1.0

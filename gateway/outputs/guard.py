@@ -6,12 +6,12 @@ from logging import getLogger
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from gateway.errors import OutputError, QueryError, raise_unless_defect
-from gateway.logs.failures import DefectLog, defect_text
 from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Command, FramePublisher, Output, OutputHealth, Publisher
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import FrameLayout
+from gateway.runtime.failures import DefectLog, defect_text
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")

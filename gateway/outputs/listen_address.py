@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import system_reason
-from gateway.logs.safe_text import quoted
+from gateway.runtime.safe_text import quoted
 
 _AUTHORITY: Final = re.compile(
     r"(?:https?://)?(?:\[(?P<ipv6>[\d:.a-f]+)\]|(?P<name>[\w.-]+))(?::(?P<port>\d+))?",

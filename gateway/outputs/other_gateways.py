@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from gateway.logs.failures import FailureLog
+from gateway.runtime.failures import FailureLog
 
 HOLD_S: Final = 3.0
 """How long another gateway must be there: after a reload, it may be the former session of this one."""

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, Self
 
 from gateway.errors import QueryError
-from gateway.logs.failures import DefectLog
-from gateway.token_bucket import TokenBucket
+from gateway.runtime.failures import DefectLog
+from gateway.runtime.token_bucket import TokenBucket
 
 MAX_KEYS: Final = 256
 """Of how many keys the rate is known. The key that was asked for least recently is forgotten first."""

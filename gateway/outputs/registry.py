@@ -12,17 +12,17 @@ from typing import Final
 
 from gateway.config.settings import OutputSettings, Settings, settings_model
 from gateway.errors import ConfigError
-from gateway.logs.safe_text import safe_text
+from gateway.outputs.adapters.foxglove.settings import FOXGLOVE
+from gateway.outputs.adapters.lsl.settings import LSL
+from gateway.outputs.adapters.ros2.settings import ROS2
+from gateway.outputs.adapters.rtc3d.settings import RTC3D
+from gateway.outputs.adapters.vrpn.settings import VRPN
 from gateway.outputs.contract import Output
-from gateway.outputs.foxglove.settings import FOXGLOVE
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.settings import LCM
-from gateway.outputs.lsl.settings import LSL
-from gateway.outputs.ros2.settings import ROS2
-from gateway.outputs.rtc3d.settings import RTC3D
 from gateway.outputs.takes.settings import TAKES
-from gateway.outputs.vrpn.settings import VRPN
 from gateway.outputs.zenoh.settings import ZENOH
+from gateway.runtime.safe_text import safe_text
 
 GROUP: Final = "rtc3d_gateway.outputs"
 """The group of entry points in which packages name their OutputKind."""

@@ -9,7 +9,6 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.errors import OutputError, raise_unless_defect
-from gateway.logs.losses import Losses
 from gateway.messages.encode import MESSAGE_TYPES, Stamp, lcm_type_name, message_timestamp_us, with_sequence
 from gateway.messages.history import MessageHistory
 from gateway.messages.topics import Topic
@@ -17,6 +16,7 @@ from gateway.outputs.contract import WHOLE_FRAME, FramePublisher, Output, Output
 from gateway.outputs.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
+from gateway.runtime.losses import Losses
 
 OPENING_S: Final = 2.0
 """How long an output may take to open, before the gateway starts without it, or warns after a reload."""

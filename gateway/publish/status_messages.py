@@ -7,14 +7,14 @@ from typing import Final
 import rtc3d
 
 from gateway import __version__
-from gateway.logs.losses import Loss
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.clock import ServerClock
-from gateway.stream.process_clock import running_clock
-from gateway.stream.status import FRAME_REJECTED, StreamStatus
+from gateway.runtime.losses import Loss
+from gateway.session.clock import ServerClock
+from gateway.session.process_clock import running_clock
+from gateway.session.status import FRAME_REJECTED, StreamStatus
 
 _COPIED_FIELDS: Final = (
     "components",

@@ -5,8 +5,8 @@ from typing import Final
 
 import rtc3d
 
-from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.descriptions.source_frame import unknown_unit_text
 from gateway.messages.encode import Stamp, tool_poses
 from gateway.messages.history import MessageHistory
 from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH, unique_name

@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple
 import rtc3d
 
 from gateway.errors import ParametersError, QueryError
-from gateway.logs.failures import EventLog
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import (
     JSON,
@@ -37,7 +36,8 @@ from gateway.rtc3d.parameters import (
     without_statistics,
 )
 from gateway.rtc3d.parameters_xml import MAX_XML_BYTES, ParsedParameters, extract_sections, parse_parameters
-from gateway.stream.replies import XmlThread
+from gateway.runtime.failures import EventLog
+from gateway.session.replies import XmlThread
 
 
 @cache

@@ -15,7 +15,6 @@ from functools import partial
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import GatewayError, ParametersError, QueryError, ReplyTimeoutError, ServerError
-from gateway.logs.failures import FailureLog
 from gateway.queries.answers import (
     QueryHistory,
     Reading,
@@ -28,7 +27,8 @@ from gateway.queries.answers import (
 from gateway.queries.server_requests import NOT_ACCEPTED, ServerRequests
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.replies import Connection, XmlThread
+from gateway.runtime.failures import FailureLog
+from gateway.session.replies import Connection, XmlThread
 
 logger = logging.getLogger(__name__)
 

@@ -7,13 +7,13 @@ from urllib.parse import unquote
 import rtc3d
 
 from gateway.errors import QueryError
-from gateway.logs.safe_text import quoted
 from gateway.messages.history import WantedMessages
 from gateway.messages.host_time import now_utime
+from gateway.messages.take_names import check_name
 from gateway.outputs.contract import KeyPath
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from gateway.takes.files.new_file import check_name
+from gateway.runtime.safe_text import quoted
 
 SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 """The message types, and the types they contain."""

@@ -11,15 +11,15 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import CommandError, GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
-from gateway.logs.failures import DefectLog
+from gateway.messages.take_names import name_of_file
 from gateway.queries.answers import QueryHistory
 from gateway.rtc3d.commands import Command, ControlRecording, recording_duration_s, recording_options
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
-from gateway.stream.process_clock import RunningTimeout
-from gateway.stream.replies import Connection
-from gateway.stream.status import StreamStatus
-from gateway.takes.files.new_file import name_of_file
+from gateway.runtime.failures import DefectLog
+from gateway.session.process_clock import RunningTimeout
+from gateway.session.replies import Connection
+from gateway.session.status import StreamStatus
 
 _Result = TypeVar("_Result")
 

@@ -10,11 +10,10 @@ from functools import partial
 from typing import Any, Final, Protocol
 
 from gateway.config.settings import SourceSettings
-from gateway.descriptions.source_frame import source_frame
 from gateway.errors import FrameError, QueryError
-from gateway.logs.safe_text import quoted
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import JSON, LCM_MESSAGES, XML, json_bytes, message_type, prefix_of
+from gateway.messages.descriptions.source_frame import source_frame
 from gateway.messages.encode import NOT_PUBLISHED, Stamp, encode_message
 from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages, pack_messages
 from gateway.messages.host_time import now_utime
@@ -37,8 +36,9 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
 from gateway.rtc3d.parameters import SECTIONS, Parameters
-from gateway.stream.state import StreamState
-from gateway.token_bucket import TokenBucket
+from gateway.runtime.safe_text import quoted
+from gateway.runtime.token_bucket import TokenBucket
+from gateway.session.state import StreamState
 
 CONTROLS_PER_S: Final = 4.0
 """How many commands a second that start, stop or change something are carried out."""

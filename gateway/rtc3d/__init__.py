@@ -9,7 +9,7 @@ From the bytes upwards:
 - ``parameters`` (§6): what a server says about itself, and the table of its elements and attributes in XML.
   ``parameters_xml`` reads and writes them.
 - ``client_protocol``: one connection as a client sees it, with its states. ``reply_matcher`` finds out which
-  command a reply answers, because replies do not say so. The server's side is in ``gateway.rtc3d_server``.
+  command a reply answers, because replies do not say so. The server's side is in ``gateway.session.server``.
 
 Be strict in what is sent and liberal in what is accepted: docs/design.md lists what real servers do. Sizes
 and counts from the network are checked here, before anything is allocated or read by them.

@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gateway.errors import ClosedError, FrameError, LinkError, PacketError, ServerError
-from gateway.logs.safe_text import safe_text
 from gateway.rtc3d.commands import (
     Bye,
     Command,
@@ -34,6 +33,7 @@ from gateway.rtc3d.packets import (
     encode_packet,
 )
 from gateway.rtc3d.reply_matcher import Match, ReplyMatcher
+from gateway.runtime.safe_text import safe_text
 
 
 class ProtocolState(Enum):

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from gateway.errors import CommandError
-from gateway.logs.safe_text import quoted
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.packets import decode_text
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.runtime.safe_text import quoted
 
 # "Event" is an alias that some clients use.
 _COMPONENT_BY_WORD: Final = {component.command_word: component for component in WIRE_ORDER} | {

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from math import nan
 from typing import Annotated, Any, Final, NamedTuple
 
-from gateway.logs.safe_text import quoted
+from gateway.runtime.safe_text import quoted
 
 
 class At(NamedTuple):

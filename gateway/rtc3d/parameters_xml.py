@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 from lxml import etree
 
 from gateway.errors import ParametersError
-from gateway.logs.safe_text import quoted, safe_text
 from gateway.rtc3d.parameters import LAYOUT, PARENT_TAGS, ROOT, SECTIONS, TAGS, Parameters, only_sections
+from gateway.runtime.safe_text import quoted, safe_text
 
 MAX_XML_BYTES: Final = 1024 * 1024
 """Larger documents are not parsed. This is enough for about 8000 markers; parsing takes 1.4 s at worst."""

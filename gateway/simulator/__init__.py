@@ -1,6 +1,6 @@
 """The simulator: an RT server with synthetic or recorded scenes, and with faults on request.
 
-The server itself is ``gateway.rtc3d_server``. A scene tells it which frames there are at which time:
+The server itself is ``gateway.session.server``. A scene tells it which frames there are at which time:
 
 - ``synthetic``: computed from the time alone, of the ``bodies`` and force plates that move in it.
 - ``c3d_scene``: a C3D file, which a child process with limits reads, because files may be malformed;

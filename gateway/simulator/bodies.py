@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from gateway.rtc3d.components import ITEM_DTYPES, MISSING, MISSING_MARKER, ComponentType, Items
 from gateway.rtc3d.parameters import ForceChannel, ParametersForce, Plate, Point
-from gateway.rtc3d_server.scene import SampleNumbers
+from gateway.session.server.scene import SampleNumbers
 
 Floats = npt.NDArray[np.floating[Any]]
 

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from gateway.c3d_files.receiving import BIG_ENDIAN, DEC, parameter_places, parameters_start
+from gateway.session.c3d_files.receiving import BIG_ENDIAN, DEC, parameter_places, parameters_start
 
 _SAME_RATE: Final = 1e-4
 """The relative difference of rates that are equal but for rounding, such as 59.94 and 59.94006 Hz."""

@@ -12,9 +12,8 @@ from typing import Any, BinaryIO, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gateway.c3d_files.receiving import PARAMETERS_END_BYTES, problem_of_sizes
-from gateway.descriptions.labels import UNUSED, common
 from gateway.errors import TakeError
+from gateway.messages.descriptions.labels import UNUSED, common
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, MISSING_MARKER, ComponentType, Items
 from gateway.rtc3d.parameters import (
     AnalogChannel,
@@ -31,7 +30,8 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
-from gateway.rtc3d_server.scene import NO_EVENTS
+from gateway.session.c3d_files.receiving import PARAMETERS_END_BYTES, problem_of_sizes
+from gateway.session.server.scene import NO_EVENTS
 from gateway.simulator.bodies import force_channels
 from gateway.simulator.c3d_header import Correction, corrections, stated_frames
 

@@ -19,14 +19,14 @@ from typing import Final
 
 import numpy as np
 
-from gateway.c3d_files.receiving import PARAMETERS_END_BYTES, problem_of_c3d, problem_of_sizes
 from gateway.config.files import check_is_file
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType, Items
-from gateway.rtc3d_server.measurement import ComputedScene, exact_rate, time_us
-from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
+from gateway.runtime.workers import module_environment
+from gateway.session.c3d_files.receiving import PARAMETERS_END_BYTES, problem_of_c3d, problem_of_sizes
+from gateway.session.server.measurement import ComputedScene, exact_rate, time_us
+from gateway.session.server.scene import NO_EVENTS, SampleNumbers
 from gateway.simulator.c3d_recording import C3dRecording, load_recording
-from gateway.workers import module_environment
 
 _SECOND_US: Final = 1_000_000
 _log = logging.getLogger(__name__)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from gateway.rtc3d.packets import Packet, PacketType
-from gateway.rtc3d_server.client_connection import ClientConnection, ConnectionFilter
-from gateway.rtc3d_server.client_session import error_packet
-from gateway.rtc3d_server.measurement import call_after_us
+from gateway.session.server.client_connection import ClientConnection, ConnectionFilter
+from gateway.session.server.client_session import error_packet
+from gateway.session.server.measurement import call_after_us
 from gateway.simulator.faults import ActiveFault, LastingConnectionFault, PendingWrite, Reply, packet_type_of
 
 MAX_WAITING_BYTES: Final = 4 * 1024 * 1024

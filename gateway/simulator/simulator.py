@@ -16,9 +16,9 @@ from gateway.config.loading import load_as
 from gateway.config.section import Section, expects, validation_error
 from gateway.config.words import describe, spelling_hint
 from gateway.errors import ConfigError, GatewayError
-from gateway.rtc3d_server.client_connection import ClientConnection
-from gateway.rtc3d_server.scene import Scene
-from gateway.rtc3d_server.server import RtServer
+from gateway.session.server.client_connection import ClientConnection
+from gateway.session.server.scene import Scene
+from gateway.session.server.server import RtServer
 from gateway.simulator.fault_pipeline import ActiveConnectionFaults, FaultPipeline
 from gateway.simulator.faults import (
     MOMENTARY_FAULTS,

@@ -26,8 +26,8 @@ from gateway.rtc3d.parameters import (
     relabelled,
 )
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.measurement import ComputedScene
-from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers, Scene
+from gateway.session.server.measurement import ComputedScene
+from gateway.session.server.scene import NO_EVENTS, SampleNumbers, Scene
 from gateway.simulator.bodies import ForcePlates, Noise, RigidBodies
 
 BUTTON_EVENT: Final = 0x123456

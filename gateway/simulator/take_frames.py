@@ -18,8 +18,8 @@ from gateway.messages.texts import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
-from gateway.rtc3d_server.measurement import exact_rate
-from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket
+from gateway.session.server.measurement import exact_rate
+from gateway.session.server.scene import NOT_YET_US, DataPacket
 from gateway.simulator.take_moments import (
     Moment,
     MomentBuilder,

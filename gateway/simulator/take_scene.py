@@ -12,14 +12,14 @@ from statistics import median_low
 from typing import Final, NamedTuple
 
 from gateway.errors import SelectionError, TakeError
-from gateway.logs.safe_text import quoted, safe_text
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.rtc3d.parameters_xml import cut_sections
+from gateway.runtime.safe_text import quoted, safe_text
+from gateway.runtime.workers import WorkerThread
 from gateway.simulator.take_frames import LATE_US, RecordedFrames, TakePass
 from gateway.simulator.take_moments import Moment, RecordedParameters, derived_parameters
 from gateway.takes.files.reader import TakeReader
-from gateway.workers import WorkerThread
 
 _AHEAD_US: Final = 3_000_000
 _MAX_AHEAD_BYTES: Final = 64 * 1024 * 1024

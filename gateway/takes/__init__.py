@@ -6,7 +6,8 @@ In ``files``:
 
 - Writing: ``take_writer`` is a take that is being written. ``writer_thread`` has one thread for all files and
   a queue with a limit in front of it. ``description`` says what is at the beginning and at the end of a file;
-  ``new_file`` checks names. The output ``takes`` and the command ``record`` are built on these.
+  ``new_file`` gives a file its name when it is complete. The output ``takes`` and the command ``record`` are
+  built on these.
 - Reading: ``event_log`` reads events one after the other and goes on behind damage. ``reader`` adds what each
   of them is: the source, the component or kind of message.
 - Arrays: ``take`` and ``series`` decode a take into numpy arrays; ``component_rows`` does so for many
@@ -15,8 +16,9 @@ In ``files``:
 - Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
   with what interrupts it.
 
-``recorder`` records what gateways publish as one of their subscribers; in the gateway itself, the output
-``takes`` does. ``replay`` publishes a take again, and ``export`` converts it for other programs.
+``export`` converts takes for other programs. What records takes is elsewhere: ``gateway.client.recorder`` as
+a subscriber, and the output ``gateway.outputs.takes`` in the gateway itself. ``gateway.tools.replay``
+publishes a take again.
 """
 
 from typing import TYPE_CHECKING, Any

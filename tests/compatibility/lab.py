@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple
 import rtc3d
 import zenoh
 
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
-from gateway.rtc3d_server.scene import Scene
-from gateway.service.gateway import Gateway
+from gateway.session.server.scene import Scene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.take_scene import TakeScene
 from tests.compatibility.comparing import kinds

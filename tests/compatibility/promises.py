@@ -21,8 +21,8 @@ from pydantic import BaseModel
 from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
-from gateway.cli.main import ALIASES, EXIT_STATUSES, app
 from gateway.config.loading import schema_text
+from gateway.tools.cli.main import ALIASES, EXIT_STATUSES, app
 from tests.support.configurations import MODEL
 from tests.support.documents import ROOT
 

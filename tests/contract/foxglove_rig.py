@@ -6,9 +6,9 @@ import socket
 import threading
 from typing import Any
 
+from gateway.outputs.adapters.foxglove.output import FoxgloveOutput
+from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
 from gateway.outputs.contract import Output
-from gateway.outputs.foxglove.output import FoxgloveOutput
-from gateway.outputs.foxglove.settings import FoxgloveSettings
 from tests.contract.frame_rigs import SOURCES, ListeningRig
 from tests.support.foxglove_viewer import Viewer, client_frame, upgrade_request
 from tests.support.networks import free_port

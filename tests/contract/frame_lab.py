@@ -23,7 +23,7 @@ from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
-from gateway.workers import make_call
+from gateway.runtime.workers import make_call
 from tests.contract.frame_rigs import (
     ALL,
     LAB,

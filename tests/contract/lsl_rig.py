@@ -7,9 +7,9 @@ import tempfile
 from pathlib import Path
 from typing import ClassVar, Final
 
+from gateway.outputs.adapters.lsl.output import LslOutput
+from gateway.outputs.adapters.lsl.settings import LslSettings
 from gateway.outputs.contract import Output
-from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.settings import LslSettings
 from tests.contract.frame_rigs import SOURCES, FrameRig, Received
 from tests.contract.memory_lsl import MemoryRig
 from tests.support.lsl_receiver import LslReceiver, lsl_config

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 from unittest.mock import patch
 
+from gateway.outputs.adapters.lsl import supervisor
+from gateway.outputs.adapters.lsl.output import LslOutput
+from gateway.outputs.adapters.lsl.process import _LslProcess
+from gateway.outputs.adapters.lsl.settings import LslSettings
 from gateway.outputs.contract import Output
-from gateway.outputs.lsl import supervisor
-from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.process import _LslProcess
-from gateway.outputs.lsl.settings import LslSettings
 from tests.contract.frame_rigs import SOURCES, FrameRig, Received
 
 _PER_TOOL = 8

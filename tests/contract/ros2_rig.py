@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import zenoh
 
+from gateway.outputs.adapters.ros2.output import Ros2Output
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.contract import Output
-from gateway.outputs.ros2.output import Ros2Output
-from gateway.outputs.ros2.settings import Ros2Settings
 from tests.contract.frame_rigs import FrameRig, Received
 from tests.support import ros_messages as ros
 from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys

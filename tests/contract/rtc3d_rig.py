@@ -7,15 +7,15 @@ import struct
 import threading
 from typing import ClassVar, Final
 
+from gateway.outputs.adapters.rtc3d.output import Rtc3dOutput
+from gateway.outputs.adapters.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.contract import Output
-from gateway.outputs.rtc3d.output import Rtc3dOutput
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from tests.contract.frame_rigs import HALL, LAB, ListeningRig
 from tests.support.networks import free_port
 from tests.support.waiting import wait_until
-from tests.unit.rtc3d_server.wire import DATA, command
+from tests.unit.session.server.wire import DATA, command
 
 HEADER: Final = struct.Struct(">II")
 

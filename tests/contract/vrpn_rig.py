@@ -6,9 +6,9 @@ import struct
 import threading
 from typing import ClassVar, Final
 
+from gateway.outputs.adapters.vrpn.output import VrpnOutput
+from gateway.outputs.adapters.vrpn.settings import VrpnSettings
 from gateway.outputs.contract import Output
-from gateway.outputs.vrpn.output import VrpnOutput
-from gateway.outputs.vrpn.settings import VrpnSettings
 from tests.contract.frame_rigs import ListeningRig
 from tests.support.networks import free_port
 from tests.support.vrpn_client import COOKIE

@@ -19,11 +19,11 @@ import typer.core
 import yaml
 import zenoh
 
-from gateway.cli.main import app
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
 from gateway.messages.encode import ITEMS_OFFSET, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.simulator import load_scenario
+from gateway.tools.cli.main import app
 from tests.support.configurations import MODEL, load
 from tests.support.documents import ROOT, Block, all_blocks, blocks, documents
 from tests.support.fresh_clones import clone_into, files_in

@@ -17,7 +17,6 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["gateway"]):
-    from gateway.cli.take_report import statistics_json
     from gateway.errors import (
         CommandError,
         ConfigError,
@@ -36,6 +35,7 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
     from gateway.takes import open_take
     from gateway.takes.files.statistics import take_statistics
+    from gateway.tools.cli.take_report import statistics_json
     from tests.support.configurations import load
     from tests.support.takes import encode_event
 

@@ -20,7 +20,7 @@ from typing import Final
 from tests.support.foxglove_viewer import PING, client_frame, upgrade_request
 from tests.support.networks import free_port
 from tests.support.vrpn_client import COOKIE, PING_TYPE, description, message
-from tests.unit.rtc3d_server.wire import DATA, EVENT, command, packet
+from tests.unit.session.server.wire import DATA, EVENT, command, packet
 
 Attack = Callable[[int], Awaitable[None]]
 """Attacks a port on this computer until it is cancelled. If it ends, or raises OSError, it begins again."""

@@ -18,7 +18,7 @@ import rtc3d
 
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
-from gateway.workers import MAX_BYTES
+from gateway.runtime.workers import MAX_BYTES
 from tests.hostile.gateway_under_attack import (
     MAX_SILENCE_S,
     GatewayUnderAttack,

@@ -22,7 +22,7 @@ from tests.support.lsl_receiver import LslReceiver, lsl_config
 from tests.support.networks import free_port
 from tests.support.vrpn_client import VrpnClient
 from tests.support.waiting import wait_until_async
-from tests.unit.rtc3d_server.wire import COMMAND
+from tests.unit.session.server.wire import COMMAND
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(300)]
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Protocol
 
-from tests.unit.rtc3d_server.wire import DATA, ByteOrder, WireComponent, command, components_in
+from tests.unit.session.server.wire import DATA, ByteOrder, WireComponent, command, components_in
 
 TIMEOUT_S = 120.0
 

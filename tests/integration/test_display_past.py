@@ -9,9 +9,9 @@ import pytest
 import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.display.live import LiveData, LiveSource
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.tools.display.live import LiveData, LiveSource
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import run_gateway
 from tests.support.waiting import wait_until, wait_until_async

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from gateway.outputs.foxglove.output import FoxgloveOutput
-from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.daemon.gateway import Gateway
+from gateway.outputs.adapters.foxglove.output import FoxgloveOutput
+from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import ExportJob, export_take

@@ -9,13 +9,13 @@ import pytest
 import rtc3d
 
 from gateway.config.settings import HistorySettings
+from gateway.daemon.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.history import WantedMessages, sequence_of, unpack_messages
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import ComponentType
-from gateway.service.gateway import Gateway
 from tests.support.networks import lcm_url
 from tests.support.queried_gateway import (
     ParameterServer,

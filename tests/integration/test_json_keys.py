@@ -12,8 +12,8 @@ import pytest
 import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.display.live import LiveData
 from gateway.takes.files.event_log import EventLogReader
+from gateway.tools.display.live import LiveData
 from tests.support.commands import run_command
 from tests.support.configurations import write_config
 from tests.support.gateway_process import program, simulator

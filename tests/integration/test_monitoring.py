@@ -18,19 +18,16 @@ import yaml
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
-from gateway.config.settings import (
-    MetricsSettings,
-    StreamSettings,
-)
+from gateway.config.settings import MetricsSettings, StreamSettings
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
-from gateway.service.gateway import Gateway
+from gateway.session.state import StreamState
+from gateway.session.status import StreamStatus
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
 from tests.support.configurations import local_source, make_settings
 from tests.support.documents import ROOT
 from tests.support.gateways import monitored_gateway
@@ -254,7 +251,7 @@ async def test_the_log_format_option_selects_the_format() -> None:
     assert program.returncode == 0
     lines = [json.loads(line) for line in errors.splitlines()]
     assert {"info"} == {line["level"] for line in lines}
-    assert all(line["logger"].startswith("gateway.rtc3d_server") for line in lines)
+    assert all(line["logger"].startswith("gateway.session.server") for line in lines)
 
 
 async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.LogCaptureFixture) -> None:
@@ -262,7 +259,7 @@ async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.
         port = other.getsockname()[1]
         async with simulator() as server, monitored_gateway(lab(server.port, port)) as gateway:
             await until_all(gateway, lambda status: status.state is StreamState.STREAMING)
-    [warning] = [record for record in caplog.records if record.name == "gateway.service.monitoring.server"]
+    [warning] = [record for record in caplog.records if record.name == "gateway.daemon.monitoring.server"]
     assert warning.levelno == logging.WARNING
     assert re.search(f"port {port}: .*metrics.port", warning.message)
 

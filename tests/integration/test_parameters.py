@@ -12,11 +12,11 @@ import rtc3d
 import zenoh
 import zenoh.ext
 
+from gateway.daemon.gateway import Gateway
 from gateway.messages.decode import decode, prefix_of
 from gateway.outputs.lcm import output as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.service.gateway import Gateway
 from gateway.simulator.faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene

@@ -8,8 +8,8 @@ import pytest
 from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
 from tests.support.proxy import FuzzingProxy
-from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, command, packet
+from tests.unit.session.server.counting_scene import CountingScene
+from tests.unit.session.server.wire import COMMAND, command, packet
 
 VERSION = (COMMAND, b"OK-Version 1.0")
 REPLY = packet(*VERSION)

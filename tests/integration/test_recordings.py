@@ -13,14 +13,14 @@ import numpy.typing as npt
 import pytest
 
 from gateway.config.settings import StreamSettings
+from gateway.daemon.gateway import Gateway
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
-from gateway.rtc3d_server.scene import Scene
-from gateway.service.gateway import Gateway
+from gateway.session.server.scene import Scene
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import MetricsSettings, Settings
+from gateway.daemon.daemon import Daemon
+from gateway.daemon.gateway import Gateway
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.service.daemon import Daemon
-from gateway.service.gateway import Gateway
 from tests.support.configurations import local_settings, local_source
 from tests.support.gateways import running_gateway
 from tests.support.networks import free_endpoint, free_port, lcm_url, zenoh_keys

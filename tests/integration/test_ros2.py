@@ -10,11 +10,11 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.messages.ros2 import ROS_TYPES
+from gateway.daemon.gateway import Gateway
+from gateway.messages.ros2.encode import ROS_TYPES
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.configurations import local_settings, local_source

@@ -14,11 +14,11 @@ from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.rtc3d_server.scene import Scene
+from gateway.session.server.scene import Scene
+from gateway.session.state import StreamState
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.support.gateways import ServingGateway, serving_gateway
 from tests.support.networks import zenoh_keys
 from tests.support.waiting import wait_until_async

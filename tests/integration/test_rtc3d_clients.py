@@ -9,8 +9,8 @@ from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import connected, consecutive, until
 from tests.support.gateways import playing, serving_gateway
 from tests.support.networks import free_port
-from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
+from tests.unit.session.server.counting_scene import CountingScene
+from tests.unit.session.server.wire import (
     COMMAND,
     DATA,
     ERROR,

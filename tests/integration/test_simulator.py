@@ -13,8 +13,8 @@ import pytest
 from gateway.errors import GatewayError
 from gateway.rtc3d.parameters import General
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.rtc3d_server.client_connection import LIMITS
-from gateway.rtc3d_server.server import RtServer
+from gateway.session.server.client_connection import LIMITS
+from gateway.session.server.server import RtServer
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.raw_client import (
@@ -28,8 +28,8 @@ from tests.integration.raw_client import (
 )
 from tests.support.gateways import serving_gateway
 from tests.support.needs import need_ipv6
-from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
+from tests.unit.session.server.counting_scene import CountingScene
+from tests.unit.session.server.wire import (
     ANALOG,
     COMMAND,
     DATA,
@@ -166,7 +166,7 @@ async def test_names_of_clients_have_brackets_if_the_address_is_one_of_ipv6(
 
 
 async def test_commands_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("DEBUG", "gateway.rtc3d_server")
+    caplog.set_level("DEBUG", "gateway.session.server")
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         await client.ask("Version 1.0\0")
         await client.ask("x" * 1000)

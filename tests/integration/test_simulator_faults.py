@@ -10,23 +10,14 @@ from contextlib import asynccontextmanager
 import pytest
 
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.rtc3d_server.client_connection import ClientConnection
-from gateway.simulator.faults import (
-    Cut,
-    Delay,
-    Fault,
-    HalfOpen,
-    Merge,
-    NoMeasurement,
-    Restart,
-    Split,
-)
+from gateway.session.server.client_connection import ClientConnection
+from gateway.simulator.faults import Cut, Delay, Fault, HalfOpen, Merge, NoMeasurement, Restart, Split
 from gateway.simulator.packet_faults import LateAcknowledgements
 from gateway.simulator.simulator import KINDS, Simulator
 from gateway.simulator.synthetic import SceneSettings
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
-from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, NO_DATA, command, packets_in
+from tests.unit.session.server.counting_scene import CountingScene
+from tests.unit.session.server.wire import COMMAND, NO_DATA, command, packets_in
 
 FAST_HZ = 1000.0
 NEVER_MS = 600_000
@@ -69,7 +60,7 @@ async def clear_and_check(simulator: Simulator, client: RawClient) -> None:
 
 async def test_a_restarted_server_plays_its_recording_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """With ``once``, each measurement waits for the first request for frames again."""
-    monkeypatch.setattr("gateway.rtc3d_server.measurement.LEAD_US", 10_000)
+    monkeypatch.setattr("gateway.session.server.measurement.LEAD_US", 10_000)
     async with Simulator(CountingScene(FAST_HZ, num_frames=30), once=True) as simulator:
         for _ in range(2):
             async with connected(simulator) as client:

@@ -29,7 +29,7 @@ ROUNDS: Final = 3
 
 WAITER: Final = """
 import asyncio, contextlib, os, uvloop
-from gateway.stream.process_clock import RunningTimeout
+from gateway.session.process_clock import RunningTimeout
 
 async def wait_for_bytes():
     loop = asyncio.get_running_loop()

@@ -11,11 +11,11 @@ from gateway.config.settings import StreamSettings
 from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, decode_text
-from gateway.rtc3d_server.client_connection import ClientConnection, ConnectionFilter
-from gateway.rtc3d_server.server import RtServer
+from gateway.session.server.client_connection import ClientConnection, ConnectionFilter
+from gateway.session.server.server import RtServer
+from gateway.session.state import StreamState
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.support.gateways import MemoryGateway, run_gateway
 
 ONE_CONNECTION = "analog and force arrive at 200 Hz instead of 2000 Hz: "

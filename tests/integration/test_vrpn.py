@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from gateway.outputs.vrpn.output import VrpnOutput
-from gateway.outputs.vrpn.settings import VrpnSettings
-from gateway.service.gateway import Gateway
+from gateway.daemon.gateway import Gateway
+from gateway.outputs.adapters.vrpn.output import VrpnOutput
+from gateway.outputs.adapters.vrpn.settings import VrpnSettings
 from tests.support.configurations import local_settings, local_source
 from tests.support.gateways import running_gateway
 from tests.support.needs import need

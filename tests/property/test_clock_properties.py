@@ -3,7 +3,7 @@ from itertools import combinations, pairwise
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateway.stream.clock import Sample, ServerClock, envelope_slope
+from gateway.session.clock import Sample, ServerClock, envelope_slope
 from tests.support.clock_simulation import EPOCH_UTIME, observe, percentile_95_us, simulate
 
 EXTREMES_US = (0, -1, 1, -(2**63), 2**63 - 1, 2**32 - 1, 2**32, -(2**32))

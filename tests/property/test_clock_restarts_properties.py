@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.stream.clock import ServerClock
+from gateway.session.clock import ServerClock
 from tests.support.clock_simulation import Frames, observe, simulate
 
 TOLERANCE_US = 3_000

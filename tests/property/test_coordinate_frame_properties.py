@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.config.settings import SourceSettings
-from gateway.descriptions.source_frame import source_frame
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.descriptions.source_frame import source_frame
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters
 

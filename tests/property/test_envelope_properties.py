@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.display.view.plots import COLUMN_US, NUM_COLUMNS, Envelope
+from gateway.tools.display.view.plots import COLUMN_US, NUM_COLUMNS, Envelope
 
 START_UTIME = 1_700_000_000_000_000
 

@@ -10,7 +10,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.doctor.observation import ObservedComponent
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode, to_json
 from gateway.messages.summary import summarise
@@ -19,10 +18,11 @@ from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
 from gateway.rtc3d.frames import encode_frame, split_frame
-from gateway.stream.ingest import Ingest
-from gateway.stream.rate_check import RateWatch
-from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
+from gateway.session.ingest import Ingest
+from gateway.session.rate_check import RateWatch
+from gateway.session.state import StreamState
+from gateway.session.status import StreamStatus
+from gateway.tools.doctor.observation import ObservedComponent
 from tests.support.examples import examples
 from tests.support.memory_output import MemoryOutput
 

@@ -20,7 +20,7 @@ from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import split_frame
-from gateway.stream.status import StreamStatus
+from gateway.session.status import StreamStatus
 from tests.support.strategies import damaged
 from tests.support.vectors import FULL_FRAME, ByteOrder
 

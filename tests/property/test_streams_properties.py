@@ -15,7 +15,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from gateway.stream.state import StreamState
+from gateway.session.state import StreamState
 from tests.support.automatic_streams import STALL_TIMEOUT_S, ScriptedStream, StreamsLab, announcing
 from tests.support.examples import examples
 

@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from gateway.cli.take_report import statistics_json, write_report
 from gateway.errors import ProtocolError, TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
@@ -27,8 +26,9 @@ from gateway.takes import open_take
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
-from gateway.takes.replay.play_list import Entry, SeekIndex, Selection, play_list
-from gateway.takes.replay.timeline import ReplayTimeline
+from gateway.tools.cli.take_report import statistics_json, write_report
+from gateway.tools.replay.play_list import Entry, SeekIndex, Selection, play_list
+from gateway.tools.replay.timeline import ReplayTimeline
 from tests.support.examples import examples
 from tests.support.recording_output import events as recorded_events
 from tests.support.recording_output import still_lab

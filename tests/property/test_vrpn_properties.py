@@ -2,7 +2,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import PeerError
-from gateway.outputs.vrpn.protocol import (
+from gateway.outputs.adapters.vrpn.protocol import (
     COOKIE,
     MAX_BODY_BYTES,
     MAX_NAME_BYTES,
@@ -11,7 +11,7 @@ from gateway.outputs.vrpn.protocol import (
     describe_tracker,
     encode_pose,
 )
-from gateway.outputs.vrpn.trackers import MAX_TRACKERS, TrackerNames, Trackers
+from gateway.outputs.adapters.vrpn.trackers import MAX_TRACKERS, TrackerNames, Trackers
 from tests.support.strategies import damaged, pieces_of
 
 PING_TYPE = 7

@@ -19,10 +19,10 @@ from gateway.rtc3d.parameters import (
     ParametersForce,
     Plate,
 )
-from gateway.stream.state import Phase, StreamState
-from gateway.stream.status import StreamStatus
-from gateway.stream.streams import AutomaticStreams
-from gateway.stream.supervisor import Listener, Supervisor
+from gateway.session.state import Phase, StreamState
+from gateway.session.status import StreamStatus
+from gateway.session.streams import AutomaticStreams
+from gateway.session.supervisor import Listener, Supervisor
 
 STALL_TIMEOUT_S = 3.0
 

@@ -7,7 +7,7 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from gateway.stream.clock import ServerClock
+from gateway.session.clock import ServerClock
 
 EPOCH_UTIME: Final = 1_700_000_000_000_000
 LEAST_DELAY_US: Final = 300

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 from unittest.mock import patch
 
-import gateway.cli
-from gateway.cli import main
+import gateway.tools.cli
+from gateway.tools.cli import main
 
 _TIMEOUT_S: Final = 120.0
 _LOCK: Final = threading.Lock()
@@ -31,8 +31,13 @@ _LOCK: Final = threading.Lock()
 _FORKS: Final = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
     [
-        *(f"gateway.cli.{module.name}" for module in pkgutil.iter_modules(gateway.cli.__path__)),
-        *("gateway.doctor.all_checks", "gateway.display.top.app", "zenoh", "tests.support.commands"),
+        *(f"gateway.tools.cli.{module.name}" for module in pkgutil.iter_modules(gateway.tools.cli.__path__)),
+        *(
+            "gateway.tools.doctor.all_checks",
+            "gateway.tools.display.top.app",
+            "zenoh",
+            "tests.support.commands",
+        ),
     ]
 )
 

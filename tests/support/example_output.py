@@ -11,7 +11,6 @@ from typing import Any, Final
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
 from gateway.errors import OutputError
-from gateway.logs.losses import Losses
 from gateway.messages.decode import TEXT
 from gateway.messages.encode import Stamp
 from gateway.messages.topics import Topic
@@ -27,6 +26,7 @@ from gateway.outputs.contract import (
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, SubscriptionRequest
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.runtime.losses import Losses
 
 UNREACHABLE: Final = "unreachable"
 """The address that never opens."""

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
-from gateway.doctor.all_checks import run_checks
 from gateway.outputs.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.tools.doctor.all_checks import run_checks
 from tests.support import servers
 from tests.support.configurations import make_settings
 from tests.support.errors import names

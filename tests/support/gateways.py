@@ -5,19 +5,19 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import Any, Final, Protocol
 
+from gateway.daemon.gateway import Gateway
+from gateway.daemon.monitoring.server import MonitoringServer
 from gateway.messages.decode import decode
+from gateway.outputs.adapters.rtc3d.live_server import LiveServer
+from gateway.outputs.adapters.rtc3d.output import Rtc3dOutput
+from gateway.outputs.adapters.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.contract import Output
-from gateway.outputs.rtc3d.live_server import LiveServer
-from gateway.outputs.rtc3d.output import Rtc3dOutput
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
-from gateway.service.gateway import Gateway
-from gateway.service.monitoring.server import MonitoringServer
 from gateway.simulator.simulator import Simulator
 from tests.support.configurations import local_settings, local_source
 from tests.support.memory_output import MemoryOutput
 from tests.support.networks import free_port
 from tests.support.waiting import wait_until_async
-from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.session.server.counting_scene import CountingScene
 
 _STOP_TIMEOUT_S: Final = 60.0
 

@@ -6,7 +6,7 @@ These are the XML, word for word, and the parameters as a human reads them.
 from pathlib import Path
 
 from gateway.config.settings import SourceSettings
-from gateway.descriptions.source_frame import source_frame
+from gateway.messages.descriptions.source_frame import source_frame
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.parameters import (
     AnalogChannel,

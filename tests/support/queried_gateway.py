@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from gateway.config.settings import SpoolSettings
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
@@ -17,7 +18,6 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
-from gateway.service.gateway import Gateway
 from tests.support.configurations import local_settings, local_source
 from tests.support.gateways import running_gateway
 from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys

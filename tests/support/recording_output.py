@@ -18,10 +18,10 @@ from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_takes import SourceTakes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.runtime.workers import WorkerThread, make_call
 from gateway.takes.files.event_log import Event
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES, WriterThread
-from gateway.workers import WorkerThread, make_call
 from tests.support.clocks import Clock
 from tests.support.waiting import wait_until_async
 

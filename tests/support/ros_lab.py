@@ -8,9 +8,9 @@ import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
+from gateway.outputs.adapters.ros2.output import Ros2Output
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.contract import FramePublisher, ServerParameters
-from gateway.outputs.ros2.output import Ros2Output
-from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
     MISSING,

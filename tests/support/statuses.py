@@ -5,7 +5,7 @@ from typing import Any
 
 import rtc3d
 
-from gateway.logs.losses import Loss
+from gateway.runtime.losses import Loss
 
 
 def stream(components: str = "3d 6d", state: str = "streaming", **fields: Any) -> rtc3d.stream_status_t:

@@ -14,7 +14,7 @@ from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, Component, ComponentType, encode_component
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.measurement import exact_rate
+from gateway.session.server.measurement import exact_rate
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.files.description import SourceDescription, TakeDetails

@@ -44,7 +44,7 @@ async def test_the_program_and_its_man_page_are_installed(machine: Machine) -> N
     where = "import gateway, os; print(os.path.realpath(gateway.__file__))"
     assert (await machine.run(f"{VENV}/bin/python", "-c", where)).text.startswith(f"{VENV}/lib")
     page = machine.path(MAN_PAGE).read_text()
-    assert page == (await machine.run(f"{VENV}/bin/python", "-P", "-m", "gateway.cli.man_page")).text
+    assert page == (await machine.run(f"{VENV}/bin/python", "-P", "-m", "gateway.tools.cli.man_page")).text
     assert ".SS config check" in page
     assert machine.path(MAN_PAGE).stat().st_mode & 0o777 == 0o644
     assert all("_RTC3D_GATEWAY_COMPLETE=complete_" in machine.path(path).read_text() for path in COMPLETIONS)

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from tests.support.clocks import Clock, VirtualTimeLoop
-from tests.unit.service.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.daemon.scripted_sources import Servers, SlowThreads, use_scripted_servers
 
 _IN_VIRTUAL_TIME: Final = {
     "test_daemon.py",

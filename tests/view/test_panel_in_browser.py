@@ -9,13 +9,13 @@ from typing import Any, Final
 import pytest
 from playwright.sync_api import Page, expect
 
-from gateway.display.view.panel import Panel
-from gateway.display.view.viewer import PERIOD_S, ViewServer
 from gateway.rtc3d.components import ComponentType
+from gateway.tools.display.view.panel import Panel
+from gateway.tools.display.view.viewer import PERIOD_S, ViewServer
 from tests.support.browser import NewPage, chromium, new_page
 from tests.support.statuses import stream
-from tests.unit.display.live_lab import Lab
-from tests.unit.display.view.conftest import server
+from tests.unit.tools.display.live_lab import Lab
+from tests.unit.tools.display.view.conftest import server
 
 pytestmark = pytest.mark.chromium
 

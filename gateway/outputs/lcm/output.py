@@ -12,13 +12,13 @@ from typing import Final
 import lcm
 
 from gateway.errors import OutputError
-from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters, encode_parameters
 from gateway.outputs.lcm.requests import LONG_REPLY_BYTES, LcmRequests
 from gateway.outputs.lcm.sender import LcmPublisher, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.runtime.losses import Losses
 
 logger = logging.getLogger(__name__)
 

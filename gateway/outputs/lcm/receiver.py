@@ -18,7 +18,6 @@ from typing import Final, TypeVar
 import lcm
 
 from gateway.errors import OutputError
-from gateway.logs.failures import FailureLog
 from gateway.outputs.lcm.connection import (
     Waiting,
     multicast_destination,
@@ -29,8 +28,9 @@ from gateway.outputs.lcm.connection import (
     send_problem,
 )
 from gateway.outputs.lcm.sender import RETRY_S
-from gateway.token_bucket import TokenBucket
-from gateway.workers import WorkerThread, thread_starts
+from gateway.runtime.failures import FailureLog
+from gateway.runtime.token_bucket import TokenBucket
+from gateway.runtime.workers import WorkerThread, thread_starts
 
 _MAGIC: Final = b"LC02"
 """Begins a datagram with a whole message. Those with fragments of one are ignored."""

@@ -19,9 +19,6 @@ import lcm
 import rtc3d
 
 from gateway.errors import OutputError, QueryError
-from gateway.logs.failures import log_fields
-from gateway.logs.losses import Losses
-from gateway.logs.safe_text import quoted
 from gateway.messages.decode import JSON, LCM_MESSAGES, json_bytes
 from gateway.messages.history import unpack_messages
 from gateway.messages.texts import xml_text
@@ -32,7 +29,10 @@ from gateway.outputs.lcm.sender import LcmSender, LcmThreadSender, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.other_gateways import OtherGateways
 from gateway.outputs.query_admission import QueryAdmission, QueryDefects, QueryLimits, Refusal
-from gateway.workers import WorkerThread
+from gateway.runtime.failures import log_fields
+from gateway.runtime.losses import Losses
+from gateway.runtime.safe_text import quoted
+from gateway.runtime.workers import WorkerThread
 
 LONG_REPLY_BYTES: Final = 32 * 1024
 """Longer contents are encoded and sent by a thread: 16 MB take 30 ms."""

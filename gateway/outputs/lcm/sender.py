@@ -12,9 +12,9 @@ from typing import Final
 import lcm
 
 from gateway.errors import OutputError
-from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm_to_send, scheme_of, send_problem
-from gateway.workers import WorkerThread
+from gateway.runtime.failures import HOLD_S, FailureLog
+from gateway.runtime.workers import WorkerThread
 
 _NEVER: Final = float("inf")
 RETRY_S: Final = 1.0

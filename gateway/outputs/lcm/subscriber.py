@@ -7,7 +7,6 @@ import threading
 
 import lcm
 
-from gateway.logs.failures import FailureLog
 from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
 from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRequest
 from gateway.outputs.lcm.connection import QUEUE_MESSAGES, Waiting, open_lcm, receiving_url, reconnect
@@ -15,6 +14,7 @@ from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.requests import is_presence
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.outputs.lcm.settings import LcmSettings, effective_lcm_url
+from gateway.runtime.failures import FailureLog
 
 logger = logging.getLogger(__name__)
 

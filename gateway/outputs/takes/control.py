@@ -6,13 +6,13 @@ from typing import Any, Final
 from urllib.parse import unquote
 
 from gateway.errors import QueryError
-from gateway.logs.safe_text import quoted
 from gateway.messages.decode import JSON, LOG, json_bytes
 from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, Answer
 from gateway.outputs.takes.folder import StoredTake
 from gateway.outputs.takes.source_takes import MAX_SAVED_S, SourceTakes
+from gateway.runtime.safe_text import quoted
+from gateway.runtime.token_bucket import TokenBucket
 from gateway.takes.files.description import MAX_DETAIL_CHARACTERS, TakeDetails
-from gateway.token_bucket import TokenBucket
 
 MAX_LISTED: Final = 1000
 """How many takes a list has, the newest."""

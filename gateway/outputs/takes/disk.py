@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.errors import OutputError, QueryError, TakeError
-from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.outputs.takes.folder import FileId, TakeEntry, TakesFolder, disk_problem
 from gateway.outputs.takes.folder_clock import STEP_S, FolderClock
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.runtime.failures import HOLD_S, FailureLog
+from gateway.runtime.workers import WorkerThread, result_of
 from gateway.takes.files.writer_thread import WriterThread
-from gateway.workers import WorkerThread, result_of
 
 logger = logging.getLogger(__name__)
 

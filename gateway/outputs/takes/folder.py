@@ -18,9 +18,10 @@ import rtc3d
 
 from gateway.errors import ProtocolError, QueryError, TakeError
 from gateway.messages.decode import decode
+from gateway.messages.take_names import by_number, check_name, default_name, numbered
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.files.new_file import NewFiles, by_number, check_name, default_name, numbered
+from gateway.takes.files.new_file import NewFiles
 from gateway.takes.files.reader import SUFFIX
 
 ROLLING: Final = ".rolling"

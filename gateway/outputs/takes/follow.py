@@ -7,12 +7,12 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
 from gateway.errors import QueryError
-from gateway.logs.failures import HOLD_S, FailureLog
 from gateway.messages.encode import COUNT_OFFSET, ITEMS_OFFSET
 from gateway.outputs.contract import Publisher
 from gateway.outputs.takes.folder import StoredTake
 from gateway.outputs.takes.source_takes import SourceTakes
 from gateway.outputs.takes.take_file import TakeFile
+from gateway.runtime.failures import HOLD_S, FailureLog
 
 END_S: Final = 2.0
 """For how long the server must send No Data until a take of a measurement ends."""

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.logs.losses import Losses
 from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import (
@@ -25,6 +24,7 @@ from gateway.outputs.takes.follow import EventPublisher, TakeFollower
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_takes import SourceTakes
 from gateway.rtc3d.components import ComponentType
+from gateway.runtime.losses import Losses
 from gateway.takes.files.writer_thread import MAX_QUEUED_BYTES, WriterThread
 
 _CLOSE_S: Final = 0.8

@@ -15,16 +15,12 @@ from typing import Final
 
 from gateway.errors import QueryError, TakeError
 from gateway.messages.history import FoundMessages, WantedMessages, sequence_of
+from gateway.messages.take_names import default_name
 from gateway.outputs.takes.folder import free_stem, is_full
-from gateway.outputs.takes.segment_index import (
-    SegmentIndex,
-    plan_reading,
-    read_planned,
-)
+from gateway.outputs.takes.segment_index import SegmentIndex, plan_reading, read_planned
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.files.new_file import default_name
 from gateway.takes.files.reader import SUFFIX
 from gateway.takes.files.take_writer import Messages, begin_log
 from gateway.takes.files.writer_thread import LogFile

@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 from gateway.errors import QueryError, TakeError
-from gateway.logs.losses import Losses
 from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.host_time import now_utime
+from gateway.messages.take_names import check_name, default_name
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import ServerParameters, encode_parameters, published_again
 from gateway.outputs.takes.disk import Storage, disk_result
@@ -36,8 +36,8 @@ from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter, TakeFile
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.runtime.losses import Losses
 from gateway.takes.files.description import NO_DETAILS, SourceDescription, TakeDetails
-from gateway.takes.files.new_file import check_name, default_name
 
 MAX_SAVED_S: Final = 3600.0
 """The most seconds that one command saves, of the past and of the future."""

@@ -7,13 +7,13 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gateway.logs.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import published_again
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import free_stem, is_full, log_path
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.runtime.losses import Losses
 from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.take_writer import Messages, TakeWriter, begin_log
 from gateway.takes.files.writer_thread import LogFile

@@ -25,15 +25,15 @@ from typing import Final, NamedTuple
 import zenoh
 
 from gateway.errors import QueryError, raise_unless_defect
-from gateway.logs.failures import log_fields
-from gateway.logs.losses import Losses
-from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import LCM_MESSAGES, TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import CONTROL_OPTION, STOP, Answer, KeyPath, QueryService
 from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, QueryLimits, Refusal
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.workers import WorkerThread
+from gateway.runtime.failures import log_fields
+from gateway.runtime.losses import Losses
+from gateway.runtime.safe_text import safe_text
+from gateway.runtime.workers import WorkerThread
 
 MAX_PENDING: Final = 4096
 """The maximum number of queries in progress. Further ones get the error busy."""

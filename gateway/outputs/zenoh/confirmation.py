@@ -13,8 +13,8 @@ from typing import Final
 
 import zenoh
 
-from gateway.logs.losses import Losses
 from gateway.outputs.zenoh.session import SessionHolder
+from gateway.runtime.losses import Losses
 
 LINK_LOST: Final = "link lost"
 """The cause of loss of what was sent before a connection was given up, and not confirmed."""

@@ -16,10 +16,9 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.descriptions.labels import describe, event_labels
 from gateway.errors import raise_unless_defect
-from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, MAX_JSON_SOURCE_BYTES, decode, json_text
+from gateway.messages.descriptions.labels import describe, event_labels
 from gateway.messages.history import utime_of
 from gateway.messages.topics import JSON_NAME, Topic
 from gateway.outputs.contract import ServerParameters
@@ -28,8 +27,9 @@ from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.session import declare_publisher, has_subscribers, undeclare
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.token_bucket import TokenBucket
-from gateway.workers import QueueRoom, WorkerThread
+from gateway.runtime.losses import Losses
+from gateway.runtime.token_bucket import TokenBucket
+from gateway.runtime.workers import QueueRoom, WorkerThread
 
 MAX_DESCRIPTION_CHARACTERS: Final = 256 * 1024
 """Longer lists of labels and units are left out: they come from the server, and are in every text."""

@@ -13,8 +13,6 @@ from typing import Any, Final, NamedTuple
 import zenoh
 
 from gateway.errors import raise_unless_defect
-from gateway.logs.failures import DefectLog, defect_text
-from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, XML, json_bytes
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Answer, Output, OutputHealth, QueryService, ServerFile, ServerParameters
@@ -27,7 +25,9 @@ from gateway.outputs.zenoh.open_ports import is_open_to_others
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.session import SessionHolder, SessionTexts, declare_publisher, in_zenoh_thread
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.workers import WorkerThread
+from gateway.runtime.failures import DefectLog, defect_text
+from gateway.runtime.losses import Losses
+from gateway.runtime.workers import WorkerThread
 
 # Parameters must arrive, even if that takes longer, and messages of streams have priority.
 _RELIABLE: Final = zenoh.CongestionControl.BLOCK

@@ -9,9 +9,9 @@ from typing import Final, NamedTuple
 
 import zenoh
 
-from gateway.logs.safe_text import safe_text
 from gateway.outputs.findings import Check, Finding
 from gateway.outputs.zenoh.routers import ROUTERS, Dropped, Router, RouterNetwork
+from gateway.runtime.safe_text import safe_text
 
 _ROUTERS, _LINKS = Check("zenoh", "routers"), Check("zenoh", "links")
 

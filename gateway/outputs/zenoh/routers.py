@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
-from gateway.logs.safe_text import safe_text
+from gateway.runtime.safe_text import safe_text
 
 ROUTERS: Final = "@/*/router"
 DESCRIPTIONS: Final = f"{ROUTERS}?_stats=true"

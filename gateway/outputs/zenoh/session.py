@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple, TypeVar
 import zenoh
 
 from gateway.errors import OutputError, raise_unless_defect
-from gateway.logs.failures import DefectLog, FailureLog, defect_text
 from gateway.outputs.contract import OutputHealth
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_reason
-from gateway.workers import thread_starts
+from gateway.runtime.failures import DefectLog, FailureLog, defect_text
+from gateway.runtime.workers import thread_starts
 
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5

@@ -16,7 +16,7 @@ from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRe
 from gateway.outputs.zenoh.config import command_config, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX, ZenohSettings
-from gateway.program_end import Process
+from gateway.runtime.program_end import Process
 
 _PORTS: Final = range(20_000, 32_768)
 """Those of the demo. Linux gives the ports above to other sockets: one could get it before Zenoh listens."""

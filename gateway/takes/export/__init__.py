@@ -13,7 +13,7 @@ MCAP, and the tables in CSV and Parquet, keep the time of capture of each frame.
 - ``bids``: the files of recordings in a BIDS data set; ``bids_data_set`` has its folders and tables.
 - ``number_text``: rows of numbers as text, for OpenSim, BIDS and CSV.
 - ``rosbag``: the messages of the output ``ros2``.
-- ``mcap``: Foxglove's types, made by ``gateway.foxglove_schemas`` as for live viewers.
+- ``mcap``: Foxglove's types, made by ``gateway.messages.foxglove`` as for live viewers.
 - ``mcap_file``: what ``mcap`` and ``rosbag`` have in common.
 - ``tables``: the take as tables, one per component; ``csv_files`` and ``parquet`` write them.
 

@@ -4,8 +4,8 @@ from typing import Final, get_args
 
 import numpy as np
 
-from gateway.descriptions.force_plates import up_axis_of
 from gateway.errors import SelectionError
+from gateway.messages.descriptions.force_plates import up_axis_of
 from gateway.takes.export.job import Axis, ExportJob
 from gateway.takes.export.measurements import Measurement
 from gateway.takes.files.component_rows import Array

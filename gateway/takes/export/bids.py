@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.force_plates import placed_plates, units_of
-from gateway.descriptions.labels import event_text, fitting_labels, printable
+from gateway.messages.descriptions.force_plates import placed_plates, units_of
+from gateway.messages.descriptions.labels import event_text, fitting_labels, printable
 from gateway.messages.encode import metres_per_unit
 from gateway.rtc3d.parameters import AnalogChannel, Marker, Tool
 from gateway.takes.export.bids_data_set import (

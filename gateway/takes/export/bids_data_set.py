@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from gateway import __version__
-from gateway.descriptions.labels import printable
 from gateway.errors import SelectionError, TakeError
+from gateway.messages.descriptions.labels import printable
 from gateway.takes.export.job import ExportJob
 from gateway.takes.files.take import Take
 

@@ -18,25 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway import version_text
-from gateway.descriptions.force_plates import ADDED_LABELS, CALIBRATED, calibration_of
-from gateway.descriptions.labels import EventText, event_text, fitting_labels, printable
 from gateway.errors import TakeError
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.takes.export.c3d_content import (
-    MAX_LIST,
-    C3dContent,
-    content_of,
-    encode_points,
-    residual_step,
-)
+from gateway.messages.descriptions.force_plates import ADDED_LABELS, CALIBRATED, calibration_of
+from gateway.messages.descriptions.labels import EventText, event_text, fitting_labels, printable
+from gateway.takes.export.c3d_content import MAX_LIST, C3dContent, content_of, encode_points, residual_step
 from gateway.takes.export.changed_labels import note_event_labels, note_labels
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import (
-    event_seconds,
-    named_measurements,
-    note_missing,
-    utc_text,
-)
+from gateway.takes.export.measurements import event_seconds, named_measurements, note_missing, utc_text
 from gateway.takes.export.plates import PlatePlan
 from gateway.takes.export.source_frame import frame_of
 from gateway.takes.files.component_rows import Array

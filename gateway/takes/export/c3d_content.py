@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.force_plates import channels_from_loads
+from gateway.messages.descriptions.force_plates import channels_from_loads
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import Measurement, Placed, sampled, seconds_of_row

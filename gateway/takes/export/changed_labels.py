@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from itertools import islice
 from typing import Final
 
-from gateway.descriptions.labels import given_labels
+from gateway.messages.descriptions.labels import given_labels
 from gateway.takes.export.job import ExportJob
 from gateway.takes.files.series import Series
 

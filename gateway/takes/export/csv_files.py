@@ -7,7 +7,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from gateway.descriptions.labels import distinct
+from gateway.messages.descriptions.labels import distinct
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.number_text import number_rows

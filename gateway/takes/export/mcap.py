@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from gateway.foxglove_schemas.messages import FIELD_NOUNS, NUMBERS_PER_ITEM, FoxgloveSource
-from gateway.foxglove_schemas.topics import MAX_FIELDS, FloatTopics, TopicMessages, field_names
+from gateway.messages.foxglove.messages import FIELD_NOUNS, NUMBERS_PER_ITEM, FoxgloveSource
+from gateway.messages.foxglove.topics import MAX_FIELDS, FloatTopics, TopicMessages, field_names
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.export.job import ExportJob

@@ -18,8 +18,8 @@ import numpy as np
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
 from gateway.errors import TakeError
-from gateway.foxglove_schemas.topics import MAX_UTIME, Topic, TopicMessages
 from gateway.messages.encode import metres_per_unit
+from gateway.messages.foxglove.topics import MAX_UTIME, Topic, TopicMessages
 from gateway.rtc3d.parameters import differ_in_statistics_only
 from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.labels import MAX_EVENT_AGE_US
 from gateway.errors import TakeError
+from gateway.messages.descriptions.labels import MAX_EVENT_AGE_US
 from gateway.takes.export.grid import Frames, Grid, bounds, place, some_frames
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.files.component_rows import Array

@@ -14,7 +14,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from gateway.descriptions.force_plates import (
+from gateway.errors import SelectionError
+from gateway.messages.descriptions.force_plates import (
     MIN_FORCE_N,
     GroundReactions,
     calibration_of,
@@ -22,8 +23,7 @@ from gateway.descriptions.force_plates import (
     loads_from_channels,
     units_of,
 )
-from gateway.descriptions.labels import printable
-from gateway.errors import SelectionError
+from gateway.messages.descriptions.labels import printable
 from gateway.messages.encode import metres_per_unit
 from gateway.takes.export.axes import rotation_of
 from gateway.takes.export.job import ExportJob, nothing_to_export

@@ -3,7 +3,7 @@
 import re
 from typing import Final
 
-from gateway.descriptions.labels import fitting_labels
+from gateway.messages.descriptions.labels import fitting_labels
 from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob
 from gateway.takes.files.series import Series

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.force_plates import (
+from gateway.messages.descriptions.force_plates import (
     FORCES_AND_MOMENTS,
     PlateGeometry,
     calibration_of,

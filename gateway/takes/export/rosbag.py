@@ -6,11 +6,12 @@ from typing import Final
 
 import numpy as np
 
-from gateway.descriptions.force_plates import units_of
-from gateway.foxglove_schemas.topics import Topic, TopicMessages
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.descriptions.force_plates import units_of
 from gateway.messages.encode import metres_per_unit
-from gateway.messages.ros2 import (
+from gateway.messages.foxglove.topics import Topic, TopicMessages
+from gateway.messages.ros2.definitions import definition
+from gateway.messages.ros2.encode import (
     FLOAT_ARRAY,
     POINT_CLOUD,
     POSE_STAMPED,
@@ -26,8 +27,7 @@ from gateway.messages.ros2 import (
     ros_stamps,
     tf_message,
 )
-from gateway.messages.ros2_definitions import definition
-from gateway.messages.ros2_names import (
+from gateway.messages.ros2.names import (
     ANALOG,
     DEFAULT_NAMESPACE,
     MARKERS,

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.descriptions.labels import printable
+from gateway.messages.descriptions.labels import printable
 from gateway.takes.export.axes import rotation_of
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import (

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.descriptions.labels import describe
+from gateway.messages.descriptions.labels import describe
 from gateway.messages.sequence_check import SequenceCheck
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters

@@ -8,9 +8,9 @@ import rtc3d
 
 from gateway import __version__
 from gateway.errors import QueryError
-from gateway.logs.safe_text import quoted
 from gateway.messages.texts import encode_within_limits
 from gateway.messages.topics import lcm_channel
+from gateway.runtime.safe_text import quoted
 
 _HAS_END: Final = "ends with take_end_t"
 """What ``take_t`` says of its recorder. Earlier versions did not write the end of a file."""

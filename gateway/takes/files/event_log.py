@@ -12,7 +12,7 @@ from typing import BinaryIO, Final, NamedTuple
 
 from gateway.config.files import check_is_file
 from gateway.errors import TakeError
-from gateway.logs.safe_text import safe_text
+from gateway.runtime.safe_text import safe_text
 
 SYNC: Final = bytes.fromhex("eda1da01")
 _HEADER: Final = struct.Struct(">4sqqii")

@@ -13,13 +13,13 @@ from typing import Any, Final, NamedTuple
 import rtc3d
 
 from gateway.errors import ProtocolError, TakeError
-from gateway.logs.safe_text import safe_text
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
+from gateway.messages.take_names import by_number
 from gateway.messages.topics import unique_name
+from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.description import has_end
 from gateway.takes.files.event_log import Event, EventColumns, EventLogReader
-from gateway.takes.files.new_file import by_number
 
 NAMED_WITHIN_EVENTS: Final = 50_000
 """Each source is named within this many events: by its description, or by its status once a second."""

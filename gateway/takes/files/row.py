@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 
 from gateway.config.words import spelling_hint
-from gateway.descriptions.labels import Description, common, describe, event_labels
 from gateway.errors import TakeError
+from gateway.messages.descriptions.labels import Description, common, describe, event_labels
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.labels import Description, common, describe, event_labels
 from gateway.errors import TakeError
+from gateway.messages.descriptions.labels import Description, common, describe, event_labels
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import (

@@ -7,9 +7,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.labels import describe, event_labels
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
+from gateway.messages.descriptions.labels import describe, event_labels
 from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters, changed_sections, describe_renames, sections_of

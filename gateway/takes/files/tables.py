@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.descriptions.labels import distinct, event_text
 from gateway.errors import TakeError
+from gateway.messages.descriptions.labels import distinct, event_text
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.series import Series

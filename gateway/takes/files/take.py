@@ -11,10 +11,10 @@ import numpy as np
 
 from gateway.config.words import spelling_hint
 from gateway.errors import ProtocolError, SelectionError, TakeError
-from gateway.logs.safe_text import quoted
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.runtime.safe_text import quoted
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details, has_end
 from gateway.takes.files.joined import join_series

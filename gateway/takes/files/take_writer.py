@@ -1,7 +1,7 @@
 """A take that is being written: begun, written again while the disk refuses, and ended with what it lacks.
 
 The gateway's own takes (``gateway.outputs.takes``) and the recordings of a subscriber
-(``gateway.takes.recorder``) have different files, and report problems to different places. The rest is here.
+(``gateway.client.recorder``) have different files, and report problems to different places. The rest is here.
 """
 
 import contextlib

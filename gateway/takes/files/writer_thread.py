@@ -13,9 +13,9 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
-from gateway.logs.failures import DefectLog
+from gateway.runtime.failures import DefectLog
+from gateway.runtime.workers import make_call, thread_starts
 from gateway.takes.files.event_log import SYNC
-from gateway.workers import make_call, thread_starts
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
 """How much may wait for the disk; at 1.3 MB/s, the disk may stand still for 50 s."""

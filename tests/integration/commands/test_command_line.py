@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from gateway.cli.main import COMMANDS
+from gateway.tools.cli.main import COMMANDS
 from tests.support.gateway_process import PROGRAM
 
 ROOT: Final = Path(__file__).parents[3]

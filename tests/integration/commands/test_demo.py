@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from gateway.cli import demo_lab
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.outputs.kind import DemoSide, Receive, Subscription
 from gateway.outputs.lcm.settings import LCM
 from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.tools.cli import demo_lab
 from tests.support.waiting import wait_until_async
 
 

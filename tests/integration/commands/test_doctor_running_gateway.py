@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import MetricsSettings
-from gateway.doctor.all_checks import run_checks
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.service.gateway import Gateway
-from gateway.stream.state import StreamState
+from gateway.session.state import StreamState
+from gateway.tools.doctor.all_checks import run_checks
 from tests.support import servers
 from tests.support.commands import run
 from tests.support.configurations import make_settings

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import pytest
 
-from gateway.cli.main import COMMANDS
+from gateway.tools.cli.main import COMMANDS
 
 INTERRUPT: Final = """
 import os, sys, _signal
@@ -24,7 +24,7 @@ def count(event, arguments):
     if arguments[0] == "gateway" and num_imports is None:  # the first line of the package comes next
         num_imports = 0
         return
-    if arguments[0] == "gateway.cli.main" and first_handler is None:
+    if arguments[0] == "gateway.tools.cli.main" and first_handler is None:
         first_handler = handler
     if num_imports is None or is_own and (first_handler is None or handler is first_handler):
         return

@@ -15,9 +15,9 @@ import zenoh
 from gateway.config.settings import StreamSettings
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.rtc3d.components import ComponentType
+from gateway.session.state import StreamState
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.integration.commands.test_params_command import SIDES, Lab, lab_without_server
 from tests.support.commands import run
 from tests.support.errors import names

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from gateway.display.top.pages import TWO_GATEWAYS
+from gateway.tools.display.top.pages import TWO_GATEWAYS
 from tests.support.commands import Completed, run_command
 from tests.support.configurations import write_config
 from tests.support.errors import names

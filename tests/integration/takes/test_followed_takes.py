@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
+from gateway.daemon.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.takes import follow
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_takes import SourceTakes
-from gateway.service.gateway import Gateway
 from gateway.takes.files.reader import TakeReader
 from tests.support.networks import free_endpoint
 from tests.support.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from gateway.config.settings import SourceSettings
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.rtc3d_server.scene import Scene
-from gateway.service.gateway import Gateway
+from gateway.session.server.scene import Scene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take

@@ -278,8 +278,8 @@ def test_without_a_gateway_there_is_no_file(
 
 HANGING: Final = """
 import sys, threading
-from gateway.cli.main import main
-from gateway.takes.recorder import TakeRecording
+from gateway.tools.cli.main import main
+from gateway.client.recorder import TakeRecording
 from gateway.takes.files.writer_thread import LogFile
 
 def hang(*_):

@@ -13,13 +13,13 @@ import pytest
 import yaml
 
 from gateway.config.settings import MetricsSettings, ReconnectSettings, Settings, SourceSettings
+from gateway.daemon.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.service.gateway import Gateway
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.files.reader import TakeReader

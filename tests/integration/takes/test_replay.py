@@ -22,7 +22,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, Tool
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.takes.files.description import SourceDescription
-from gateway.takes.replay.replay import lcm_destination, require_silence
+from gateway.tools.replay.replay import lcm_destination, require_silence
 from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.support.commands import run_in_process
 from tests.support.errors import names

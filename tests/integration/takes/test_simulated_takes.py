@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import MetricsSettings, SourceSettings
+from gateway.daemon.gateway import Gateway
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
@@ -24,16 +25,15 @@ from gateway.rtc3d.parameters import (
     ParametersAnalog,
 )
 from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
-from gateway.rtc3d_server.measurement import ComputedScene
-from gateway.rtc3d_server.scene import Scene
-from gateway.service.gateway import Gateway
+from gateway.session.server.measurement import ComputedScene
+from gateway.session.server.scene import Scene
+from gateway.session.state import StreamState
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.faults import ChangeScene, Rename
 from gateway.simulator.packet_faults import FrozenTimestamps
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SceneSettings, SyntheticScene
 from gateway.simulator.take_scene import TakeScene
-from gateway.stream.state import StreamState
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from tests.integration.raw_client import RawClient, connected
@@ -42,7 +42,7 @@ from tests.support.configurations import make_settings
 from tests.support.gateways import run_gateway, running_gateway
 from tests.support.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
 from tests.support.waiting import wait_until_async
-from tests.unit.rtc3d_server.wire import XML, WireComponent, command
+from tests.unit.session.server.wire import XML, WireComponent, command
 
 SECOND_US = 1_000_000
 LABELS = encode_parameters(

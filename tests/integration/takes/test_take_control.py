@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import pytest
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.display.live import LiveData
-from gateway.display.view.viewer import RunningTakes
+from gateway.daemon.gateway import Gateway
 from gateway.outputs.takes.folder import MAX_PIECE_BYTES, TakesFolder
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.service.gateway import Gateway
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
+from gateway.tools.display.live import LiveData
+from gateway.tools.display.view.viewer import RunningTakes
 from tests.support.errors import names
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer

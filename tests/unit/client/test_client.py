@@ -9,11 +9,11 @@ import pytest
 from gateway.client import GatewayAddress, GatewayClient, Messages
 from gateway.client.sources import FINGERPRINTS
 from gateway.client.transport import Replies, Reply, silence_text
-from gateway.display.live import LiveData
 from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
 from gateway.outputs.contract import ServerParameters, encode_parameters
 from gateway.outputs.lcm.connection import open_lcm
+from gateway.tools.display.live import LiveData
 from tests.support.errors import names
 from tests.support.networks import lcm_url
 from tests.support.waiting import wait_until

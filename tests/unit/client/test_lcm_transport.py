@@ -9,13 +9,13 @@ import rtc3d
 
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.client.reception import MAX_SOURCES
+from gateway.client.recorder import FileWriter, TakeRecording, Target
 from gateway.client.sources import FINGERPRINTS
 from gateway.messages.encode import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.files.event_log import EventLogReader
-from gateway.takes.recorder import FileWriter, TakeRecording, Target
 from tests.support.networks import lcm_url
 from tests.support.waiting import wait_until
 

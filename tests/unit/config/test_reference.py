@@ -24,13 +24,13 @@ from gateway.config.settings import (
     StreamSettings,
 )
 from gateway.config.values import RollPitchYaw, TransformSettings
-from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
+from gateway.outputs.adapters.lsl.settings import LslSettings
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
+from gateway.outputs.adapters.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.adapters.vrpn.settings import VrpnSettings
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.lsl.settings import LslSettings
-from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.property.test_config_properties import SETTINGS
 from tests.support.configurations import MODEL

@@ -10,7 +10,7 @@ from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame
-from gateway.stream.status import StreamStatus
+from gateway.session.status import StreamStatus
 from tests.support.vectors import TOOLS, ByteOrder, ComponentVector
 
 STAMP = Stamp(utime=2_000, capture_utime=1_000, session=3, parameters_version=5)

@@ -7,7 +7,7 @@ import pytest
 import rtc3d
 
 from gateway.messages.source_report import MAX_ENTRIES, MAX_STREAMS, Level, source_report, streams_text
-from gateway.stream.state import StreamState
+from gateway.session.state import StreamState
 from tests.support.statuses import count, loss, output, stream
 
 SERVER = "192.0.2.9:3020"

@@ -5,13 +5,13 @@ import logging
 import pytest
 import rtc3d
 
-from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
 from gateway.messages.summary import summarise
 from gateway.messages.texts import xml_bytes, xml_text
 from gateway.outputs.contract import OutputHealth, OutputStatus
-from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
+from gateway.runtime.losses import Losses
+from gateway.session.state import StreamState
+from gateway.session.status import StreamStatus
 from tests.support.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentVector
 from tests.unit.messages.samples import (
     command_messages,

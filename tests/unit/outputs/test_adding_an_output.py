@@ -14,23 +14,23 @@ from prometheus_client.parser import text_string_to_metric_families
 from rich.console import Console
 from typer.testing import CliRunner
 
-from gateway.cli.demo_lab import run_demo
-from gateway.cli.main import app
 from gateway.config import loading
 from gateway.config.settings import Settings
-from gateway.doctor.all_checks import check_output, run_checks_without_settings
+from gateway.daemon.gateway import Gateway
+from gateway.daemon.monitoring.metrics import GatewayMetrics
+from gateway.daemon.monitoring.process_limits import DiskFacts, LoopDelay
+from gateway.daemon.monitoring.server import health_page
 from gateway.errors import ConfigError
 from gateway.messages.decode import decode
 from gateway.outputs.contract import OutputHealth
 from gateway.outputs.findings import Result
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS, settings_type
-from gateway.service.gateway import Gateway
-from gateway.service.monitoring.metrics import GatewayMetrics
-from gateway.service.monitoring.process_limits import DiskFacts, LoopDelay
-from gateway.service.monitoring.server import health_page
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.tools.cli.demo_lab import run_demo
+from gateway.tools.cli.main import app
+from gateway.tools.doctor.all_checks import check_output, run_checks_without_settings
 from tests.support.errors import names, raises
 from tests.support.example_output import (
     EXAMPLE,

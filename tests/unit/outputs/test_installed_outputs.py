@@ -12,16 +12,10 @@ import pytest
 from gateway.config import loading
 from gateway.config.loading import schema_text, shown_configuration
 from gateway.config.settings import Settings
-from gateway.doctor.all_checks import run_checks
 from gateway.errors import ConfigError
 from gateway.outputs.findings import Result
-from gateway.outputs.registry import (
-    OUTPUTS,
-    UNUSABLE,
-    add_installed_outputs,
-    build_outputs,
-    settings_type,
-)
+from gateway.outputs.registry import OUTPUTS, UNUSABLE, add_installed_outputs, build_outputs, settings_type
+from gateway.tools.doctor.all_checks import run_checks
 from tests.support.errors import names, raises
 from tests.support.example_output import ExampleOutput, ExampleSettings
 from tests.support.records import logged

@@ -9,7 +9,7 @@ from concurrent.futures import CancelledError
 import pytest
 
 from gateway.outputs.frame_output import LoopThread, in_this_loop
-from gateway.workers import MAX_BYTES
+from gateway.runtime.workers import MAX_BYTES
 
 
 async def nothing() -> None: ...

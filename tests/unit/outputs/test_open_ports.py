@@ -5,11 +5,8 @@ from typing import Any, Final
 import pytest
 
 from gateway.config.settings import SourceSettings
-from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.open_ports import (
-    Access,
-    listening_ports,
-)
+from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
+from gateway.outputs.open_ports import Access, listening_ports
 from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.open_ports import is_open_to_others

@@ -5,15 +5,15 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import SourceSettings
-from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
+from gateway.outputs.adapters.lsl.settings import LslSettings
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
+from gateway.outputs.adapters.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.adapters.vrpn.settings import VrpnSettings
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
-from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
-from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType

@@ -10,14 +10,14 @@ import lcm
 import pytest
 
 from gateway.messages.topics import Topic
+from gateway.outputs.adapters.lsl.output import LslOutput
+from gateway.outputs.adapters.lsl.settings import LslSettings
+from gateway.outputs.adapters.ros2.output import Ros2Output
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.outputs.lsl.output import LslOutput
-from gateway.outputs.lsl.settings import LslSettings
-from gateway.outputs.ros2.output import Ros2Output
-from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.queries.service import SourceQueryService

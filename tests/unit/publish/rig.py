@@ -5,12 +5,12 @@ from collections.abc import Callable, Collection
 import numpy as np
 
 from gateway.errors import OutputError
-from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
 from gateway.messages.encode import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, WIRE_ORDER, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, FrameLayout, encode_frame, split_frame
+from gateway.runtime.losses import Losses
 from tests.support.toy_output import ToyOutput
 from tests.support.vectors import FULL_FRAME
 

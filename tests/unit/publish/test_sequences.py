@@ -10,8 +10,8 @@ from gateway.messages.decode import decode
 from gateway.messages.encode import encode_message
 from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages, sequence_of
 from gateway.publish.fan_out import FanOut
-from gateway.stream.ingest import Ingest
-from gateway.stream.status import StreamStatus
+from gateway.session.ingest import Ingest
+from gateway.session.status import StreamStatus
 from tests.support.statuses import amounts
 from tests.support.toy_output import ToyOutput
 from tests.unit.publish.rig import (

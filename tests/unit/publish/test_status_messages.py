@@ -7,15 +7,15 @@ import pytest
 import rtc3d
 
 from gateway import __version__
-from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.contract import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, clock_model, status_message, unusable_frames
-from gateway.stream.clock import ServerClock
-from gateway.stream.process_clock import running_clock
-from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
+from gateway.runtime.losses import Losses
+from gateway.session.clock import ServerClock
+from gateway.session.process_clock import running_clock
+from gateway.session.state import StreamState
+from gateway.session.status import StreamStatus
 from tests.support.errors import names
 
 NO_CLOCK = {"has_clock": False, "offset_us": 0, "drift_ppm": 0.0, "uncertainty_us": 0.0, "samples": 0}

@@ -19,7 +19,7 @@ from gateway.queries.service import SourceQueries
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketType
-from gateway.stream.status import SessionNumbers, StreamStatus
+from gateway.session.status import SessionNumbers, StreamStatus
 from tests.support.parameters import in_root
 from tests.support.waiting import wait_until_async
 

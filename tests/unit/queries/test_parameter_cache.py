@@ -11,7 +11,7 @@ from gateway.queries.answers import MAX_PARTS
 from gateway.queries.parameter_cache import ParameterCache
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.replies import LONG_XML_BYTES, XmlThread
+from gateway.session.replies import LONG_XML_BYTES, XmlThread
 from tests.support.errors import names
 from tests.support.parameters import in_root
 from tests.support.records import kinds, logged

@@ -20,7 +20,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import SECTIONS
-from gateway.stream.state import StreamState
+from gateway.session.state import StreamState
 from tests.support.clocks import run_in_virtual_time
 from tests.support.errors import raises
 from tests.support.servers import markers_frame

@@ -10,10 +10,10 @@ import ezc3d
 import numpy as np
 import pytest
 
-from gateway.c3d_files.receiving import parameter_places
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters3D, Point
+from gateway.session.c3d_files.receiving import parameter_places
 from gateway.simulator import c3d_scene
 from gateway.simulator.c3d_recording import _markers
 from gateway.simulator.c3d_scene import C3dScene

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from gateway.cli.main import app
 from gateway.errors import ConfigError
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.faults import Cut, Delay, Restart
@@ -22,6 +21,7 @@ from gateway.simulator.simulator import (
     parameters_of,
 )
 from gateway.simulator.synthetic import SceneSettings
+from gateway.tools.cli.main import app
 from tests.support.errors import raises
 
 ROOT = Path(__file__).parents[3]

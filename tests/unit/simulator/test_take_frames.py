@@ -10,12 +10,12 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import AnalogChannel, Marker, Parameters, Parameters3D, ParametersAnalog
 from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.client_session import ClientSession
+from gateway.session.server.client_session import ClientSession
 from gateway.simulator.take_frames import RecordedFrames, TakePass
 from gateway.simulator.take_moments import Moment, RecordedParameters
 from gateway.takes.files.reader import TakeReader
 from tests.support.takes import START_UTIME, Message, description, markers, parameters, write_take
-from tests.unit.rtc3d_server.wire import WireComponent, components_in
+from tests.unit.session.server.wire import WireComponent, components_in
 
 FIRST = b"<RT_Parameters><General><Name>first</Name></General></RT_Parameters>"
 SECOND = b"<RT_Parameters><General><Name>second</Name></General></RT_Parameters>"

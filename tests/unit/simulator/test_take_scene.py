@@ -14,7 +14,7 @@ from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import General, Marker, Parameters, Parameters3D
 from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
-from gateway.rtc3d_server.scene import NOT_YET_US
+from gateway.session.server.scene import NOT_YET_US
 from gateway.simulator.take_frames import RecordedFrames
 from gateway.simulator.take_scene import TakeScene
 from gateway.takes.files.description import SourceDescription
@@ -32,7 +32,7 @@ from tests.support.takes import (
     parameters,
     write_take,
 )
-from tests.unit.rtc3d_server.wire import components_in
+from tests.unit.session.server.wire import components_in
 
 MARKERS = (ComponentType.MARKERS,)
 GENERAL = General(name="the simulator")

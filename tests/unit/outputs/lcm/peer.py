@@ -9,13 +9,13 @@ import lcm
 import pytest
 import rtc3d
 
-from gateway.logs.failures import current_log_fields
-from gateway.logs.losses import Losses
 from gateway.messages.decode import JSON, decode, json_bytes
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.requests import LcmRequests
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.runtime.failures import current_log_fields
+from gateway.runtime.losses import Losses
 from tests.support.statuses import amounts
 from tests.support.waiting import wait_until_async
 

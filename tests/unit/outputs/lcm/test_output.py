@@ -10,12 +10,12 @@ from unittest.mock import Mock
 import lcm
 import pytest
 
-from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm import output as output_module
 from gateway.outputs.lcm.output import REPEAT_S, LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.runtime.losses import Losses
 from tests.support.clocks import Clock
 from tests.support.statuses import amounts
 from tests.unit.outputs.lcm.peer import XML, Lab, request

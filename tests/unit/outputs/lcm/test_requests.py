@@ -20,7 +20,7 @@ from gateway.outputs.lcm.receiver import LcmReceiver
 from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmRequests
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.token_bucket import TokenBucket
+from gateway.runtime.token_bucket import TokenBucket
 from tests.support.clocks import Clock
 from tests.support.errors import names
 from tests.support.waiting import wait_until_async

@@ -15,7 +15,6 @@ from typing import Any, cast
 import pytest
 
 from gateway.errors import OutputError, QueryError
-from gateway.logs.losses import Losses
 from gateway.messages.decode import decode
 from gateway.messages.history import WantedMessages
 from gateway.outputs.contract import ServerParameters, encode_parameters
@@ -26,6 +25,7 @@ from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.segment_index import read_planned
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter
+from gateway.runtime.losses import Losses
 from gateway.takes.files.description import SourceDescription
 from gateway.takes.files.take_writer import RETRY_S
 from gateway.takes.files.writer_thread import LogFile

@@ -10,12 +10,12 @@ from typing import NoReturn
 import pytest
 
 from gateway.errors import QueryError
-from gateway.logs.losses import Losses
 from gateway.outputs.takes import segments
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import SourceFacts
+from gateway.runtime.losses import Losses
 from gateway.takes.files.description import SourceDescription, TakeDetails
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader

@@ -11,12 +11,12 @@ import pytest
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.logs.failures import current_log_fields
-from gateway.logs.losses import Losses
 from gateway.outputs.contract import Answer, KeyPath
 from gateway.outputs.zenoh.answers import ZenohAnswers
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.runtime.failures import current_log_fields
+from gateway.runtime.losses import Losses
 from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.support.queried_gateway import Reply, query, query_all
 from tests.support.statuses import amounts

@@ -7,7 +7,7 @@ import zenoh
 
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
-from gateway.token_bucket import TokenBucket
+from gateway.runtime.token_bucket import TokenBucket
 from tests.support.clocks import Clock
 from tests.support.errors import names
 from tests.support.queried_gateway import to_reply

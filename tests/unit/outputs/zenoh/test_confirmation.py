@@ -11,11 +11,11 @@ from unittest.mock import Mock
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from gateway.logs.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.zenoh.confirmation import LINK_LOST, SILENT_S, RouterConfirmation
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.runtime.losses import Losses
 from tests.support.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.support.statuses import amounts
 from tests.support.waiting import wait_until

@@ -11,13 +11,13 @@ import pytest
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.logs.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs import other_gateways
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.runtime.losses import Losses
 from tests.support.errors import names
 from tests.support.networks import open_zenoh, zenoh_keys
 from tests.support.statuses import amounts

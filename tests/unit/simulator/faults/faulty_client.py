@@ -4,13 +4,13 @@ import asyncio
 from typing import Any, cast
 
 from gateway.rtc3d.packets import Packet, PacketReader
-from gateway.rtc3d_server.client_connection import ClientConnection
+from gateway.session.server.client_connection import ClientConnection
 from gateway.simulator.fault_pipeline import FaultPipeline
 from gateway.simulator.faults import ActiveFault, Fault
 from gateway.simulator.simulator import Simulator
-from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.scripted_client import ScriptedClient
-from tests.unit.rtc3d_server.wire import COMMAND, command, packets_in
+from tests.unit.session.server.counting_scene import CountingScene
+from tests.unit.session.server.scripted_client import ScriptedClient
+from tests.unit.session.server.wire import COMMAND, command, packets_in
 
 RATE_HZ = 1000.0
 VERSION = (COMMAND, b"OK-Version 1.0")

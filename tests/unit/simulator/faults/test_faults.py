@@ -42,7 +42,7 @@ from gateway.simulator.packet_faults import (
 from gateway.simulator.simulator import KINDS, describe_kinds, parse_fault
 from gateway.simulator.synthetic import SceneSettings
 from tests.support.errors import raises
-from tests.unit.rtc3d_server.wire import (
+from tests.unit.session.server.wire import (
     COMMAND,
     DATA,
     MARKERS,

@@ -32,7 +32,7 @@ from gateway.simulator.packet_faults import (
     ShortEvents,
 )
 from tests.support.errors import names
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, EVENT, NO_DATA, XML, components_in, packet
+from tests.unit.session.server.wire import COMMAND, DATA, ERROR, EVENT, NO_DATA, XML, components_in, packet
 from tests.unit.simulator.faults.faulty_client import VERSION, FaultyClient
 
 UNDERSIZE = struct.pack(">II", 0, DATA)

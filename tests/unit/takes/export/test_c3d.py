@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.descriptions.labels import EventText
+from gateway.messages.descriptions.labels import EventText
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
     AnalogChannel,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
-from gateway.foxglove_schemas.topics import Topic, TopicMessages
+from gateway.messages.foxglove.topics import Topic, TopicMessages
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import (
@@ -393,7 +393,7 @@ def test_versions_that_start_again_have_the_newest_parameters_before_the_message
 def test_without_foxglove_sdk_the_error_has_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in [name for name in sys.modules if name.startswith("gateway.takes.export.mcap")]:
         monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "gateway.foxglove_schemas.topics", None)
+    monkeypatch.setitem(sys.modules, "gateway.messages.foxglove.topics", None)
     with raises(TakeError, "'rtc3d-gateway[foxglove]'"):
         export_messages(tmp_path, [markers(1)], "walk.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]

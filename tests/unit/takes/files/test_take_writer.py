@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from gateway.client.recorder import FileWriter
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.take_writer import begin_log
 from gateway.takes.files.writer_thread import LogFile
-from gateway.takes.recorder import FileWriter
 from tests.support.errors import names
 from tests.support.waiting import wait_until
 

@@ -1,1 +1,0 @@
-"""Logging: failures, losses and repeated events, the formats of the log, and text that is safe in it."""

@@ -1,0 +1,303 @@
+"""The messages of one source as Foxglove's, one at a time: for a file, or live.
+
+docs/reference/takes.md has the table of topics.
+"""
+
+from collections.abc import Container, Iterator
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from foxglove.messages import (
+    FrameTransform,
+    FrameTransforms,
+    Log,
+    LogLevel,
+    PackedElementField,
+    PackedElementFieldNumericType,
+    PointCloud,
+    Quaternion,
+    SceneUpdate,
+    Vector3,
+)
+
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.decode import json_text
+from gateway.messages.descriptions.labels import MAX_EVENT_AGE_US, describe, event_labels, event_text
+from gateway.messages.encode import metres_per_unit
+from gateway.messages.foxglove.plates import NO_POSE, PlateScene
+from gateway.messages.foxglove.topics import (
+    MAX_FIELDS,
+    MAX_UTIME,
+    FloatRecord,
+    FloatTopics,
+    FoxgloveMessage,
+    ProtobufRecord,
+    Topic,
+    TopicMessages,
+    field_names,
+    json_topic,
+    timestamp,
+    topic_of,
+)
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items, num_described_items
+from gateway.rtc3d.parameters import Parameters
+
+_POINT: Final = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reliability", "<f4"), ("marker", "<u4")]
+)
+_POINT_FIELDS: Final = [
+    PackedElementField(
+        name=name,
+        offset=4 * index,
+        type=(
+            PackedElementFieldNumericType.Uint32
+            if name == "marker"
+            else PackedElementFieldNumericType.Float32
+        ),
+    )
+    for index, name in enumerate(_POINT.names or ())
+]
+_LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
+FIELD_NOUNS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
+"""What channels and plates without a name are called."""
+
+NUMBERS_PER_ITEM: Final = {ComponentType.ANALOG: 1, ComponentType.FORCE: len(_LOADS)}
+"""The components whose messages have a field for each number."""
+
+_MAX_LAYOUTS: Final = 100
+"""How many different numbers of items of one component are remembered."""
+
+_MILLIMETRE: Final = 1e-3
+
+
+class FoxgloveSource:
+    """Converts messages of one source, as long as its parameters are the same.
+
+    When they change, create another one with the same ``topics``. ``version`` is that of the parameters.
+    Positions are in ``frame``, whose unit must be known where positions are converted. None means the
+    server's axes, in metres; an unknown unit counts as mm then, and ``problem`` says so in a sentence.
+    """
+
+    def __init__(
+        self,
+        topics: FloatTopics,
+        parameters: Parameters,
+        version: int,
+        frame: CoordinateFrame | None = None,
+    ) -> None:
+        self.source = source = topics.source
+        self.problem = ""
+        self._topics = topics
+        self._parameters = parameters
+        self._version = version
+        self._facts = {} if frame is None else {"frame": frame.facts}
+        if frame is None:
+            unit = parameters.length_unit
+            metres = metres_per_unit(unit)
+            if metres is None:
+                self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"
+            frame = CoordinateFrame(source, metres or _MILLIMETRE)
+        self._frame = frame
+        self._plates = PlateScene(parameters, frame)
+        self._labels_of = lru_cache(_MAX_LAYOUTS)(self._find_labels)
+        self._number_records = lru_cache(_MAX_LAYOUTS)(self._new_records)
+        self._markers = topic_of(f"/{source}/markers", PointCloud)
+        self._tools = topic_of(f"/{source}/tools", FrameTransforms)
+        self._events = topic_of(f"/{source}/events", Log)
+        self._outlines = topic_of(f"/{source}/plates", SceneUpdate)
+        self._arrows = topic_of(f"/{source}/forces", SceneUpdate)
+        self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
+
+    @property
+    def known_topics(self) -> dict[Topic, ComponentType | None]:
+        """All topics and their components; those of numbers only if the parameters say how many there are."""
+        return dict.fromkeys((self._description, self._outlines)) | {
+            topic: component
+            for component in WIRE_ORDER
+            for topic in self.topics(component, num_described_items(self._parameters, component))
+        }
+
+    @property
+    def changed_names(self) -> dict[str, dict[str, str]]:
+        """The names of fields that are not the labels of channels or plates, by component key and label."""
+        found: dict[str, dict[str, str]] = {}
+        for component, noun in FIELD_NOUNS.items():
+            labels = self._labels_of(component, num_described_items(self._parameters, component))
+            names = zip(labels, field_names(labels, noun), strict=True)
+            found[component.key] = {label: name for label, name in names if label != name}
+        return {key: names for key, names in found.items() if names}
+
+    def topics(self, component: ComponentType, num_items: int) -> tuple[Topic, ...]:
+        """Return the topics that a component with this many items has."""
+        match component:
+            case ComponentType.MARKERS:
+                return (self._markers,)
+            case ComponentType.TOOLS:
+                return (self._tools,)
+            case ComponentType.ANALOG:
+                return tuple(self._number_records(component, num_items))
+            case ComponentType.FORCE:
+                return (*self._number_records(component, num_items), self._arrows)
+            case ComponentType.EVENT:
+                return (self._events,)
+
+    def describe(self, utime: int) -> list[FoxgloveMessage]:
+        """Return what is the same for all messages: labels, units and rates, and the outlines of plates."""
+        content: dict[str, Any] = {"version": self._version, **self._facts}
+        for component in WIRE_ORDER:
+            if num_items := num_described_items(self._parameters, component):
+                found = describe(component, self._parameters, num_items)
+                content[component.key] = {
+                    "labels": found.labels,
+                    "units": found.units,
+                    "moment_unit": found.moment_unit,
+                    "rate_hz": found.rate_hz,
+                }
+                if component is ComponentType.ANALOG:
+                    content[component.key]["fields"] = field_names(found.labels, "channel")
+        labels = {str(number): label for number, label in event_labels(self._parameters).items()}
+        content["event"] = {"labels": labels}
+        data = json_text(content).encode()
+        return [
+            FoxgloveMessage(self._description, utime, data),
+            FoxgloveMessage(self._outlines, utime, self._plates.outlines(utime)),
+        ]
+
+    def convert(
+        self,
+        component: ComponentType,
+        items: Items,
+        capture_utime: int,
+        timestamp_us: int,
+        wanted: Container[Topic] | None = None,
+    ) -> list[FoxgloveMessage]:
+        """Return the messages of one component, on the ``wanted`` topics; None means all.
+
+        ``items`` has the shape (items,) and the dtype of ITEM_DTYPES in any byte order. ``capture_utime`` is
+        in µs since 1970, from 0 to MAX_UTIME, and ``timestamp_us`` the server's time stamp.
+        """
+        found: list[FoxgloveMessage] = []
+        for topic in self.topics(component, len(items)):
+            if wanted is not None and topic not in wanted:
+                continue
+            if topic is self._markers:
+                [data] = self._clouds(items[np.newaxis], [capture_utime])
+                found.append(FoxgloveMessage(topic, capture_utime, data))
+            elif topic is self._tools:
+                data = self._transforms(items, capture_utime)
+                if data:
+                    found.append(FoxgloveMessage(topic, capture_utime, data))
+            elif topic is self._events:
+                found += [self._log(item, capture_utime, timestamp_us) for item in items]
+            elif topic is self._arrows:
+                data = self._plates.arrows(items, capture_utime)
+                found.append(FoxgloveMessage(topic, capture_utime, data))
+            else:
+                record = self._number_records(component, len(items))[topic]
+                found.append(FoxgloveMessage(topic, capture_utime, record.encode(_floats(items))))
+        return found
+
+    def convert_frames(
+        self,
+        component: ComponentType,
+        items: Items,
+        capture_utimes: list[int],
+        timestamps_us: list[int],
+        arrow_interval: int,
+    ) -> Iterator[TopicMessages]:
+        """Yield the messages of many frames for a file: what ``convert`` returns for each of them.
+
+        ``items`` has the shape (frames, items). Forces are drawn in one of ``arrow_interval`` frames only.
+        """
+        num_items = items.shape[1]
+        records = self._number_records(component, num_items) if component in NUMBERS_PER_ITEM else {}
+        for topic in self.topics(component, num_items):
+            record = records.get(topic)
+            if isinstance(record, ProtobufRecord):  # as all in files
+                yield TopicMessages(topic, capture_utimes, record.encode_rows(_floats(items)))
+            elif topic is self._markers:
+                yield TopicMessages(topic, capture_utimes, self._clouds(items, capture_utimes))
+            else:
+                chosen = slice(None, None, arrow_interval if topic is self._arrows else 1)
+                frames = zip(items[chosen], capture_utimes[chosen], timestamps_us[chosen], strict=True)
+                converted = [
+                    message
+                    for frame, utime, timestamp_us in frames
+                    for message in self.convert(component, frame, utime, timestamp_us, (topic,))
+                ]
+                yield TopicMessages(
+                    topic, [message.utime for message in converted], [message.data for message in converted]
+                )
+
+    def _clouds(self, items: Items, utimes: list[int]) -> list[bytes]:
+        """Return the visible markers of frames; each has its position in the parameters, from 0."""
+        values = _floats(items).reshape(*items.shape, 4).astype(np.float32)
+        points = np.empty((*items.shape, 5), "<f4")
+        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+            points[..., :3] = self._frame.points(values[..., :3])
+        points[..., 3] = values[..., 3]
+        points.view("<u4")[..., 4] = np.arange(items.shape[1])
+        is_visible: Any = np.isfinite(values[..., :3]).all(axis=2)
+        return [
+            PointCloud(
+                timestamp=timestamp(utime),
+                frame_id=self._frame.frame_id,
+                pose=NO_POSE,
+                point_stride=_POINT.itemsize,
+                fields=_POINT_FIELDS,
+                data=frame[visible].tobytes(),
+            ).encode()
+            for frame, visible, utime in zip(points, is_visible, utimes, strict=True)
+        ]
+
+    def _transforms(self, items: Items, utime: int) -> bytes:
+        """Return the poses of the visible tools; b"" if there are none.
+
+        Without a transform, rerun would reject the messages before and after this one, too.
+        """
+        poses = self._frame.poses(items)
+        labels = self._labels_of(ComponentType.TOOLS, len(poses))
+        time = timestamp(utime)
+        transforms = []
+        for label, pose in zip(labels, poses, strict=True):
+            if pose is not None:
+                x, y, z, qx, qy, qz, qw, _ = pose
+                transforms.append(
+                    FrameTransform(
+                        timestamp=time,
+                        parent_frame_id=self._frame.frame_id,
+                        child_frame_id=f"{self.source}/{label}",
+                        translation=Vector3(x=x, y=y, z=z),
+                        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+                    )
+                )
+        return FrameTransforms(transforms=transforms).encode() if transforms else b""
+
+    def _new_records(self, component: ComponentType, num_items: int) -> dict[Topic, FloatRecord]:
+        """Return the topics of a component's values by their labels; {} if there are none or too many."""
+        if not 0 < num_items * NUMBERS_PER_ITEM[component] <= MAX_FIELDS:
+            return {}
+        name, names = "analog", field_names(self._labels_of(component, num_items), FIELD_NOUNS[component])
+        if component is ComponentType.FORCE:
+            labels = [f"{plate}_{load}" for plate in names for load in _LOADS]
+            name, names = "loads", field_names(labels, "load")
+        return {record.topic: record for record in self._topics.records(name, names)}
+
+    def _log(self, item: Any, capture_utime: int, timestamp_us: int) -> FoxgloveMessage:
+        """Return an event, at its own time stamp if that is plausible."""
+        delay_us = timestamp_us - int(item["timestamp"])
+        utime = capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
+        utime = min(max(utime, 0), MAX_UTIME)
+        text = event_text(self._parameters, item)
+        message = f"{text.label} ({text.description})" if text.description else text.label
+        log = Log(timestamp=timestamp(utime), level=LogLevel.Info, message=message, name=self.source)
+        return FoxgloveMessage(self._events, utime, log.encode())
+
+    def _find_labels(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
+        return describe(component, self._parameters, num_items).labels
+
+
+def _floats(items: Items) -> Items:
+    """Return the values of items, shape (…, values), as they are in memory."""
+    return items.view(items.dtype[0]) if items.dtype.names else items

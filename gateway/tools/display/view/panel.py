@@ -1,0 +1,310 @@
+"""The panel beside the picture: state, rates, latency, losses, visibility, events and plots."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import viser
+
+from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis
+from gateway.messages.source_report import Level, State
+from gateway.tools.display.live import LiveData, LiveSource
+from gateway.tools.display.view.plots import Plots
+from gateway.tools.display.view.scene_items import UP_AXES, Rgb
+from gateway.tools.display.view.texts import (
+    clock_text,
+    counted,
+    data_state,
+    events_html,
+    gateway_states,
+    html_text,
+    ignored_html,
+    items_html,
+    source_html,
+)
+
+_SCRIPT: Final = """
+if (!window.gatewayScript) {
+  window.gatewayScript = true;
+  document.querySelector(`[style*='width: 20em'] [style*='cursor: pointer']`)?.click();
+  let second, changed = performance.now();
+  setInterval(() => {
+    const banner = document.querySelector('[data-second]'), now = performance.now();
+    if (!banner) return;
+    if (banner.dataset.second !== second) [second, changed] = [banner.dataset.second, now];
+    if (now - changed < 4000 || banner.querySelector('.frozen')) return;
+    const line = document.createElement('p');
+    line.className = 'frozen';
+    line.textContent = 'This page gets nothing ' + 'any more. What it shows is old.';
+    banner.append(line);
+  }, 500);
+}
+"""
+"""Runs once in each page, when the style sheet is loaded: viser offers no other way to add a script.
+
+It closes the sheet that viser shows instead of a panel on narrow screens, where it would cover the picture;
+a tap on its title opens it. Then it adds a line to the banner while this program does not change the banner.
+"""
+
+STYLE: Final = (
+    f'<style onload="{_SCRIPT}">'
+    """
+:root { --g-good: #2b8a3e; --g-waiting: #b35900; --g-bad: #c92a2a; --g-line: #0002; --g-on-bad: #fff }
+[data-mantine-color-scheme=dark] { --g-good: #69db7c; --g-waiting: #ffc078; --g-bad: #ff8787; --g-line: #fff2;
+  --g-on-bad: #2c0b0b }
+.gateway { font-size: 12.5px; line-height: 1.45; padding: 2px 12px 4px; overflow-wrap: anywhere }
+.gateway h3 { font-size: 13.5px; margin: 6px 0 2px }
+.gateway p { margin: 2px 0 }
+.gateway table { width: 100%; border-collapse: collapse; margin: 6px 0; font-variant-numeric: tabular-nums }
+.gateway th { font-weight: 500; opacity: .65; font-size: 11.5px; vertical-align: bottom }
+.gateway th, .gateway td { text-align: right; padding: 2px 0 2px 8px; overflow-wrap: normal }
+.gateway td { white-space: nowrap }
+.gateway th:first-child, .gateway td:first-child { text-align: left; padding-left: 0 }
+.gateway .items td:first-child { white-space: normal; overflow-wrap: anywhere }
+.gateway td { border-top: 1px solid var(--g-line) }
+.gateway .good { color: var(--g-good) }
+.gateway .waiting { color: var(--g-waiting) }
+.gateway .bad { color: var(--g-bad) }
+.gateway .dim { opacity: .65 }
+.gateway .last { float: right; opacity: .65; font-variant-numeric: tabular-nums }
+.gateway .stopped { background: var(--g-bad); color: var(--g-on-bad); border-radius: 4px; padding: 5px 8px;
+  margin: 4px 0 }
+.gateway .items table { table-layout: fixed }
+.gateway .items th:nth-child(2) { width: 132px }
+.gateway .items th:nth-child(3) { width: 84px }
+.gateway .bar { display: inline-block; width: 64px; height: 7px; background: var(--g-line) }
+.gateway .share { display: inline-block; width: 56px }
+.gateway .legend { font-size: 11.5px }
+.gateway .bar i { display: block; height: 100%; background: currentColor }
+.gateway .events :is(td, th) { text-align: left }
+.gateway .events td:not(:first-child) { white-space: normal; overflow-wrap: anywhere }
+.gateway .frozen { background: var(--g-bad); color: var(--g-on-bad); border-radius: 4px; padding: 5px 8px }
+[style*="width: 20em"] { width: 100vw !important }
+</style>"""
+)
+
+
+MAX_SOURCES: Final = 16
+"""How many sources the panel shows."""
+
+_MAX_CHARACTERS: Final = 160
+
+
+def banner_html(
+    sources: Sequence[LiveSource], now_s: float, *, is_take: bool = False, is_paused: bool = False
+) -> str:
+    """Return a line for each source: red, with the reason, if its data have stopped.
+
+    ``now_s`` is the time since the Unix epoch. ``is_paused`` is for takes: nothing comes, on purpose.
+    """
+    lines = [f"<p class=waiting>{'The take begins.' if is_take else 'No source is heard yet.'}</p>"]
+    if sources:
+        lines = [_banner_line(each, now_s, is_take, is_paused) for each in sources[:MAX_SOURCES]]
+    if len(sources) > MAX_SOURCES:
+        lines.append(f"<p class=dim>and {counted(len(sources) - MAX_SOURCES, 'more source')}</p>")
+    # The second changes as long as this program runs; otherwise, the page itself says so (_SCRIPT).
+    return f"<section data-second={int(now_s)}>{''.join(lines)}</section>"
+
+
+def _banner_line(source: LiveSource, now_s: float, is_take: bool, is_paused: bool) -> str:
+    name, state, last, recording = html_text(source.name), data_state(source), "", ""
+    if is_take:
+        if is_paused:
+            state = State(Level.WAITING, "paused")
+        elif state.level is Level.GOOD:
+            state = State(Level.GOOD, "recorded")
+    else:
+        age_s = source.age_s
+        last = "" if age_s is None else f"last data {clock_text(now_s - age_s)}"
+        if source.running_take and not source.is_silent:
+            take = html_text(source.running_take, _MAX_CHARACTERS)
+            recording = f"<p><span class=bad>● recording</span> {take}</p>"
+    text = html_text(state.text, _MAX_CHARACTERS)
+    if state.level is Level.BAD and not is_take:
+        reasons = ", ".join(each.text for each in gateway_states(source) if each.level is not Level.GOOD)
+        details = html_text(" · ".join(filter(None, (last, reasons))), _MAX_CHARACTERS)
+        line = f"<div class=stopped><b>{name}: {text}</b>. The picture is old.<br>{details}</div>"
+    else:
+        state_text = f"<span class={state.level.value}>● {text}</span>"
+        line = f"<p>{state_text} <b>{name}</b> <span class=last>{last}</span></p>"
+    return line + recording
+
+
+_LEGEND: Final = (
+    f"<div class=gateway>Yellow arrows are forces: 1 m for {1 / METRES_PER_NEWTON:.0f} N. Axes are tools: "
+    "red x, green y, blue z. What is grey is not live.</div>"
+)
+
+
+class Switches:
+    """The switches of the scene, common to all browsers. ``fit`` is called with the browser that wants it."""
+
+    def __init__(
+        self, server: viser.ViserServer, tab: viser.GuiTabHandle, fit: Callable[[viser.ClientHandle], object]
+    ) -> None:
+        self._server = server
+        self._tab = tab
+        with tab:
+            button = server.gui.add_button("Fit view", hint="Turn the camera so that it sees all data.")
+            self.marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
+            self.tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
+            self.trails = server.gui.add_checkbox("Marker trails", initial_value=False)
+            self.floor = server.gui.add_checkbox("Floor", initial_value=True)
+            self._up = server.gui.add_dropdown(
+                "Up axis", UP_AXES, initial_value="z", hint="The axis of the laboratory that points up."
+            )
+            themes = server.gui.add_button_group("Background", ("dark", "light"))
+            self._group = server.gui.add_folder("Sources")
+            server.gui.add_html(_LEGEND)
+        self.has_chosen_up = False
+        """Whether somebody has chosen the axis that points up."""
+
+        @button.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            if event.client is not None:
+                fit(event.client)
+
+        @self._up.on_update
+        def _(event: viser.GuiEvent[viser.GuiDropdownHandle[UpAxis]]) -> None:
+            self.has_chosen_up |= event.client is not None
+
+        @themes.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
+            if event.client is not None:
+                set_theme(event.client.gui, dark=themes.value == "dark")
+
+    @property
+    def up(self) -> UpAxis:
+        """The axis that points up; z if a page has sent anything else."""
+        chosen = self._up.value
+        return chosen if chosen in UP_AXES else "z"
+
+    def suggest_up(self, up: UpAxis | None) -> None:
+        """Choose the axis that points up, unless somebody has chosen it, or it is not known."""
+        if up is not None and not self.has_chosen_up:
+            self._up.value = up  # type: ignore[misc] # mypy does not find the setter
+
+    def add_source(self, name: str, color: Rgb) -> viser.GuiCheckboxHandle:
+        """Add the switch of a source, with a stripe in its colour."""
+        with self._group:
+            style = f"margin: 0 0.8em; height: 3px; background: rgb{color}"
+            self._server.gui.add_html(f'<div style="{style}"></div>')
+            return self._server.gui.add_checkbox(name, initial_value=True)
+
+
+@dataclass
+class _Turn:
+    """What is shown at an interval, next at ``due_s``."""
+
+    interval_s: float
+    due_s: float
+    show: Callable[[Sequence[LiveSource]], None]
+
+
+_PLOT_INTERVAL_S: Final = 0.1
+_BANNER_INTERVAL_S: Final = 0.25
+_TEXT_INTERVAL_S: Final = 1.0
+
+_WIDTH_PX: Final = 410
+"""The tables need it."""
+
+_MIN_WINDOW_PX: Final = 720
+"""In a narrower window, the panel is closed at first. On phones, viser has a sheet instead: see _SCRIPT."""
+
+
+class Panel:
+    """The tabs of the panel, and above them a banner that says whether the picture is live.
+
+    Texts are built a few times per second, and only while somebody looks. viser sends those that change.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        tabs: viser.GuiTabGroupHandle,
+        live: LiveData,
+        *,
+        is_take: bool = False,
+    ) -> None:
+        self._server = server
+        self._live = live
+        self._is_take = is_take
+        self._is_paused = False
+        self._stopped: tuple[bool, ...] = ()
+        server.gui.main_panel.set_width(_WIDTH_PX)
+        server.gui.add_html(STYLE, order=-2)
+        self._banner = server.gui.add_html("", order=-1)
+        with tabs.add_tab("Sources"):
+            self._sources = server.gui.add_html("")
+        with tabs.add_tab("Markers"):
+            self._items = server.gui.add_html("")
+        with tabs.add_tab("Events"):
+            self._events = server.gui.add_html("")
+        with tabs.add_tab("Plots"):
+            self._plots = Plots(server)
+        # Not all texts in the same turn: the picture would wait for them.
+        now_s = time.monotonic()
+        self._turns = [
+            _Turn(_BANNER_INTERVAL_S, now_s, self._show_banner),
+            _Turn(_TEXT_INTERVAL_S, now_s + 0.05, self._show_sources),
+            _Turn(
+                _TEXT_INTERVAL_S,
+                now_s + 0.15,
+                lambda sources: _show(self._items, map(items_html, sources[:MAX_SOURCES])),
+            ),
+            _Turn(
+                _TEXT_INTERVAL_S,
+                now_s + 0.35,
+                lambda sources: _show(self._events, map(events_html, sources[:MAX_SOURCES])),
+            ),
+            _Turn(_TEXT_INTERVAL_S, now_s + 0.45, self._plots.offer),
+            _Turn(_PLOT_INTERVAL_S, now_s, lambda _: self._plots.show()),
+        ]
+
+        @server.on_client_connect
+        def _(client: viser.ClientHandle) -> None:
+            if client.camera.image_width < _MIN_WINDOW_PX:
+                client.gui.main_panel.minimize()
+
+    def update(self, sources: list[LiveSource], *, is_paused: bool = False) -> None:
+        """Show the sources as they are now. Call it after the picture was sent, at every picture.
+
+        ``is_paused`` says that a take stands still on purpose.
+        """
+        self._is_paused = is_paused
+        for source in sources:
+            for component in [*source.components.values()]:
+                component.note_shown()
+        self._plots.take(sources)
+        if not self._server.get_clients():
+            return
+        now_s = time.monotonic()
+        stopped = tuple(source.is_stopped for source in sources)
+        if stopped != self._stopped:  # said at once
+            self._stopped = stopped
+            self._show_banner(sources)
+        for turn in self._turns:
+            if now_s >= turn.due_s:
+                turn.due_s += turn.interval_s
+                if turn.due_s <= now_s:  # nobody looked, or the computer was busy
+                    turn.due_s = now_s + turn.interval_s
+                turn.show(sources)
+
+    def _show_banner(self, sources: Sequence[LiveSource]) -> None:
+        banner = banner_html(sources, time.time(), is_take=self._is_take, is_paused=self._is_paused)
+        _show(self._banner, [banner])
+
+    def _show_sources(self, sources: Sequence[LiveSource]) -> None:
+        shown = sources[:MAX_SOURCES]
+        texts = [source_html(each, is_take=self._is_take, is_paused=self._is_paused) for each in shown]
+        _show(self._sources, [*texts, ignored_html(self._live)])
+
+
+def _show(tab: viser.GuiHtmlHandle, parts: Iterable[str]) -> None:
+    tab.content = f"<div class=gateway>{''.join(parts)}</div>"
+
+
+def set_theme(gui: viser.GuiApi, *, dark: bool) -> None:
+    """Choose the colours of the page, of all browsers or of one."""
+    gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)

@@ -1,0 +1,290 @@
+"""The picture: the floor, the axes and the camera, and a group for each source."""
+
+import math
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Final, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+import viser
+
+from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis, up_axis_of
+from gateway.rtc3d.parameters import Parameters
+from gateway.takes.files.component_rows import Array
+from gateway.tools.display.live import LiveComponent, LiveSource
+from gateway.tools.display.view.panel import Switches
+from gateway.tools.display.view.scene_items import (
+    GREY,
+    PLANES,
+    UP_AXES,
+    Markers,
+    Plates,
+    Tools,
+    color_of,
+    on_floor,
+)
+
+_MIN_RADIUS_M: Final = 0.3
+_MARGIN: Final = 1.15
+_FROM: Final = (0.6, -1.0, 0.5)
+"""The direction from what is seen to the camera: on the two axes of the floor, and up."""
+
+_FAR: Final = 4.0
+"""Points that are this much farther from the middle than most others are not what the picture is about."""
+
+
+class Sphere(NamedTuple):
+    """What is to be seen, in metres."""
+
+    centre: tuple[float, float, float]
+    radius: float
+
+
+def sphere_around(parts: Sequence[Array]) -> Sphere | None:
+    """Return a sphere around points, each part of shape (points, 3); None without any. NaN is left out."""
+    points = np.concatenate([np.empty((0, 3)), *parts])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    near = points[distances <= _FAR * np.percentile(distances, 75) + _MIN_RADIUS_M]
+    centre = (near.min(axis=0) + near.max(axis=0)) / 2
+    radius = max(_MIN_RADIUS_M, float(np.linalg.norm(near - centre, axis=1).max()))
+    x, y, z = centre.tolist()
+    return Sphere((x, y, z), radius)
+
+
+def fit(client: viser.ClientHandle, sphere: Sphere, up: UpAxis) -> None:
+    """Turn the camera of one browser so that it sees the sphere.
+
+    Raises ValueError if the browser has said that its camera is at no place.
+    """
+    camera = client.camera
+    aspect = camera.image_width / max(1, camera.image_height)  # the height of a page can be 0
+    angle = min(camera.fov, 2 * math.atan(math.tan(camera.fov / 2) * max(0.1, aspect)))
+    distance = _MARGIN * sphere.radius / math.sin(min(max(0.1, angle), math.pi) / 2)
+    direction = np.array(on_floor(up, *_FROM))
+    position = np.array(sphere.centre) + distance * direction / np.linalg.norm(direction)
+    with client.atomic():
+        camera.up_direction = on_floor(up, 0.0, 0.0, 1.0)
+        camera.position = position
+        camera.look_at = sphere.centre
+
+
+_AXIS_M: Final = 0.5
+_GRID_M: Final = 10.0
+_LINE_COLOR: Final = (110, 115, 125)
+
+
+class World:
+    """What does not move. ``up`` is the axis that points up."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        server.scene.configure_default_lights(cast_shadow=False)  # shadows cost browsers more than all else
+        self._grids = {
+            axis: server.scene.add_grid(
+                f"/world/floor {axis}",
+                _GRID_M,
+                _GRID_M,
+                plane=PLANES[axis],
+                cell_size=0.25,
+                cell_color=GREY,
+                cell_thickness=0.4,
+                section_size=1.0,
+                section_color=_LINE_COLOR,
+                section_thickness=1.0,
+                fade_distance=15.0,
+                shadow_opacity=0.0,
+                visible=False,
+            )
+            for axis in UP_AXES
+        }
+        server.scene.add_frame("/world/axes", axes_length=_AXIS_M, axes_radius=0.006, origin_radius=0.012)
+        for name, position in zip("xyz", _AXIS_M * np.eye(3), strict=True):
+            server.scene.add_label(f"/world/{name}", name, position=position, anchor="bottom-center")
+        self._unit = server.scene.add_label(
+            "/world/unit", "1 m", anchor="center-center", font_screen_scale=0.8
+        )
+        self.up: UpAxis = "z"
+        self.set_up("z")
+
+    def set_up(self, up: UpAxis) -> None:
+        """Turn the picture so that this axis points up."""
+        self.up = up
+        direction = on_floor(up, 0.0, 0.0, 1.0)
+        self._server.scene.set_up_direction(direction)
+        for axis, grid in self._grids.items():
+            grid.visible = axis == up
+        self._unit.position = on_floor(up, 1.0, 0.0)
+
+    @property
+    def mark(self) -> Array:
+        """Where the mark for 1 m is, shape (1, 3)."""
+        return np.array([self._unit.position])
+
+    def update(self, *, forces: bool, floor: bool) -> None:
+        """Show the floor or not, and say how much force an arrow of 1 m is if there are ``forces``."""
+        self._unit.text = f"1 m = {1 / METRES_PER_NEWTON:.0f} N" if forces else "1 m"
+        self._grids[self.up].visible = floor
+
+
+_NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
+
+_GAP_M: Final = 0.2
+"""How much higher the label of each further source is that says that its data have stopped."""
+
+
+class SourceScene:
+    """The markers, tools, plates and forces of a source, in a group of their own.
+
+    ``number`` is the source's: it has a colour of its own, and its labels are not where others have theirs.
+    """
+
+    def __init__(
+        self, scene: viser.SceneApi, source: LiveSource, number: int, switch: viser.GuiCheckboxHandle
+    ) -> None:
+        self._number = number
+        self._name = source.name
+        self._switch = switch
+        path = f"/sources/{quote(source.channels, safe='')}"
+        self.group = scene.add_frame(path, show_axes=False)
+        """What is visible if its switch is on."""
+        self._markers = Markers(scene, path, color_of(number))
+        self._tools = Tools(scene, path)
+        self._plates = Plates(scene, path, number)
+        self._stopped = scene.add_label(
+            f"{path}/stopped", "", visible=False, font_screen_scale=1.6, anchor="bottom-center"
+        )
+
+    def update(
+        self, source: LiveSource, up: UpAxis, switches: Switches, now_s: float, *, is_alone: bool
+    ) -> None:
+        """Show the newest data of the source. If it is not alone, its labels begin with its name."""
+        if source.name != self._name:  # on LCM, a status says the name
+            self._name = source.name
+            self._switch.label = source.name
+        self.group.visible = self._switch.value
+        if not self.group.visible:
+            return
+        components = {**source.components}
+        prefix = "" if is_alone else f"{source.name}: "
+        if "3d" in components:
+            labels, trails = switches.marker_labels.value, switches.trails.value
+            self._markers.update(components["3d"], now_s, prefix, labels=labels, trails=trails)
+        if "6d" in components:
+            self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels.value)
+        self._plates.update(components.get("force"), source.newest_parameters, up, now_s, prefix)
+        self._say_stopped(source.name, components, up)
+
+    @property
+    def subject(self) -> "Sphere | None":
+        """What is around the markers and tools in the picture; None without any."""
+        return sphere_around([self._markers.positions, self._tools.positions])
+
+    @property
+    def has_plates(self) -> bool:
+        """Whether force plates are shown."""
+        return bool(self.group.visible) and len(self._plates.corners) > 0
+
+    @property
+    def points(self) -> list[np.ndarray]:
+        """The positions of everything, each of shape (points, 3), in metres; NaN is missing."""
+        return [self._markers.positions, self._tools.positions, self._plates.corners]
+
+    def _say_stopped(self, name: str, components: dict[str, LiveComponent], up: UpAxis) -> None:
+        stopped = {key: each for key, each in components.items() if each.is_stopped}
+        self._stopped.visible = bool(stopped)
+        if not stopped:
+            return
+        expected = [key for key in _NAMES if key in components and components[key].age_s is not None]
+        names = [_NAMES[key] for key in expected if key in stopped]
+        what = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+        if len(names) == len(expected):
+            what = "data"
+        age_s = max(each.age_s or 0.0 for each in stopped.values())
+        duration = f"{age_s / 60:.0f} min" if age_s < 6000 else f"{age_s / 3600:.0f} h"
+        if age_s < 100:
+            duration = f"{age_s:.0f} s"
+        self._stopped.text = f"{name}: no {what} for {duration}"
+        # Above its own subject: between that and its plates, another source's subject may be.
+        sphere = self.subject or sphere_around([self._plates.corners]) or Sphere((0.0, 0.0, 0.0), 0.0)
+        above = on_floor(up, 0.0, 0.0, sphere.radius + _GAP_M * self._number)
+        self._stopped.position = np.add(sphere.centre, above)
+
+
+_SETTLE_S: Final = 0.3
+"""How long after the first data the view is fitted: other sources may come at the same time."""
+
+
+class Scene:
+    """The picture of all sources. Everything is called in one thread, except what viser calls."""
+
+    def __init__(self, server: viser.ViserServer, tabs: viser.GuiTabGroupHandle) -> None:
+        self._server = server
+        self._world = World(server)
+        self._sources: dict[str, SourceScene] = {}  # by the beginning of their channels
+        self._parameters: list[Parameters] = []
+        self._first_s: float | None = None
+        """When the first data were shown."""
+        self._has_subject = False
+        """Whether markers or tools have been shown, and not only plates."""
+        self._fitted: set[int] = set()
+        """The browsers whose view has been fitted."""
+        self._switches = Switches(
+            server, tabs.add_tab("Scene"), lambda client: self._fitted.discard(client.client_id)
+        )
+
+    def update(self, sources: list[LiveSource], clients: dict[int, viser.ClientHandle]) -> None:
+        """Show the newest data of the sources to the browsers."""
+        now_s = time.monotonic()
+        for source in sources:
+            if source.channels not in self._sources:
+                number = len(self._sources)
+                switch = self._switches.add_source(source.name, color_of(number))
+                self._sources[source.channels] = SourceScene(self._server.scene, source, number, switch)
+        parameters = [source.newest_parameters for source in sources]
+        if [*map(id, parameters)] != [*map(id, self._parameters)]:
+            self._parameters = parameters
+            self._switches.suggest_up(up_axis_of(parameters))
+        if self._world.up != self._switches.up:
+            self._world.set_up(self._switches.up)
+            self._fitted.clear()
+        for source in sources:
+            self._sources[source.channels].update(
+                source, self._world.up, self._switches, now_s, is_alone=len(sources) == 1
+            )
+        has_plates = any(scene.has_plates for scene in self._sources.values())
+        self._world.update(forces=has_plates, floor=self._switches.floor.value)
+        self._fit(clients, now_s, has_scale=has_plates)
+
+    def pause(self) -> None:
+        """Hide the data while no browser is connected: the next one must not show old data first."""
+        for scene in self._sources.values():
+            scene.group.visible = False
+
+    def _fit(self, clients: dict[int, viser.ClientHandle], now_s: float, *, has_scale: bool) -> None:
+        """Fit the view of browsers that are new, or want it; of all when the first markers or tools come."""
+        if not self._has_subject and any(scene.subject for scene in self._sources.values()):
+            self._has_subject = True
+            self._first_s = now_s
+            self._fitted.clear()
+        self._fitted &= clients.keys()
+        waiting = [client for number, client in clients.items() if number not in self._fitted]
+        if not waiting:
+            return
+        points = [part for scene in self._sources.values() if scene.group.visible for part in scene.points]
+        if points and has_scale:
+            points.append(self._world.mark)  # it says the scale of the arrows
+        sphere = sphere_around(points)
+        if sphere is None:
+            return
+        self._first_s = now_s if self._first_s is None else self._first_s
+        if now_s - self._first_s < _SETTLE_S:
+            return
+        for client in waiting:
+            self._fitted.add(client.client_id)
+            with suppress(ValueError):
+                fit(client, sphere, self._world.up)
