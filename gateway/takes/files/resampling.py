@@ -1,14 +1,14 @@
 """A series at another rate, on a grid of times that all components share."""
 
 import math
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array
-from gateway.takes.files.series import MAX_PADDING, MIN_LIMIT_BYTES, Series, regular_step
+from gateway.takes.files.series_data import MAX_PADDING, MIN_LIMIT_BYTES, SeriesData, regular_step
 
 _MAX_RATE_HZ: Final = 1_000_000
 """Times are in whole µs."""
@@ -27,13 +27,15 @@ _NUM_VALUES: Final = {
 }
 """How many fields of an item must not be NaN; those behind them are its reliability or error."""
 
+_SeriesT = TypeVar("_SeriesT", bound=SeriesData)
+
 _QUATERNION: Final = slice(0, 4)
 """The fields q0, qx, qy, qz of a tool."""
 
 
 def resample(
-    series: Series, rate_hz: float, max_gap_s: float, from_s: float | None, to_s: float | None
-) -> Series:
+    series: _SeriesT, rate_hz: float, max_gap_s: float, from_s: float | None, to_s: float | None
+) -> _SeriesT:
     """Return a series at another rate: see ``Series.resample``."""
     if series.component is ComponentType.EVENT:
         raise TakeError("events have no rate and cannot be resampled; each has a time of its own")
@@ -48,7 +50,7 @@ def resample(
     bounds = np.searchsorted(times, [run.capture_utime.min() for run in runs]).tolist()
     bounds = [0, *bounds[1:], len(times)]
     items: dict[int, list[Array]] = {}
-    nearest: list[tuple[Series, Array]] = []
+    nearest: list[tuple[_SeriesT, Array]] = []
     for run, first, stop in zip(runs, bounds, bounds[1:], strict=False):
         values, frames = _interpolate(run, times[first:stop], max_gap_s * 1e6)
         [(number, recorded)] = run.content.recorded.items()
@@ -59,7 +61,7 @@ def resample(
         for name in series.content.columns
     }
     columns["capture_utime"] = times
-    return Series(
+    return type(series)(
         series.component,
         columns,
         {number: np.concatenate(found) for number, found in items.items()},
@@ -70,7 +72,7 @@ def resample(
     )
 
 
-def _between_clock_steps(run: Series) -> list[Series]:
+def _between_clock_steps(run: _SeriesT) -> list[_SeriesT]:
     """Return the parts of a run between steps back of the gateway's clock, after which times occur again."""
     order = np.argsort(run.sequence, kind="stable")
     steps = np.diff(run.capture_utime[order])
@@ -78,7 +80,7 @@ def _between_clock_steps(run: Series) -> list[Series]:
     return [run.rows(np.sort(chosen)) for chosen in np.split(order, places + 1)] if len(places) else [run]
 
 
-def _grid(series: Series, rate_hz: float, from_s: float | None, to_s: float | None) -> Array:
+def _grid(series: SeriesData, rate_hz: float, from_s: float | None, to_s: float | None) -> Array:
     """Return the times in µs since 1970, int64: multiples of the period since the beginning of the take."""
     first_s = float(series.seconds.min()) if from_s is None else from_s
     last_s = float(series.seconds.max()) if to_s is None else to_s
@@ -98,7 +100,7 @@ def _grid(series: Series, rate_hz: float, from_s: float | None, to_s: float | No
     return elapsed_us + series.start_utime
 
 
-def _interpolate(run: Series, times: Array, max_gap_us: float) -> tuple[Array, Array]:
+def _interpolate(run: SeriesData, times: Array, max_gap_us: float) -> tuple[Array, Array]:
     """Return the values of a run at these times, float32, and the index of the nearest frame of each.
 
     The shape of the values is (times, items * fields). Values that are missing do not count: an item is

@@ -9,7 +9,7 @@ from gateway.errors import TakeError
 from gateway.messages.descriptions.labels import distinct, event_text
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.takes.files.component_rows import Array
-from gateway.takes.files.series import Series
+from gateway.takes.files.series_data import SeriesData
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,12 +39,12 @@ class Column(NamedTuple):
     unit: str
 
 
-def time_columns(series: Series) -> dict[str, Array]:
+def time_columns(series: SeriesData) -> dict[str, Array]:
     """Return the columns of TIME_COLUMNS, each of shape (rows,)."""
     return {"time_s": series.seconds, **{name: series.content.columns[name] for name in TIME_COLUMNS[1:]}}
 
 
-def value_columns(series: Series) -> tuple[Column, ...]:
+def value_columns(series: SeriesData) -> tuple[Column, ...]:
     """Return the columns of the values, in their order; each name is different, also from TIME_COLUMNS."""
     if series.component is ComponentType.EVENT:
         return tuple(Column(name, "") for name in _EVENT_COLUMNS)
@@ -57,19 +57,19 @@ def value_columns(series: Series) -> tuple[Column, ...]:
     return tuple(map(Column, distinct(labels, lambda label, _: label, TIME_COLUMNS), units))
 
 
-def _unit(series: Series, unit: str, field: str) -> str:
+def _unit(series: SeriesData, unit: str, field: str) -> str:
     if field in _QUATERNION:
         return ""
     return series.moment_unit if field in _MOMENTS else unit
 
 
-def value_rows(series: Series) -> Array:
+def value_rows(series: SeriesData) -> Array:
     """Return the values as a table, float32, shape (rows, columns). Not of events."""
     values = series.values
     return values.reshape(len(series), int(np.prod(values.shape[1:])))
 
 
-def event_columns(series: Series) -> dict[str, list[Any]]:
+def event_columns(series: SeriesData) -> dict[str, list[Any]]:
     """Return the values of events by column, one for each row."""
     items = series.items
     texts = [event_text(series.parameters_of(row), item) for row, item in enumerate(items)]
@@ -82,7 +82,7 @@ def event_columns(series: Series) -> dict[str, list[Any]]:
     }
 
 
-def to_pandas(series: Series) -> "pd.DataFrame":
+def to_pandas(series: SeriesData) -> "pd.DataFrame":
     """Return a table: see ``Series.to_pandas``."""
     package = _installed("pandas")
     times = time_columns(series)
@@ -102,7 +102,7 @@ def units_by_column(columns: tuple[Column, ...]) -> dict[str, str]:
     return _TIME_UNITS | {column.name: column.unit for column in columns if column.unit}
 
 
-def to_xarray(series: Series) -> "xarray.Dataset":
+def to_xarray(series: SeriesData) -> "xarray.Dataset":
     """Return a dataset: see ``Series.to_xarray``."""
     package = _installed("xarray")
     times = time_columns(series)
