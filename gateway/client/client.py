@@ -9,7 +9,14 @@ from typing import IO, Any, Final, NamedTuple, Self
 from gateway.client.history_requests import Completeness
 from gateway.client.lcm_transport import LcmTransport
 from gateway.client.reception import Reception
-from gateway.client.transport import FoundSources, GatewaySubscriber, Query, Replies, Reply, Transport
+from gateway.client.transport import (
+    FoundSources,
+    GatewaySubscriber,
+    Query,
+    QueryReplies,
+    QueryReply,
+    Transport,
+)
 from gateway.client.zenoh_transport import ZenohTransport
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import DEFAULT_LCM_PREFIX
@@ -54,7 +61,7 @@ class GatewayAddress(NamedTuple):
     queries_url: str | None = None
 
 
-TakeReplies = Replies[dict[str, dict[str, Any]]]
+TakeReplies = QueryReplies[dict[str, dict[str, Any]]]
 """What gateways say about takes, by source; docs/reference/queries.md describes it."""
 
 
@@ -97,7 +104,7 @@ class GatewayClient:
 
     def parameters(
         self, source: str | None = None, sections: tuple[str, ...] = (), *, fresh: bool = False
-    ) -> Replies[list[Reply]]:
+    ) -> QueryReplies[list[QueryReply]]:
         """Return the parameters of a source, or of all that are found, as XML.
 
         ``sections`` are keys of SECTIONS (gateway.rtc3d.parameters), such as "3d"; () means all. ``fresh``
@@ -193,11 +200,11 @@ class GatewayClient:
         self._process.check("this client")
         return self._opened
 
-    def _ask(self, query: Query, source: str | None) -> Replies[list[Reply]]:
+    def _ask(self, query: Query, source: str | None) -> QueryReplies[list[QueryReply]]:
         try:
             return self._transport().ask(query, source, self._timeout_s)
         except QueryError as error:
-            return Replies([], [error])
+            return QueryReplies([], [error])
 
     def _ask_takes(self, options: Mapping[str, str], source: str | None) -> TakeReplies:
         """Ask a source, or all that are found, with these options.
@@ -220,7 +227,7 @@ class GatewayClient:
         if source is None and received:
             expected = {"disabled", "nothing-yet"} if options.get(CONTROL_OPTION) == "stop" else {"disabled"}
             problems = [problem for problem in problems if problem.code not in expected]
-        return Replies(received, problems)
+        return QueryReplies(received, problems)
 
 
 def _open(address: GatewayAddress) -> Transport:
@@ -286,7 +293,7 @@ class TakeTransfer:
         file.truncate(boundary.complete_bytes)
         return FetchedTake(first.source, boundary.complete_bytes, False)
 
-    def _first_piece(self) -> Reply:
+    def _first_piece(self) -> QueryReply:
         """Return the first piece, from the only source that has the take."""
         pieces, problems = self._ask(self._source, 0)
         if len(pieces) > 1:
@@ -297,7 +304,7 @@ class TakeTransfer:
             raise _most_telling(problems)
         return pieces[0]
 
-    def _next_piece(self, first: Reply, offset: int) -> Reply:
+    def _next_piece(self, first: QueryReply, offset: int) -> QueryReply:
         """Return the piece at ``offset`` from the gateway that sent the first one."""
         problems: list[QueryError] = []
         for _ in range(ATTEMPTS):
@@ -309,7 +316,7 @@ class TakeTransfer:
                 break
         raise _most_telling(problems)
 
-    def _ask(self, source: str | None, offset: int) -> Replies[list[Reply]]:
+    def _ask(self, source: str | None, offset: int) -> QueryReplies[list[QueryReply]]:
         """Return the pieces at ``offset``: replies whose facts have the size of the take as ``bytes``."""
         query = Query("take", "takes", options={READ_OPTION: self._name, "offset": str(offset)})
         replies = self._transport.ask(query, source, self._timeout_s)
@@ -322,7 +329,7 @@ class TakeTransfer:
             else:
                 text = f"source {reply.source!r}: a piece of take {self._name!r} cannot be read"
                 replies.problems.append(QueryError(text, code="unreadable"))
-        return Replies(pieces, replies.problems)
+        return QueryReplies(pieces, replies.problems)
 
 
 def _most_telling(problems: list[QueryError]) -> QueryError:

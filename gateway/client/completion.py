@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.client.arrived_run import ArrivedRun, HeldBytes
-from gateway.client.completion_states import End, State, Unknown
+from gateway.client.completion_states import CompletionState, End, Unknown
 from gateway.client.delivery import Delivery
 from gateway.client.history_requests import (
     COMPLETE,
@@ -65,7 +65,7 @@ class Completion:
         is_past = completeness.last_s is not None
         self._fills_gaps = completeness.is_complete
         self._is_steady = is_steady
-        self._state = State.BEGINNING if self._fills_gaps or is_past else State.PASSING
+        self._state = CompletionState.BEGINNING if self._fills_gaps or is_past else CompletionState.PASSING
         self._end = End.OPEN
         self._delivery = Delivery(hand_on, check, held_bytes)
         self._timing = RequestTiming(completeness.patience_s, is_past=is_past)
@@ -106,7 +106,7 @@ class Completion:
     def has_begun(self) -> bool:
         """Whether anything has arrived, or was requested."""
         has_arrived = self._delivery.arrived.until >= 0
-        return self._state is not State.BEGINNING or has_arrived or self._timing.is_due
+        return self._state is not CompletionState.BEGINNING or has_arrived or self._timing.is_due
 
     # What arrives.
 
@@ -117,10 +117,10 @@ class Completion:
 
         Unless ``has_room``, it is let go, and is requested later.
         """
-        if self._end is not End.OPEN or self._state is State.ENDED:
+        if self._end is not End.OPEN or self._state is CompletionState.ENDED:
             return
         delivery = self._delivery
-        if self._state is not State.PASSING and delivery.recent.utime_of(sequence, -1) == utime:
+        if self._state is not CompletionState.PASSING and delivery.recent.utime_of(sequence, -1) == utime:
             return  # it comes again, or late: that shows nothing, however often
         self._watch_publishers(sequence, utime, session, now_s)
         arrived = self._arriving
@@ -128,7 +128,7 @@ class Completion:
         is_next_run = not arrived.is_continued_by(sequence, utime, session) or (
             arrived is delivery.arrived and delivery.recent.contradict(sequence, utime)
         )
-        if is_next_run and self._state is not State.PASSING:
+        if is_next_run and self._state is not CompletionState.PASSING:
             self._suspect_restart(now_s)
         elif is_next_run and self.problem and not self._watch.sees_two(now_s):
             # The gateway that has restarted may keep messages, even if the former one did not. No history
@@ -136,7 +136,7 @@ class Completion:
             delivery.check.begin_at(0, is_restart=True)
             delivery.begin_run()
             self._resume(now_s)
-        if self._state is State.PASSING:
+        if self._state is CompletionState.PASSING:
             if not arrived.is_continued_by(sequence, utime, session):
                 delivery.begin_run()
                 arrived = delivery.arrived
@@ -160,8 +160,8 @@ class Completion:
         self._newest_since = max(self._newest_since, sequence)
         if self.is_past:
             self._timing.wait_for_past(now_s)
-        if self._state is State.BEGINNING and self._first_request is None:
-            delivery.next, self._state = sequence, State.FOLLOWING
+        if self._state is CompletionState.BEGINNING and self._first_request is None:
+            delivery.next, self._state = sequence, CompletionState.FOLLOWING
             delivery.check.begin_at(sequence)
         if not has_room:
             self._timing.wait_from(now_s)  # nothing is requested until there is room
@@ -169,7 +169,7 @@ class Completion:
             # One of the two has a false number, and nothing here says which. The history has the other one.
             delivery.num_damaged += 1
             arrived.release(sequence)
-        elif self._state in {State.BEGINNING, State.CHECKING} or sequence > delivery.next:
+        elif self._state in {CompletionState.BEGINNING, CompletionState.CHECKING} or sequence > delivery.next:
             arrived.hold(sequence, message)
         elif sequence == delivery.next:
             delivery.pass_on(sequence, message)
@@ -180,22 +180,22 @@ class Completion:
     def _advance(self, now_s: float, *, is_live: bool = False) -> None:
         """Hand on what is held and follows, and note when to request what is missing, if it is."""
         delivery = self._delivery
-        if self._state in {State.FOLLOWING, State.FILLING}:
+        if self._state in {CompletionState.FOLLOWING, CompletionState.FILLING}:
             while delivery.next in delivery.arrived.held:
                 delivery.pass_on(delivery.next, delivery.arrived.release(delivery.next))
             # What was lost last, no later message shows: at the end, only the history knows it.
             if delivery.next <= delivery.arrived.until or self._end is End.ENDING:
-                self._state = State.FILLING
+                self._state = CompletionState.FILLING
             else:
-                self._state, delivery.asks_known = State.FOLLOWING, True
+                self._state, delivery.asks_known = CompletionState.FOLLOWING, True
                 self._timing.stop()
                 self._end_past()
-        is_incomplete = self._state in {State.FILLING, State.CHECKING} or (
-            self._state is State.BEGINNING and delivery.arrived.until >= 0
+        is_incomplete = self._state in {CompletionState.FILLING, CompletionState.CHECKING} or (
+            self._state is CompletionState.BEGINNING and delivery.arrived.until >= 0
         )
         if is_incomplete and not self._timing.is_due:
             # A message that the network delivers late comes by itself: to request each would cost more.
-            is_late = is_live and self._state is State.FILLING
+            is_late = is_live and self._state is CompletionState.FILLING
             self._timing.begin(now_s, GRACE_S if is_late else 0.0)
         if is_live:
             self._timing.hear(now_s)
@@ -203,7 +203,10 @@ class Completion:
     def notice(self, newest: int, utime: int, now_s: float) -> None:
         """Take the number and the time of the newest message that the history has: it may never arrive."""
         arrived = self._delivery.arrived
-        if self._state not in {State.FOLLOWING, State.FILLING} or utime <= arrived.newest_utime:
+        if (
+            self._state not in {CompletionState.FOLLOWING, CompletionState.FILLING}
+            or utime <= arrived.newest_utime
+        ):
             return
         if newest > arrived.until:
             arrived.until = newest
@@ -220,7 +223,7 @@ class Completion:
         """Pass messages on while two gateways publish: the numbers of neither say what is missing."""
         self._watch.add(sequence, utime, session, now_s)
         has_two = self._watch.sees_two(now_s)
-        if has_two and self._state is not State.PASSING:
+        if has_two and self._state is not CompletionState.PASSING:
             self.unknown[Unknown.TWO_GATEWAYS] += 1
             self._pass_on_only("two gateways publish it", now_s)
         elif self.problem and now_s >= self._passes_until_s and not has_two:
@@ -231,7 +234,7 @@ class Completion:
         self._delivery.flush(self._restart.take_runs(), has_restarted=False)
         self.problem = self.last_problem = problem
         self._passes_until_s = until_s
-        self._state, self._first_request = State.PASSING, None
+        self._state, self._first_request = CompletionState.PASSING, None
         self._timing.stop()
         self._timing.end_past()
         self._requested += 1
@@ -240,7 +243,7 @@ class Completion:
         """Fill gaps again, from the newest message on."""
         self.problem = ""
         self._delivery.resume()
-        self._state = State.FOLLOWING
+        self._state = CompletionState.FOLLOWING
         self._timing.wait_from(now_s)
 
     # What is requested.
@@ -269,9 +272,9 @@ class Completion:
         """Return what to request; only if something is due."""
         self._requested += 1
         self._newest_since = -1
-        if self._state is State.CHECKING:
+        if self._state is CompletionState.CHECKING:
             return self._restart.request(self._requested, self._delivery)
-        if self._state is State.BEGINNING:
+        if self._state is CompletionState.BEGINNING:
             return (self._first_request or HistoryRequest(0))._replace(number=self._requested)
         return self._delivery.request(self._requested, knows_last=self._end is not End.ENDING)
 
@@ -280,7 +283,7 @@ class Completion:
         if request.number != self._requested:
             return
         self._timing.note_answer()
-        if self._state is State.CHECKING:
+        if self._state is CompletionState.CHECKING:
             self._take_verdict(request, answer, now_s)
         elif request.is_contradicted_by(answer):
             # Only a restart explains that, or a false number that was handed on. The number of the known
@@ -303,9 +306,9 @@ class Completion:
     def _take(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Hand on, or hold, what the history has."""
         delivery, former = self._delivery, self._delivery.next
-        if self._state is State.BEGINNING:
+        if self._state is CompletionState.BEGINNING:
             delivery.next = min([answer.first, *delivery.arrived.held])
-            self._state, self._first_request = State.FILLING, None
+            self._state, self._first_request = CompletionState.FILLING, None
         if former < 0 or self._end is End.ENDING:
             delivery.arrived.until = max(delivery.arrived.until, answer.newest)
         if self._end is End.ENDING:
@@ -332,7 +335,7 @@ class Completion:
         if code in RETRY_CODES:
             # Without a connection, nobody takes a request either: only if messages arrive, the gateway is one
             # of an earlier version. What has made the request shows a connection, however long none follows.
-            has_arrived = self._state is State.CHECKING or self._asks_for_first
+            has_arrived = self._state is CompletionState.CHECKING or self._asks_for_first
             is_nobody = code == "no-gateway" and (is_connected or has_arrived)
             is_over = not self._repeat(
                 now_s, has_helped=False, is_nobody=is_nobody, knows_end=is_nobody and is_connected
@@ -355,7 +358,11 @@ class Completion:
     def _lacks_what_arrived(self) -> bool:
         """Whether a history without messages is of yet another run: of this one, some have arrived."""
         delivery = self._delivery
-        return self._state is State.FILLING and delivery.reached is None and delivery.arrived.newest >= 0
+        return (
+            self._state is CompletionState.FILLING
+            and delivery.reached is None
+            and delivery.arrived.newest >= 0
+        )
 
     @property
     def _asks_for_first(self) -> bool:
@@ -375,16 +382,16 @@ class Completion:
         """Go on with the next message that there is."""
         self._timing.stop()
         arrived = self._delivery.arrived
-        if self._state is State.CHECKING:
+        if self._state is CompletionState.CHECKING:
             # Nobody denies the restart that the numbers show. If they are false, the past is not repeated
             # either: the history does not answer.
             self._begin_run(None, now_s)
             return
-        if self._state is State.BEGINNING:
+        if self._state is CompletionState.BEGINNING:
             self.unknown[Unknown.BEGINNING] += self._asks_for_first and not knows_end
             self._first_request = None
             if arrived.until >= 0:
-                self._delivery.next, self._state = arrived.first, State.FOLLOWING
+                self._delivery.next, self._state = arrived.first, CompletionState.FOLLOWING
         elif self.is_past:
             self._delivery.skip_past_to(arrived.first)
         else:
@@ -399,7 +406,7 @@ class Completion:
         """Go on with what arrives now; without filling gaps, if that is not wanted."""
         if self.is_past and not self._fills_gaps:
             self._flush()
-            self._state = State.PASSING
+            self._state = CompletionState.PASSING
             self._timing.stop()
             self._requested += 1  # the past may still come, and would be handed on after what is live
         self._timing.end_past()
@@ -413,8 +420,8 @@ class Completion:
             if self._restart.has_too_many_runs:
                 self._pass_on_only("the numbers of its messages have no order", now_s + PASSING_S)
                 return
-        if self._state is not State.CHECKING:
-            self._state = State.CHECKING
+        if self._state is not CompletionState.CHECKING:
+            self._state = CompletionState.CHECKING
             self._restart.begin()
             self._timing.request_now(now_s)
         self._requested += 1  # an answer that is on its way may be of before the restart, and would deny it
@@ -433,7 +440,7 @@ class Completion:
             if verdict is Verdict.FALSE_NUMBER:
                 self._delivery.correct_known(sequence_of(answer.messages[0]))
             self._restart.rejoin(self._delivery, newest)
-            self._state = State.BEGINNING if self._delivery.next < 0 else State.FILLING
+            self._state = CompletionState.BEGINNING if self._delivery.next < 0 else CompletionState.FILLING
             self._timing.request_now(now_s)
             self._advance(now_s)
 
@@ -448,7 +455,7 @@ class Completion:
         self._requested += 1
         if self._end is End.KNOWN:
             self._end = End.ENDING  # that was the end of the former run
-        self._state, self._first_request = State.FOLLOWING, None
+        self._state, self._first_request = CompletionState.FOLLOWING, None
         self._timing.stop()
         self._advance(now_s)
         self._end_past()
@@ -461,7 +468,7 @@ class Completion:
 
     def end(self, now_s: float) -> None:
         """Take nothing more that is published, and request everything until now."""
-        if self._state in {State.PASSING, State.ENDED} or not self.has_begun:
+        if self._state in {CompletionState.PASSING, CompletionState.ENDED} or not self.has_begun:
             return
         if self._end is End.OPEN:
             self._end = End.ENDING
@@ -470,9 +477,9 @@ class Completion:
 
     def abandon(self) -> None:
         """Hand on what is held, and request nothing more."""
-        if self._state is not State.PASSING:
+        if self._state is not CompletionState.PASSING:
             self._flush()
         self.unknown[Unknown.END] += self._end is End.ENDING
-        self._state = State.ENDED
+        self._state = CompletionState.ENDED
         self._timing.stop()
         self._requested += 1

@@ -3,7 +3,7 @@
 import enum
 
 
-class State(enum.Enum):
+class CompletionState(enum.Enum):
     """What a Completion does with a message that arrives.
 
     =====================  ================================================================================

@@ -22,14 +22,14 @@ from gateway.client.history_requests import (
 from gateway.client.lcm_refill import LcmRefill
 from gateway.client.lcm_requester import LcmRequester
 from gateway.client.reception import Reception
-from gateway.client.sources import FINGERPRINTS, POSE, Series, Source
+from gateway.client.sources import FINGERPRINTS, POSE, ReceivedSeries, ReceivedSource
 from gateway.client.transport import (
     RETRY_S,
     FoundSources,
     GatewaySubscriber,
     Query,
-    Replies,
-    Reply,
+    QueryReplies,
+    QueryReply,
     TimeLimits,
     Transport,
     read_status,
@@ -106,9 +106,9 @@ class LcmTransport(Transport):
 
     # Queries.
 
-    def ask(self, query: Query, source: str | None, timeout_s: float) -> Replies[list[Reply]]:
+    def ask(self, query: Query, source: str | None, timeout_s: float) -> QueryReplies[list[QueryReply]]:
         """See Transport. It repeats requests: they and their replies can get lost."""
-        replies: Replies[list[Reply]] = Replies([], [])
+        replies: QueryReplies[list[QueryReply]] = QueryReplies([], [])
         with self._hear(source) as found:
             if source is None:
                 _wait_for_all(found)
@@ -205,11 +205,11 @@ def _request(query: Query) -> Any:
     return request
 
 
-def _reply(source: str, query: Query, reply: Any) -> Reply:
+def _reply(source: str, query: Query, reply: Any) -> QueryReply:
     if isinstance(reply, rtc3d.command_reply_t):
-        return Reply(source, (), reply.content.encode())
+        return QueryReply(source, (), reply.content.encode())
     facts = {"age_s": reply.age_s, "parameters_version": reply.parameters_version}
-    return Reply(source, query.sections, xml_bytes(reply.xml), facts)
+    return QueryReply(source, query.sections, xml_bytes(reply.xml), facts)
 
 
 START_S: Final = 1.2
@@ -244,7 +244,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._names = {lcm_channel(prefix, name): name for name in sources}
         self._requester = requester
         self._refill = refill
-        self._pose_keys: dict[Series, str] = {}
+        self._pose_keys: dict[ReceivedSeries, str] = {}
         """The keys of poses on Zenoh: channels do not say the labels of tools exactly."""
         self._take_requests: dict[str, Any] = {}
         """The newest request for the takes of each source, by the beginning of its channels."""
@@ -256,7 +256,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         pattern = f"({channels})_({keys})"
         self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
-    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
+    def _identify(self, address: str, message: bytes) -> tuple[ReceivedSource | None, str, str] | None:
         exchange = ("_REQUEST", "_REPLY", "_REFILL", "_RECONNECTED")
         if address.endswith(exchange) or is_presence(address, message):
             return None
@@ -271,12 +271,12 @@ class LcmGatewaySubscriber(GatewaySubscriber):
             return None
         name = self._names.get(channels)
         guess = channels.removeprefix(f"{self._prefix}_").lower()
-        source: Source | None = self._reception.source(name or guess, channels, is_known=False)
+        source: ReceivedSource | None = self._reception.source(name or guess, channels, is_known=False)
         if source is not None and name is not None:
             source.has_known_name = True
         return source, key, address
 
-    def _take(self, series: Series, message: bytes, sample: Any) -> None:  # noqa: ARG002 - overrides
+    def _take(self, series: ReceivedSeries, message: bytes, sample: Any) -> None:  # noqa: ARG002 - overrides
         """See GatewaySubscriber. The status says the name of a source: channels have only capital letters."""
         source = series.source
         if series.key == "parameters" and series.accepts(message):
@@ -289,7 +289,9 @@ class LcmGatewaySubscriber(GatewaySubscriber):
                 if lcm_channel(self._prefix, name) == source.channels:
                     source.name, source.has_known_name = name, True
 
-    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
+    def _ask_history(
+        self, series: ReceivedSeries, request: HistoryRequest, timeout_s: float
+    ) -> HistoryAnswer:
         """See GatewaySubscriber."""
         key = self._pose_keys.get(series, series.key)
         if key.startswith(POSE) and series not in self._pose_keys:
@@ -298,21 +300,21 @@ class LcmGatewaySubscriber(GatewaySubscriber):
                     key = self._pose_keys[series] = each
         return self._refill.ask(series.source.channels, {"key": key, **request.options}, timeout_s)
 
-    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+    def _history_overview(self, source: ReceivedSource, timeout_s: float) -> Mapping[str, Any]:
         """See GatewaySubscriber."""
         return self._refill.overview(source.channels, timeout_s)
 
-    def _kept_series(self, source: Source, key: str) -> Series | None:
+    def _kept_series(self, source: ReceivedSource, key: str) -> ReceivedSeries | None:
         """See GatewaySubscriber."""
         channel = _channel(source, key)
         is_pose = key.startswith(POSE)
         series_key = f"{POSE}{channel.rpartition(_POSE_MARK)[2]}" if is_pose else key
-        series: Series | None = self._reception.series(source, series_key, channel)
+        series: ReceivedSeries | None = self._reception.series(source, series_key, channel)
         if is_pose and series is not None:
             self._pose_keys[series] = key
         return series
 
-    def _query(self, source: Source) -> None:
+    def _query(self, source: ReceivedSource) -> None:
         """See GatewaySubscriber. Every gateway sends its status."""
 
         def take(reply: Any) -> None:
@@ -328,7 +330,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         if not source.has_answer:
             self._send(source, self._requester.prepare(rtc3d.parameters_request_t(), take))
 
-    def query_takes(self, source: Source) -> None:
+    def query_takes(self, source: ReceivedSource) -> None:
         """See GatewaySubscriber."""
 
         def take(reply: Any) -> None:
@@ -341,7 +343,7 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._take_requests[source.channels] = self._requester.prepare(request, take)
         self._send(source, request)
 
-    def _send(self, source: Source, request: Any) -> None:
+    def _send(self, source: ReceivedSource, request: Any) -> None:
         try:
             self._requester.send(source.channels, request)
         except OSError as error:
@@ -357,6 +359,6 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         self._requester.close()
 
 
-def _channel(source: Source, key: str) -> str:
+def _channel(source: ReceivedSource, key: str) -> str:
     """Return the channel of a key of the history."""
     return f"{source.channels}{lcm_channel('', *key.split('/', 1))}"

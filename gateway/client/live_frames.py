@@ -7,7 +7,7 @@ from typing import Final, NamedTuple, cast
 
 import numpy as np
 
-from gateway.client.queued_reception import Arrival, DescribedSource, QueuedReception, QueuedSeries
+from gateway.client.queued_reception import DescribedSource, QueuedMessage, QueuedReception, QueuedSeries
 from gateway.messages.descriptions.labels import Description, describe
 from gateway.messages.host_time import STEP_US, clock_difference_us, now_steady_us, now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
@@ -302,7 +302,7 @@ def _merged(frames: Sequence[Frame]) -> Frame:
     return Frame(first._source, first.key, parts, gap, first._start_utime)  # noqa: SLF001 - see above
 
 
-def decode_frames(arrivals: Sequence[Arrival], start_utime: int) -> Iterator[Frame]:
+def decode_frames(arrivals: Sequence[QueuedMessage], start_utime: int) -> Iterator[Frame]:
     """Yield the frames in messages, in their order. Messages that cannot be read are left out."""
     messages: dict[QueuedSeries, list[bytes]] = {}
     for series, message, *_ in arrivals:

@@ -17,7 +17,7 @@ from typing import Any, Final, Self
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.client.live_frames import Frame, LiveReception, decode_frames
 from gateway.client.live_join import Join
-from gateway.client.queued_reception import Arrival, QueuedSeries
+from gateway.client.queued_reception import QueuedMessage, QueuedSeries
 from gateway.client.transport import GatewaySubscriber, close_in_time, silence_text
 from gateway.errors import SelectionError
 from gateway.messages.encode import VERSION_OFFSET
@@ -126,7 +126,7 @@ class Live:
         self._is_closed = False
         self._is_slow = False
         self._taking = threading.RLock()  # of what waits here
-        self._pending: list[Arrival] = []
+        self._pending: list[QueuedMessage] = []
         self._pending_s = 0.0
         self._given_up: set[tuple[object, bytes]] = set()
         self._ready: deque[Frame] = deque()
@@ -334,7 +334,7 @@ class Live:
         """Return how long to wait before decoding again, so that much that arrives is decoded together."""
         return max(0.0, self._decoded_s + _MIN_STEP_S - time.monotonic())
 
-    def _described(self, now_s: float) -> tuple[list[Arrival], float | None]:
+    def _described(self, now_s: float) -> tuple[list[QueuedMessage], float | None]:
         """Return the next messages if their parameters are known; none, and how long to wait for these."""
         if not self._pending:
             self._pending = self._reception.take_waiting(_BATCH)

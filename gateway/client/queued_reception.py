@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from gateway.client.reception import Reception
-from gateway.client.sources import Series, Source
+from gateway.client.sources import ReceivedSeries, ReceivedSource
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.host_time import now_steady_us, now_utime
@@ -28,12 +28,12 @@ _MAX_ENTRIES: Final = 16
 """How many parameters of a source are kept: frames that wait belong to the newest ones."""
 
 
-class QueuedSeries(Series):
+class QueuedSeries(ReceivedSeries):
     """The messages of one key of a source, of which the newest ones wait to be decoded."""
 
-    def __init__(self, source: Source, key: str, channel: str) -> None:
+    def __init__(self, source: ReceivedSource, key: str, channel: str) -> None:
         super().__init__(source, key, channel)
-        self.newest: Arrival | None = None
+        self.newest: QueuedMessage | None = None
         """The newest message."""
         self.num_dropped = 0
         """How many messages were left out, because too many waited."""
@@ -56,7 +56,7 @@ class QueuedSeries(Series):
         return max(0, self._num_lost - before)  # fewer, if a late message has filled a gap
 
 
-class Arrival(NamedTuple):
+class QueuedMessage(NamedTuple):
     """A message of a component.
 
     ``arrived_utime`` is when it arrived, on this host's clock, and ``steady_us`` the same on the clock that
@@ -72,7 +72,7 @@ class Arrival(NamedTuple):
     steady_us: int = 0
 
 
-class DescribedSource(Source):
+class DescribedSource(ReceivedSource):
     """A source, and the server's parameters that describe its frames.
 
     ``update_parameters`` and what it changes belong to one thread.
@@ -145,7 +145,7 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         """Whether messages are kept for ``take_waiting``; otherwise, only the newest of each series."""
         self.num_changes = 0
         """How often a message or parameters have arrived."""
-        self._waiting: deque[Arrival] = deque()
+        self._waiting: deque[QueuedMessage] = deque()
         self._waiting_bytes = 0
         self._num_asleep = 0  # threads in ``wait``
         self._changed = threading.Condition(self._lock)
@@ -153,9 +153,9 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
 
     # In the thread that reads.
 
-    def take_waiting(self, max_messages: int = MAX_WAITING) -> list[Arrival]:
+    def take_waiting(self, max_messages: int = MAX_WAITING) -> list[QueuedMessage]:
         """Return the messages that wait, the oldest first, and remove them."""
-        taken: list[Arrival] = []
+        taken: list[QueuedMessage] = []
         with self._lock:
             while self._waiting and len(taken) < max_messages:
                 arrival = self._waiting.popleft()
@@ -211,7 +211,9 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         if series.key not in COMPONENTS_BY_KEY:
             return
         gap = series.new_losses()
-        series.newest = arrival = Arrival(series, message, now_utime(), gap, series.is_past, now_steady_us())
+        series.newest = arrival = QueuedMessage(
+            series, message, now_utime(), gap, series.is_past, now_steady_us()
+        )
         if not self.is_queueing:
             return
         self._waiting.append(arrival)

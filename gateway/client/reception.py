@@ -12,7 +12,7 @@ from typing import Final, Generic, TypeVar
 from gateway.client.completion import Completion
 from gateway.client.history_requests import Completeness
 from gateway.client.refill import SILENT_S, Ask, FindSeries, Refill
-from gateway.client.sources import FIELDS, Series, Source
+from gateway.client.sources import FIELDS, ReceivedSeries, ReceivedSource
 from gateway.messages.encode import FINGERPRINT_BYTES, VERSION_OFFSET
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
@@ -35,8 +35,8 @@ _MIN_UTIME: Final = -(1 << 63)
 _VERSION: Final = slice(VERSION_OFFSET, None)
 """The part of a ``parameters_t`` that shows whether it is new: its version and its XML."""
 
-SourceT = TypeVar("SourceT", bound=Source)
-SeriesT = TypeVar("SeriesT", bound=Series)
+SourceT = TypeVar("SourceT", bound=ReceivedSource)
+SeriesT = TypeVar("SeriesT", bound=ReceivedSeries)
 
 
 class Reception(ABC, Generic[SourceT, SeriesT]):
@@ -220,7 +220,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
             return  # of another program
         source.running_take = str(running[0]) if running else ""
 
-    def _hear(self, source: Source) -> float:
+    def _hear(self, source: ReceivedSource) -> float:
         now_s = self.monotonic()
         if (
             source.heard_s is not None
@@ -268,7 +268,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         source.parameters = parameters
 
 
-class Messages(Reception[Source, Series]):
+class Messages(Reception[ReceivedSource, ReceivedSeries]):
     """Passes each message on, once at a time, to a function that takes the source, the key and the message.
 
     The key is that on Zenoh, below the source, such as "3d", "6d/Tool 1" or "parameters".
@@ -278,14 +278,21 @@ class Messages(Reception[Source, Series]):
         super().__init__()
         self._receive = receive
 
-    def _new_source(self, name: str, channels: str) -> Source:
-        return Source(name, channels, self.monotonic)
+    def _new_source(self, name: str, channels: str) -> ReceivedSource:
+        return ReceivedSource(name, channels, self.monotonic)
 
-    def _new_series(self, source: Source, key: str, channel: str) -> Series:
-        return Series(source, key, channel)
+    def _new_series(self, source: ReceivedSource, key: str, channel: str) -> ReceivedSeries:
+        return ReceivedSeries(source, key, channel)
 
-    def _take(self, series: Series, message: bytes) -> None:
+    def _take(self, series: ReceivedSeries, message: bytes) -> None:
         self._receive(series.source.name, series.key, message)
 
-    def _take_parameters(self, series: Series, message: bytes, *, is_first: bool, is_made: bool) -> None:  # noqa: ARG002 - overrides
+    def _take_parameters(
+        self,
+        series: ReceivedSeries,
+        message: bytes,
+        *,
+        is_first: bool,  # noqa: ARG002 - it overrides
+        is_made: bool,  # noqa: ARG002 - it overrides
+    ) -> None:
         self._receive(series.source.name, series.key, message)

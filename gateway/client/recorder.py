@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.client.reception import Reception
-from gateway.client.sources import Series, Source
+from gateway.client.sources import ReceivedSeries, ReceivedSource
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.history import utime_of
 from gateway.messages.host_time import now_utime
@@ -31,7 +31,7 @@ _MAX_EARLY_BYTES: Final = 16 * 1024 * 1024
 """How much waits for earlier messages. What is beyond comes before them in the file."""
 
 
-class RecordedSeries(Series):
+class RecordedSeries(ReceivedSeries):
     """The messages of one key of a source."""
 
     source: "RecordedSource"
@@ -47,7 +47,7 @@ class RecordedSeries(Series):
         """The time of the newest message, which orders it among those of other series."""
 
 
-class RecordedSource(Source):
+class RecordedSource(ReceivedSource):
     """A source of the recording. ``channels`` is the beginning of its channels in the file."""
 
     def __init__(self, name: str, channels: str, monotonic: Callable[[], float]) -> None:

@@ -11,7 +11,7 @@ from gateway.client.arrived_run import HeldBytes
 from gateway.client.completion import Completion
 from gateway.client.history_requests import REPLY_S, RETRY_CODES, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.request_timing import NOBODY_S, PATIENCE_S, RETRY_S
-from gateway.client.sources import Series, Source
+from gateway.client.sources import ReceivedSeries, ReceivedSource
 from gateway.errors import QueryError
 from gateway.runtime.workers import thread_starts
 
@@ -87,16 +87,16 @@ class Refill:
         self._find = find
         self._held_bytes = HeldBytes()
         self._changed = threading.Condition(lock)
-        self._completions: dict[Series, Completion] = {}
-        self._due: dict[Source, dict[Series, Completion]] = {}
-        self._look_s: dict[Source, float] = {}  # when to look for series of which nothing has arrived
-        self._looked_s: dict[Source, float] = {}
+        self._completions: dict[ReceivedSeries, Completion] = {}
+        self._due: dict[ReceivedSource, dict[ReceivedSeries, Completion]] = {}
+        self._look_s: dict[ReceivedSource, float] = {}  # when to look for series of which nothing has arrived
+        self._looked_s: dict[ReceivedSource, float] = {}
         self._helped_s = -math.inf  # when an answer has brought something
         self._is_ending = self._is_closed = False
 
     # Under the lock, which the caller holds.
 
-    def add(self, series: Series, hand_on: Callable[[bytes], object]) -> Completion:
+    def add(self, series: ReceivedSeries, hand_on: Callable[[bytes], object]) -> Completion:
         """Return what completes a series, which hands its messages on."""
         completion = Completion(
             *(hand_on, series.check, self._held_bytes, self.completeness), is_steady=series.key == "status"
@@ -104,12 +104,12 @@ class Refill:
         self._completions[series] = completion
         return completion
 
-    def begin(self, source: Source) -> None:
+    def begin(self, source: ReceivedSource) -> None:
         """Note that there is a source, which may have had messages in the last seconds."""
         if self.completeness.last_s is not None:
             self._due_of(source)
 
-    def _due_of(self, source: Source) -> dict[Series, Completion]:
+    def _due_of(self, source: ReceivedSource) -> dict[ReceivedSeries, Completion]:
         """Return the series of a source of which something is to be requested, by a thread of the source."""
         due = self._due.get(source)
         if due is None:
@@ -120,7 +120,7 @@ class Refill:
                 self._due[source] = due
         return due
 
-    def look_after_silence(self, source: Source) -> None:
+    def look_after_silence(self, source: ReceivedSource) -> None:
         """Note that something of a source arrives again after SILENT_S without anything.
 
         The numbers of the keys that are heard may go on by chance although the gateway was started again, and
@@ -132,14 +132,14 @@ class Refill:
             self._look_s.setdefault(source, self._monotonic() + _LOOK_S)
             self._changed.notify_all()
 
-    def check(self, series: Series) -> None:
+    def check(self, series: ReceivedSeries) -> None:
         """Note that there is something to request of a series."""
         due = self._due_of(series.source)
         if series not in due:
             due[series] = self._completions[series]
             self._changed.notify_all()
 
-    def reached_utime(self, source: Source) -> float:
+    def reached_utime(self, source: ReceivedSource) -> float:
         """Return until when all series of a source are complete; infinite if nothing is missing."""
         due = self._due.get(source)
         incomplete = () if due is None else (each for each in due.values() if each.due_s < math.inf)
@@ -194,7 +194,7 @@ class Refill:
 
     # In the threads.
 
-    def _run(self, source: Source, due: dict[Series, Completion]) -> None:
+    def _run(self, source: ReceivedSource, due: dict[ReceivedSeries, Completion]) -> None:
         begin_s = self._monotonic()
         silent_s = self._begin_silent(source, begin_s)
         while True:
@@ -211,7 +211,7 @@ class Refill:
             else:
                 self._look(source)
 
-    def _request(self, series: Series, completion: Completion) -> None:
+    def _request(self, series: ReceivedSeries, completion: Completion) -> None:
         """Request what a series misses, and give it the answer."""
         source = series.source
         with self._changed:
@@ -240,7 +240,7 @@ class Refill:
                 if completion.reached_utime != before:
                     self._helped_s = now_s
 
-    def _begin_silent(self, source: Source, begin_s: float) -> float:
+    def _begin_silent(self, source: ReceivedSource, begin_s: float) -> float:
         """Begin the series of a source that had messages in the last seconds, and may have none now.
 
         Returns when to try again: infinite if that is not needed, or nobody has answered since ``begin_s``
@@ -268,7 +268,7 @@ class Refill:
         is_over = now_s - begin_s >= (NOBODY_S if is_nobody else PATIENCE_S)
         return math.inf if is_over or code not in RETRY_CODES else now_s + RETRY_S
 
-    def _look(self, source: Source) -> None:
+    def _look(self, source: ReceivedSource) -> None:
         """Look for messages of a source that nothing which arrives shows: the first of a key, or the last."""
         begin_s = self._monotonic()
         found: list[KeptSeries] = []
@@ -299,7 +299,9 @@ class Refill:
                 if completion.due_s < math.inf:
                     self.check(series)
 
-    def _wait(self, source: Source, due: dict[Series, Completion], silent_s: float) -> Series | None:
+    def _wait(
+        self, source: ReceivedSource, due: dict[ReceivedSeries, Completion], silent_s: float
+    ) -> ReceivedSeries | None:
         """Wait until there is something to request, and return of which series; None to look for some.
 
         ``silent_s`` is when to look for those that are silent now.
@@ -321,6 +323,6 @@ class Refill:
         return None
 
 
-def _is_connected(source: Source, now_s: float) -> bool:
+def _is_connected(source: ReceivedSource, now_s: float) -> bool:
     """Whether something of a source has arrived just now, at least its status, or nothing ever has."""
     return now_s - (source.heard_s or now_s) <= SILENT_S

@@ -48,10 +48,10 @@ _MAX_LISTED: Final = 8
 """How many places are listed where messages are missing. All are counted."""
 
 
-class Series:
+class ReceivedSeries:
     """The messages of one key of a source. ``row`` is its line in tables: the key, or 6d/* for poses."""
 
-    def __init__(self, source: "Source", key: str, channel: str) -> None:
+    def __init__(self, source: "ReceivedSource", key: str, channel: str) -> None:
         self.source = source
         self.key = key
         self.row = f"{POSE}*" if key.startswith(POSE) else key
@@ -91,7 +91,7 @@ class Series:
         self.num_bytes += len(message)
 
 
-class Source:
+class ReceivedSource:
     """A source of which something was received. ``channels`` is the beginning of its channels."""
 
     def __init__(self, name: str, channels: str, monotonic: Callable[[], float] = time.monotonic) -> None:

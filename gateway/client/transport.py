@@ -11,7 +11,7 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 from gateway.client.history_requests import INCOMPLETE, Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.reception import MAX_SERIES, Reception
 from gateway.client.refill import KeptSeries
-from gateway.client.sources import FINGERPRINTS, POSE, TYPES_BY_KEY, Series, Source
+from gateway.client.sources import FINGERPRINTS, POSE, TYPES_BY_KEY, ReceivedSeries, ReceivedSource
 from gateway.errors import ProtocolError, QueryError
 from gateway.messages.decode import decode
 from gateway.messages.source_report import SourceReport, source_report
@@ -130,7 +130,7 @@ class Query(NamedTuple):
     options: Mapping[str, str] = {}
 
 
-class Reply(NamedTuple):
+class QueryReply(NamedTuple):
     """A reply about ``source``, and what the gateway says about the content (``facts``).
 
     If gateways on Zenoh serve sources of the same name, the second one is called ``lab_2``. ``gateway`` is
@@ -166,7 +166,7 @@ class Reply(NamedTuple):
         return value if math.isfinite(value) else None
 
 
-class Replies(NamedTuple, Generic[ReceivedT]):
+class QueryReplies(NamedTuple, Generic[ReceivedT]):
     """All replies to a query, and the problems of other sources; QueryError lists their codes."""
 
     received: ReceivedT
@@ -219,7 +219,7 @@ class GatewaySubscriber(ABC):
         self._reception = reception
         if completeness != INCOMPLETE:
             reception.complete(self._ask_history, self._find_kept, completeness)
-        self._series: dict[str, Series | None] = {}  # by address; None: left out
+        self._series: dict[str, ReceivedSeries | None] = {}  # by address; None: left out
         self._closing = threading.Lock()
         self._is_closed = False
 
@@ -234,7 +234,7 @@ class GatewaySubscriber(ABC):
         except Exception as defect:  # noqa: BLE001 - the other messages are received
             self._reception.failed(defect)
 
-    def _find_series(self, address: str, message: bytes) -> Series | None:
+    def _find_series(self, address: str, message: bytes) -> ReceivedSeries | None:
         """Return the series of an address without messages so far; None, counted, if it cannot be."""
         if address in self._series:
             self._reception.ignore(beyond_limit=True)
@@ -243,7 +243,9 @@ class GatewaySubscriber(ABC):
         if identified is None:
             return None
         source, key, channel = identified
-        series: Series | None = None if source is None else self._reception.series(source, key, channel)
+        series: ReceivedSeries | None = (
+            None if source is None else self._reception.series(source, key, channel)
+        )
         if len(self._series) < 2 * MAX_SERIES:
             self._series[address] = series
         if series is None:
@@ -251,23 +253,25 @@ class GatewaySubscriber(ABC):
         return series
 
     @abstractmethod
-    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:
+    def _identify(self, address: str, message: bytes) -> tuple[ReceivedSource | None, str, str] | None:
         """Return the source (None if there are too many), the key and the channel of a series.
 
         Returns None for what is left out; that of others is counted.
         """
 
     @abstractmethod
-    def _take(self, series: Series, message: bytes, sample: Any) -> None:
+    def _take(self, series: ReceivedSeries, message: bytes, sample: Any) -> None:
         """Hand a message to the reception."""
 
     # In the threads that request what is missing.
 
     @abstractmethod
-    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
+    def _ask_history(
+        self, series: ReceivedSeries, request: HistoryRequest, timeout_s: float
+    ) -> HistoryAnswer:
         """Request messages of a series, and return the answer. Raises QueryError."""
 
-    def _find_kept(self, source: Source, last_s: float, timeout_s: float) -> list[KeptSeries]:
+    def _find_kept(self, source: ReceivedSource, last_s: float, timeout_s: float) -> list[KeptSeries]:
         """Return the wanted series of which the gateway has messages of the last seconds; see FindSeries."""
         overview = self._history_overview(source, timeout_s)
         found = []
@@ -279,11 +283,11 @@ class GatewaySubscriber(ABC):
         return found
 
     @abstractmethod
-    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+    def _history_overview(self, source: ReceivedSource, timeout_s: float) -> Mapping[str, Any]:
         """Return what the history has of a source (docs/reference/queries.md). Raises QueryError."""
 
     @abstractmethod
-    def _kept_series(self, source: Source, key: str) -> Series | None:
+    def _kept_series(self, source: ReceivedSource, key: str) -> ReceivedSeries | None:
         """Return the series of a key of the history, new or not; None if there are too many."""
 
     # In one other thread.
@@ -295,11 +299,11 @@ class GatewaySubscriber(ABC):
                 self._query(source)
 
     @abstractmethod
-    def _query(self, source: Source) -> None:
+    def _query(self, source: ReceivedSource) -> None:
         """Query the parameters and the status of a source, if they are not known."""
 
     @abstractmethod
-    def query_takes(self, source: Source) -> None:
+    def query_takes(self, source: ReceivedSource) -> None:
         """Query which take the gateway of a source records; see Source.running_take."""
 
     def query_routers(self) -> None:  # noqa: B027 - there are none on LCM
@@ -330,7 +334,7 @@ class Transport(ABC):
         """Return the sources that are found, all or only the ``wanted`` one. Raises OutputError."""
 
     @abstractmethod
-    def ask(self, query: Query, source: str | None, timeout_s: float) -> Replies[list[Reply]]:
+    def ask(self, query: Query, source: str | None, timeout_s: float) -> QueryReplies[list[QueryReply]]:
         """Ask ``source``, or every source that is found (None), until it has replied or time is up.
 
         Raises OutputError.

@@ -21,15 +21,15 @@ from gateway.client.history_requests import (
     history_answer,
 )
 from gateway.client.reception import MAX_XML_BYTES, Reception
-from gateway.client.sources import POSE, Series, Source
+from gateway.client.sources import POSE, ReceivedSeries, ReceivedSource
 from gateway.client.transport import (
     MAX_STATUS_BYTES,
     RETRY_S,
     FoundSources,
     GatewaySubscriber,
     Query,
-    Replies,
-    Reply,
+    QueryReplies,
+    QueryReply,
     TimeLimits,
     Transport,
 )
@@ -104,10 +104,10 @@ class ZenohTransport(Transport):
 
     # Queries.
 
-    def ask(self, query: Query, source: str | None, timeout_s: float) -> Replies[list[Reply]]:
+    def ask(self, query: Query, source: str | None, timeout_s: float) -> QueryReplies[list[QueryReply]]:
         """See Transport. It repeats the queries that get no reply, as happens while Zenoh reconnects."""
         limits = TimeLimits(timeout_s)
-        replies: Replies[list[Reply]] = Replies([], [])
+        replies: QueryReplies[list[QueryReply]] = QueryReplies([], [])
         reason: QueryError | None = None
         try:
             unanswered = self._selectors(query, source)
@@ -143,7 +143,10 @@ class ZenohTransport(Transport):
         return self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s)
 
     def _receive(
-        self, arriving: zenoh.handlers.Handler[zenoh.Reply], replies: Replies[list[Reply]], late: QueryError
+        self,
+        arriving: zenoh.handlers.Handler[zenoh.Reply],
+        replies: QueryReplies[list[QueryReply]],
+        late: QueryError,
     ) -> tuple[bool, QueryError | None]:
         """Take the replies to one query; return whether there was any, and else the reason, if known.
 
@@ -172,12 +175,12 @@ class ZenohTransport(Transport):
             replies.problems.append(late)
         return is_answered, late if is_late else reason
 
-    def _reply(self, sample: zenoh.Sample, gateway: str) -> Reply:
+    def _reply(self, sample: zenoh.Sample, gateway: str) -> QueryReply:
         source, _, *sections = str(sample.key_expr).removeprefix(f"{self._prefix}/").split("/")
         if (source, gateway) not in self._unique_names:
             self._unique_names[source, gateway] = unique_name(source, set(self._unique_names.values()))
         name = self._unique_names[source, gateway]
-        return Reply(name, tuple(sections), sample.payload.to_bytes(), attached_facts(sample), gateway)
+        return QueryReply(name, tuple(sections), sample.payload.to_bytes(), attached_facts(sample), gateway)
 
     def _wait_to_repeat(
         self, unanswered: Sequence[str], source: str | None, limits: TimeLimits, reason: QueryError | None
@@ -247,7 +250,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         self._session = session
         self._sources = sources
         self._network = RouterNetwork(session)
-        self._gateways: dict[Source, str] = {}  # the Zenoh ids of their gateways
+        self._gateways: dict[ReceivedSource, str] = {}  # the Zenoh ids of their gateways
         self._queried_s = -math.inf  # when routers were queried
         for name in served_sources(session, prefix):
             if _SOURCE_NAME.fullmatch(name) and (not sources or name in sources):
@@ -263,10 +266,10 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
                     lambda sample: self._receive(str(sample.key_expr), sample.payload.to_bytes(), sample),
                 )
 
-    def _source(self, name: str) -> Source | None:
+    def _source(self, name: str) -> ReceivedSource | None:
         return self._reception.source(name, lcm_channel(DEFAULT_LCM_PREFIX, name), is_known=True)
 
-    def _identify(self, address: str, message: bytes) -> tuple[Source | None, str, str] | None:  # noqa: ARG002 - overrides
+    def _identify(self, address: str, message: bytes) -> tuple[ReceivedSource | None, str, str] | None:  # noqa: ARG002 - overrides
         name, _, path = address.removeprefix(f"{self._prefix}/").partition("/")
         if path in _NO_KEYS or is_json_key(path):
             return None
@@ -277,7 +280,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         source = self._source(name)
         return source, path, "" if source is None else _channel(source, path)
 
-    def _take(self, series: Series, message: bytes, sample: zenoh.Sample) -> None:
+    def _take(self, series: ReceivedSeries, message: bytes, sample: zenoh.Sample) -> None:
         if series.key != "parameters":
             self._reception.receive(series, message)
         elif len(message) > MAX_XML_BYTES:
@@ -286,7 +289,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             parameters = self._parameters_message(series.source, sample)
             self._reception.receive_parameters(series, parameters, is_made=True)
 
-    def _parameters_message(self, source: Source, sample: zenoh.Sample) -> bytes:
+    def _parameters_message(self, source: ReceivedSource, sample: zenoh.Sample) -> bytes:
         facts = attached_facts(sample)
         age_s = facts.get("age_s")
         return self._reception.parameters_message(
@@ -297,7 +300,9 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             float(age_s) if isinstance(age_s, int | float) and 0 <= age_s < 1e9 else 0.0,
         )
 
-    def _ask_history(self, series: Series, request: HistoryRequest, timeout_s: float) -> HistoryAnswer:
+    def _ask_history(
+        self, series: ReceivedSeries, request: HistoryRequest, timeout_s: float
+    ) -> HistoryAnswer:
         """See GatewaySubscriber."""
         options = ";".join(f"{name}={value}" for name, value in request.options.items())
         selector = f"{zenoh_key(self._prefix, series.source.name)}/{series.key}?{options}"
@@ -316,7 +321,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             raise QueryError(str(problem), code="zenoh") from problem
         return first
 
-    def _history_overview(self, source: Source, timeout_s: float) -> Mapping[str, Any]:
+    def _history_overview(self, source: ReceivedSource, timeout_s: float) -> Mapping[str, Any]:
         """See GatewaySubscriber."""
         sample = self._first_reply(zenoh_key(self._prefix, source.name, "history"), timeout_s)
         overview = None
@@ -325,7 +330,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
                 overview = json.loads(sample.payload.to_bytes())
         return overview if isinstance(overview, dict) else {}
 
-    def _kept_series(self, source: Source, key: str) -> Series | None:
+    def _kept_series(self, source: ReceivedSource, key: str) -> ReceivedSeries | None:
         """See GatewaySubscriber."""
         path = "/".join(map(escape_key_chunk, key.split("/", 1)))
         return self._reception.series(source, path, _channel(source, path))
@@ -353,7 +358,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         if not has_any:
             raise error
 
-    def _query(self, source: Source) -> None:
+    def _query(self, source: ReceivedSource) -> None:
         def take_parameters(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 if len(reply.ok.payload) <= MAX_XML_BYTES:
@@ -370,7 +375,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         if source.status is None:
             self._get(source, "status", take_status)
 
-    def query_takes(self, source: Source) -> None:
+    def query_takes(self, source: ReceivedSource) -> None:
         """See GatewaySubscriber."""
 
         def take(reply: zenoh.Reply) -> None:
@@ -395,11 +400,11 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         if self._network.connected:
             self._session.get(DESCRIPTIONS, self._network.add, timeout=_QUERY_S)
 
-    def _take_gateway(self, source: Source, reply: zenoh.Reply) -> None:
+    def _take_gateway(self, source: ReceivedSource, reply: zenoh.Reply) -> None:
         if reply.ok is not None and reply.replier_id is not None:
             self._gateways[source] = str(reply.replier_id.zid)
 
-    def _get(self, source: Source, key: str, on_reply: Callable[[zenoh.Reply], None]) -> None:
+    def _get(self, source: ReceivedSource, key: str, on_reply: Callable[[zenoh.Reply], None]) -> None:
         self._session.get(zenoh_key(self._prefix, source.name, key), on_reply, timeout=_QUERY_S)
 
     def silence(self) -> str:
@@ -410,7 +415,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         self._session.close()
 
 
-def _channel(source: Source, path: str) -> str:
+def _channel(source: ReceivedSource, path: str) -> str:
     """Return the channel of a key below a source."""
     is_pose = path.startswith(POSE)
     return lcm_channel(source.channels, *(("6d", unquote(path.removeprefix(POSE))) if is_pose else (path,)))

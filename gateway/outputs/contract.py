@@ -22,7 +22,7 @@ from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.texts import xml_text
 from gateway.messages.topics import Topic
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.rtc3d.parameters import Parameters
 from gateway.runtime.losses import Loss, Losses
 
@@ -103,7 +103,7 @@ class FramePublisher(Protocol):
         output that learns from frames which items there are does so here.
         """
 
-    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Send the ``components`` of one frame without blocking.
 
         Raises OutputError if the output does not accept the frame.

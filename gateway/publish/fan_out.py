@@ -14,7 +14,7 @@ from gateway.outputs.contract import Output, OutputStatus, ServerParameters
 from gateway.publish.routes import FrameRoute, OutputRoute, TopicRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 
 _HOLD_S: Final = 30.0
 """After a change was logged, further ones of the same component are logged together after this time."""
@@ -109,7 +109,7 @@ class _ComponentPlan:
         self._start, self._end = layout.content_spans[index]
         self._has_lcm_form = has_lcm_form(layout.components[index], layout.byte_order)
 
-    def next_message(self, frame: Frame, stamp: Stamp) -> bytes:
+    def next_message(self, frame: RawFrame, stamp: Stamp) -> bytes:
         """Return the component's message, which uses up a sequence number even if it is not published."""
         component = self._component
         if self._has_lcm_form:
@@ -281,7 +281,7 @@ class FanOut:
         """Each output with its counters for this source."""
         return [(route.output, route.status) for route in self._routes]
 
-    def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish the ``wanted`` components of a frame. Raises nothing if an output fails."""
         # This is the inner loop of the gateway; benchmarks/own_cost.py measures it.
         plan = self._plan
@@ -296,7 +296,7 @@ class FanOut:
         if plan.tool_indices:
             self._tool_poses.publish(frame, plan.tool_indices, stamp)
 
-    def skip(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
+    def skip(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
         """Number the messages of these components like ``publish``, but publish nothing.
 
         Returns how many messages this loses. Messages that pacing leaves out on every output do not count.
@@ -309,7 +309,7 @@ class FanOut:
             num_lost += any(is_lost) or bool(plan.frame_routes)
         return num_lost
 
-    def _change_plan(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
+    def _change_plan(self, frame: RawFrame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
         self._plan = plan = self._plan_for(frame.layout, wanted)
         if self._item_counts.update(plan.num_items, stamp.session):
             self.on_items_changed()

@@ -15,7 +15,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.contract import WHOLE_FRAME, FramePublisher, Output, OutputStatus
 from gateway.outputs.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.runtime.losses import Losses
 
 OPENING_S: Final = 2.0
@@ -206,7 +206,7 @@ class FrameRoute:
         self._output_route = output_route
         self._sent = output_route.sent.setdefault(WHOLE_FRAME, SentCounter())
 
-    def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""
         try:
             self.publisher.publish(frame, stamp, wanted)

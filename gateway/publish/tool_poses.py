@@ -13,7 +13,7 @@ from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.publish.routes import OutputRoute, TopicRoute
 from gateway.rtc3d.components import Component, ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters import Parameters
 
 _MAX_REMEMBERED_NAMES: Final = 1024
@@ -80,7 +80,7 @@ class ToolPoses:
         self._parameters = parsed
         self._frame = parameters.frame
 
-    def publish(self, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
+    def publish(self, frame: RawFrame, indices: Sequence[int], stamp: Stamp) -> None:
         """Publish the pose of each tool in the frame's components at ``indices``, if there are subscribers.
 
         Usually that is one component.
@@ -107,7 +107,7 @@ class ToolPoses:
             for index in indices:
                 self._send(frame.component(index), stamp)
 
-    def skip(self, frame: Frame, indices: Sequence[int]) -> int:
+    def skip(self, frame: RawFrame, indices: Sequence[int]) -> int:
         """Use up the numbers of the poses that ``publish`` would publish; return how many poses that are."""
         num_skipped = 0
         for index in indices if _num_tools(frame, indices) <= _MAX_TOOLS else ():
@@ -156,5 +156,5 @@ def _key(name: str) -> str:
     return f"{ComponentType.TOOLS.key}/{name}"
 
 
-def _num_tools(frame: Frame, indices: Sequence[int]) -> int:
+def _num_tools(frame: RawFrame, indices: Sequence[int]) -> int:
     return sum(frame.layout.components[index].num_items for index in indices)

@@ -265,7 +265,7 @@ class QueryHistory:
         """Waits for the end of its duration, if it has one."""
 
 
-class Reading(NamedTuple):
+class ParametersReading(NamedTuple):
     """Parsed parameters, and how they differ from the former ones."""
 
     parsed: ParsedParameters
@@ -274,15 +274,15 @@ class Reading(NamedTuple):
     changed_sections: Sequence[str] = ()
 
 
-def read_parameters(xml: bytes, before: ServerAnswer | None) -> Reading:
+def read_parameters(xml: bytes, before: ServerAnswer | None) -> ParametersReading:
     """Parse XML and compare it with the former answer. It runs in a thread."""
     if before is None:
-        return Reading(parse_parameters(xml), True)
+        return ParametersReading(parse_parameters(xml), True)
     old = before.parsed
     if differ_in_statistics_only(before.xml, xml):
-        return Reading(_with_statistics(old, xml), False)
+        return ParametersReading(_with_statistics(old, xml), False)
     parsed = parse_parameters(xml)
-    return Reading(
+    return ParametersReading(
         parsed,
         without_statistics(parsed.parameters) != without_statistics(old.parameters),
         describe_renames(old.parameters, parsed.parameters),

@@ -16,8 +16,8 @@ from functools import partial
 from gateway.config.settings import SourceSettings
 from gateway.errors import GatewayError, ParametersError, QueryError, ReplyTimeoutError, ServerError
 from gateway.queries.answers import (
+    ParametersReading,
     QueryHistory,
-    Reading,
     Sections,
     ServerAnswer,
     now_s,
@@ -201,7 +201,7 @@ class ParameterCache:
             )
             await self._announce(None, self.version)
 
-    def _log_change(self, reading: Reading, *, is_first: bool) -> None:
+    def _log_change(self, reading: ParametersReading, *, is_first: bool) -> None:
         events, version = self._history.events, f"(parameters_version {self.version})"
         if is_first:
             if self.version > 1:

@@ -19,7 +19,7 @@ from gateway.rtc3d.commands import (
     encode_command,
 )
 from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, FrameReader, announced_components, detect_byte_order, encode_frame
+from gateway.rtc3d.frames import FrameReader, RawFrame, announced_components, detect_byte_order, encode_frame
 from gateway.rtc3d.packets import (
     ALL_PACKETS,
     DATA,
@@ -234,7 +234,9 @@ class ClientProtocol:
         """Whether ``receive`` has not processed all bytes yet, because of ``max_packets``."""
         return self._packet_reader.has_more
 
-    def receive(self, data: bytes, max_packets: int = ALL_PACKETS) -> tuple[list[Frame], list[ProtocolEvent]]:
+    def receive(
+        self, data: bytes, max_packets: int = ALL_PACKETS
+    ) -> tuple[list[RawFrame], list[ProtocolEvent]]:
         """Take bytes from the server; return the frames and the other events that they complete.
 
         Processes at most ``max_packets``. While ``has_more``, call it again, with b"" or with the next bytes.
@@ -242,7 +244,7 @@ class ClientProtocol:
         events first, so that a ByteOrderMismatch is reported before the first frame is used. ``state`` is
         the state after all of them. StreamCorrupted is always the last event. Never raises.
         """
-        frames: list[Frame] = []
+        frames: list[RawFrame] = []
         events: list[ProtocolEvent] = []
         for packet in self._packet_reader.feed(data, max_packets):
             if packet.type == DATA:
@@ -265,7 +267,7 @@ class ClientProtocol:
         if self.state in states:
             self.state = after
 
-    def _on_data(self, packet: Packet, frames: list[Frame], events: list[ProtocolEvent]) -> None:
+    def _on_data(self, packet: Packet, frames: list[RawFrame], events: list[ProtocolEvent]) -> None:
         reader = self._frame_reader
         try:
             if reader is not None:
@@ -286,7 +288,7 @@ class ClientProtocol:
             self._apply(ProtocolInput.FRAME_RECEIVED)
         frames.append(frame)
 
-    def _read_first_frame(self, body: bytes, events: list[ProtocolEvent]) -> Frame:
+    def _read_first_frame(self, body: bytes, events: list[ProtocolEvent]) -> RawFrame:
         byte_order = detect_byte_order(body, self._agreed_byte_order)
         reader = FrameReader(byte_order)
         frame = reader.read(body)
@@ -296,7 +298,7 @@ class ClientProtocol:
                 events.append(ByteOrderMismatch(byte_order))
         return frame
 
-    def _is_answered_by(self, frame: Frame, pending: Command) -> bool:
+    def _is_answered_by(self, frame: RawFrame, pending: Command) -> bool:
         match pending:
             case StreamFrames():
                 # In other states frames arrive anyway, so they do not show that a new rate was accepted.

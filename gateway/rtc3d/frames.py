@@ -85,7 +85,7 @@ class FrameLayout:
         return found
 
 
-class Frame:
+class RawFrame:
     """A data frame: its layout, and the ``body`` of its packet. Its methods cut components from the body.
 
     A component's content is the part after its size and type: frame number, time stamp, count and items,
@@ -135,7 +135,7 @@ class Frame:
         )
 
 
-def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
+def split_frame(body: bytes, byte_order: ByteOrder) -> RawFrame:
     """Split a type-3 packet's body into components (§7.1).
 
     Components of unknown type are skipped by their size. Bytes after the last component are ignored, as by
@@ -143,7 +143,7 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     than MAX_COMPONENTS, or if sizes and counts contradict each other or the body's length: then no part of
     the frame can be trusted.
     """
-    return Frame(FrameLayout(byte_order, *_frame_fields(body, byte_order)), body)
+    return RawFrame(FrameLayout(byte_order, *_frame_fields(body, byte_order)), body)
 
 
 def _frame_fields(body: bytes, byte_order: ByteOrder) -> tuple[tuple[LayoutField, ...], int]:
@@ -248,11 +248,11 @@ class FrameReader:
         self._templates: dict[int, _Template] = {}  # the newest one for each size of body, in bytes
         self._layouts: dict[tuple[tuple[LayoutField, ...], int], _Template] = {}
 
-    def read(self, body: bytes) -> Frame:
+    def read(self, body: bytes) -> RawFrame:
         """Return the frame in the body of a type-3 packet; raises FrameError as ``split_frame`` does."""
         template = self._templates.get(len(body))
         if template is not None and template.unpack(body) == template.constants:
-            return Frame(template.layout, body)
+            return RawFrame(template.layout, body)
         fields = _frame_fields(body, self.byte_order)
         template = self._layouts.get(fields)
         if template is None:
@@ -261,7 +261,7 @@ class FrameReader:
                 self._templates.clear()
             template = self._layouts[fields] = _Template(FrameLayout(self.byte_order, *fields))
         self._templates[len(body)] = template
-        return Frame(template.layout, body)
+        return RawFrame(template.layout, body)
 
 
 class _Template:

@@ -244,7 +244,7 @@ TAGS: Final = {tag.lower(): tag for tag in (ROOT, *PARENT_TAGS)}
 """The tags of §6 by their lower-case form."""
 
 
-class Section(NamedTuple):
+class SectionNames(NamedTuple):
     """The names of one section of the parameters."""
 
     command_word: str
@@ -264,12 +264,12 @@ class Section(NamedTuple):
 
 
 SECTIONS: Final = {
-    "general": Section("General", "general"),
-    "3d": Section("3D", "markers", "markers"),
-    "6d": Section("6D", "tools", "tools"),
-    "analog": Section("Analog", "analog", "channels"),
-    "force": Section("Force", "force", "plates"),
-    "events": Section("Events", "events", "events"),
+    "general": SectionNames("General", "general"),
+    "3d": SectionNames("3D", "markers", "markers"),
+    "6d": SectionNames("6D", "tools", "tools"),
+    "analog": SectionNames("Analog", "analog", "channels"),
+    "force": SectionNames("Force", "force", "plates"),
+    "events": SectionNames("Events", "events", "events"),
 }
 """The sections of §6 by the names that they have in the gateway's keys, messages and commands."""
 

@@ -11,7 +11,7 @@ import asyncio
 from collections.abc import Callable
 from typing import Final
 
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.session.clock import ServerClock
 from gateway.session.process_clock import running_clock
 
@@ -37,7 +37,7 @@ _MAX_CHUNK_WITHOUT_PACE: Final = 64
 MAX_TOGETHER: Final = 4
 """Up to this many frames that arrive together are published at once if that is quick. More are a backlog."""
 
-OnFrames = Callable[[list[Frame], int, int], None]
+OnFrames = Callable[[list[RawFrame], int, int], None]
 """Takes frames that arrived together, oldest first, and when, as ``HostClock.read`` returns it."""
 
 ReadClocks = Callable[[], tuple[int, int]]
@@ -78,7 +78,7 @@ class Backlog:
         self._on_waiting = on_waiting
         self._on_defect = on_defect
         self._timer: asyncio.Handle | None = None  # set while frames wait
-        self._frames: list[Frame] = []  # waiting, without those before _next
+        self._frames: list[RawFrame] = []  # waiting, without those before _next
         self._next = 0
         self._utime = 0  # when they arrived
         self._arrival_us = 0  # the same on the steady clock
@@ -90,7 +90,7 @@ class Backlog:
         """Whether no frames wait."""
         return not self._frames
 
-    def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
+    def receive(self, frames: list[RawFrame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first; see Ingest.receive."""
         is_quick = len(frames) == 1 or (len(frames) <= MAX_TOGETHER and self._is_quick(len(frames)))
         if is_quick and not self._frames:
@@ -131,7 +131,7 @@ class Backlog:
         """Return whether so many frames can be published in one turn, judged by the newest ones."""
         return num_frames * self._frame_s <= _TURN_S
 
-    def _publish_together(self, frames: list[Frame], utime: int, steady_us: int) -> None:
+    def _publish_together(self, frames: list[RawFrame], utime: int, steady_us: int) -> None:
         began_us = self._read_clocks()[1]
         self._publish(frames, utime, steady_us)
         self._frame_s = (self._read_clocks()[1] - began_us) * 1e-6 / len(frames)
@@ -190,7 +190,7 @@ class Backlog:
             at += 1
         return at
 
-    def _wait_s(self, frame: Frame, speed: float) -> float:
+    def _wait_s(self, frame: RawFrame, speed: float) -> float:
         """Return how long to wait after ``frame`` was due: as long as after the one before it."""
         if frame.layout.first_component_type is None:
             return 0.0

@@ -7,7 +7,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.encode import Stamp
 from gateway.rtc3d.commands import Frequency
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.session.backlog import MAX_TOGETHER
 from gateway.session.missing_frames import MissingFrames
 from gateway.session.plan import MAX_HALVINGS, LagControl
@@ -15,10 +15,10 @@ from gateway.session.process_clock import running_clock
 from gateway.session.rate_check import Arrivals
 from gateway.session.status import FRAME_REJECTED, StreamStatus
 
-Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
+Publish = Callable[[RawFrame, Stamp, frozenset[ComponentType]], None]
 """Takes a frame, its stamp, and the types of the components to publish."""
 
-Skip = Callable[[Frame, Stamp, frozenset[ComponentType]], int]
+Skip = Callable[[RawFrame, Stamp, frozenset[ComponentType]], int]
 """Takes the same for components that are not published; returns how many messages this loses."""
 
 _LEARNING_US: Final = 3_000_000
@@ -96,7 +96,7 @@ class Ingest:
             self._num_restarts,
         )
 
-    def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
+    def receive(self, frames: list[RawFrame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first.
 
         ``utime`` is when they arrived, in µs since the Unix epoch; ``steady_us`` is the same moment on the
@@ -139,7 +139,7 @@ class Ingest:
         is_learning = self._began_us is None or steady_us - self._began_us < _LEARNING_US
         return num_together > MAX_TOGETHER and not is_learning
 
-    def _newest_components(self, frames: list[Frame]) -> list[frozenset[ComponentType]]:
+    def _newest_components(self, frames: list[RawFrame]) -> list[frozenset[ComponentType]]:
         """Return the wanted components of each frame that no later one of these frames has."""
         later: frozenset[ComponentType] = frozenset()
         newest = []
@@ -150,7 +150,7 @@ class Ingest:
         newest.reverse()
         return newest
 
-    def _publish_newest(self, frame: Frame, stamp: Stamp, newest: frozenset[ComponentType]) -> None:
+    def _publish_newest(self, frame: RawFrame, stamp: Stamp, newest: frozenset[ComponentType]) -> None:
         """Publish the events and the ``newest`` components of a late frame; skip the others."""
         published, skipped = self._wanted_events, self._skippable
         if newest:
@@ -169,7 +169,7 @@ class Ingest:
         if layout.num_extra_bytes:
             self._status.add_limitation("bytes after the last component of a frame are ignored")
 
-    def _stamp(self, frame: Frame, utime: int, steady_us: int) -> Stamp:
+    def _stamp(self, frame: RawFrame, utime: int, steady_us: int) -> Stamp:
         """Return the times of a frame, with the session; count and report what its numbers and times show."""
         status, clock, numbers = self._status, self._clock, self._numbers
         frame_number, timestamp_us = frame.number_and_timestamp

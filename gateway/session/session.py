@@ -41,7 +41,7 @@ def defect_error(defect: BaseException) -> DefectError:
     return error
 
 
-class FileReceiver(Protocol):
+class FileSink(Protocol):
     """Takes the C3D files of one stream. Its methods are called in the event loop and must not block."""
 
     def receive(self, piece: FilePiece) -> None:
@@ -80,7 +80,7 @@ class Session:
         stream: StreamSettings,
         status: StreamStatus,
         on_frames: OnFrames,
-        files: FileReceiver | None = None,
+        files: FileSink | None = None,
         connect: Connect = open_connection,
         read_clocks: ReadClocks = host_clock.read,
     ) -> None:

@@ -18,7 +18,7 @@ from gateway.session.backlog import ReadClocks
 from gateway.session.ingest import Ingest, Publish, Skip
 from gateway.session.rate_check import AnnouncedRates, RateWatch
 from gateway.session.replies import ReadParameters
-from gateway.session.session import FileReceiver, Session, defect_error
+from gateway.session.session import FileSink, Session, defect_error
 from gateway.session.state import StreamState
 from gateway.session.status import StreamStatus
 from gateway.session.stream_requests import StreamRequests, StreamTarget
@@ -38,7 +38,7 @@ class Callbacks(NamedTuple):
     """Returns the server's parameters for each handshake."""
     on_restart: Callable[[], None]
     """Called when the server's frame numbers or time stamps start again within a connection."""
-    files: FileReceiver
+    files: FileSink
     """Takes the C3D files."""
     has_subscribers: Callable[[Collection[ComponentType]], bool]
     """Returns whether any of these components may have subscribers."""

@@ -21,7 +21,7 @@ from gateway.outputs.contract import FramePublisher, Output
 from gateway.outputs.registry import OUTPUTS
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters import Parameters
 from gateway.runtime.workers import make_call
 from tests.contract.frame_rigs import (
@@ -121,7 +121,7 @@ class Lab:
         for source in self.fan_outs:
             await self.arrives(source)
 
-    def publish(self, source: str, to_publish: Frame, at: Stamp | None = None) -> None:
+    def publish(self, source: str, to_publish: RawFrame, at: Stamp | None = None) -> None:
         self.fan_outs[source].publish(to_publish, at or stamp(), ALL)
 
     def publish_next(self, source: str = LAB) -> int:
@@ -202,7 +202,7 @@ async def returns(call: Callable[[], Any]) -> None:
     made.result()
 
 
-def offered(publisher: FramePublisher, to_publish: Frame) -> str:
+def offered(publisher: FramePublisher, to_publish: RawFrame) -> str:
     """Publish a frame; return the cause if it is refused, "" otherwise."""
     try:
         publisher.publish(to_publish, stamp(), ALL)

@@ -28,7 +28,7 @@ from gateway.rtc3d.components import (
     ComponentType,
     encode_component,
 )
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -240,17 +240,17 @@ def component(
     return encode_component(kind, number, number * 5000, items, order)
 
 
-def frame_of(*components: bytes, order: ByteOrder = "big") -> Frame:
+def frame_of(*components: bytes, order: ByteOrder = "big") -> RawFrame:
     """Return a frame with these components."""
     return split_frame(encode_frame(components, order), order)
 
 
-def frame(number: int, order: ByteOrder = "big") -> Frame:
+def frame(number: int, order: ByteOrder = "big") -> RawFrame:
     """Return a frame with all five components."""
     return frame_of(*(component(number, kind, order=order) for kind in WIRE_ORDER), order=order)
 
 
-def odd_frames(number: int) -> dict[str, Frame]:
+def odd_frames(number: int) -> dict[str, RawFrame]:
     """Return frames that lack or repeat components, each with the tool at ``number`` if it has one."""
     tool = component(number, ComponentType.TOOLS)
     short_event = np.array([(7, 1, 2, 3)], SHORT_EVENT)

@@ -11,7 +11,7 @@ import zenoh
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.tools.display.live import LiveData, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveData
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import run_gateway
 from tests.support.waiting import wait_until, wait_until_async
@@ -31,7 +31,9 @@ def where(request: pytest.FixtureRequest) -> Iterator[tuple[dict[str, Any], Gate
         yield {"lcm_url": url}, GatewayAddress(is_lcm=True, url=url)
 
 
-def watch(address: GatewayAddress, is_seen: Callable[[LiveSource], object], **options: Any) -> LiveSource:
+def watch(
+    address: GatewayAddress, is_seen: Callable[[DisplayedSource], object], **options: Any
+) -> DisplayedSource:
     """Receive as a display does until something of a source ``is_seen``; return the source."""
     live = LiveData()
 
@@ -57,7 +59,7 @@ async def test_what_a_silent_source_sent_in_the_last_seconds_is_shown(
         await wait_until_async(lambda: gateway.sources[0].statuses[0].frames_in > 100)
         await simulator.close()
 
-        def is_seen(source: LiveSource) -> bool:
+        def is_seen(source: DisplayedSource) -> bool:
             keys = ("3d", "6d", "analog", "force", "event")
             found = [source.components[key] for key in keys if key in source.components]
             return len(found) == len(keys) and all(each.newest_head is not None for each in found)

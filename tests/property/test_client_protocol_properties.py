@@ -24,7 +24,7 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
-from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.frames import RawFrame, split_frame
 from tests.support.servers import ok, packet
 from tests.support.strategies import damaged, pieces_of
 from tests.support.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME
@@ -56,8 +56,8 @@ server_packets = st.lists(
 
 def received_in_pieces(
     protocol: ClientProtocol, pieces: Iterable[bytes]
-) -> tuple[list[Frame], list[ProtocolEvent]]:
-    frames: list[Frame] = []
+) -> tuple[list[RawFrame], list[ProtocolEvent]]:
+    frames: list[RawFrame] = []
     events: list[ProtocolEvent] = []
     for piece in pieces:
         new_frames, new_events = protocol.receive(piece)

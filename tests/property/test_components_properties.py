@@ -16,7 +16,7 @@ from gateway.rtc3d.components import (
     big_endian_content,
     encode_component,
 )
-from gateway.rtc3d.frames import Frame, FrameReader, detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.frames import FrameReader, RawFrame, detect_byte_order, encode_frame, split_frame
 from tests.support.examples import examples
 from tests.support.strategies import damaged
 from tests.support.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
@@ -165,7 +165,7 @@ def test_unknown_components_are_skipped_at_any_position(
 # Arbitrary bytes ------------------------------------------------------------------------------
 
 
-def split_or_none(body: bytes, order: ByteOrder) -> Frame | None:
+def split_or_none(body: bytes, order: ByteOrder) -> RawFrame | None:
     try:
         return split_frame(body, order)
     except FrameError:

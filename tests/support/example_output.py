@@ -25,7 +25,7 @@ from gateway.outputs.contract import (
 )
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, SubscriptionRequest
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.runtime.losses import Losses
 
 UNREACHABLE: Final = "unreachable"
@@ -120,7 +120,7 @@ class ExampleFramePublisher:
         """Publish all frames, whether or not anybody has subscribed."""
         return True
 
-    def publish(self, frame: Frame, _stamp: Stamp, _components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, _stamp: Stamp, _components: frozenset[ComponentType]) -> None:
         """See FramePublisher."""
         self._publisher.publish(frame.body)
 

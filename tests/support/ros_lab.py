@@ -19,7 +19,7 @@ from gateway.rtc3d.components import (
     ComponentType,
     encode_component,
 )
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     Marker,
@@ -60,7 +60,7 @@ def parameters(
     return ServerParameters(b"<xml/>", 1, version, parsed=parsed, frame=frame or CoordinateFrame("lab"))
 
 
-def frame_of(*components: tuple[ComponentType, list[Any]], byte_order: ByteOrder = "big") -> Frame:
+def frame_of(*components: tuple[ComponentType, list[Any]], byte_order: ByteOrder = "big") -> RawFrame:
     """Return a frame; items are tuples of the component's fields, None is a missing tool or marker."""
     encoded = []
     for kind, items in components:
@@ -71,7 +71,7 @@ def frame_of(*components: tuple[ComponentType, list[Any]], byte_order: ByteOrder
     return split_frame(encode_frame(encoded, byte_order), byte_order)
 
 
-def tools_frame(*positions: tuple[float, float, float] | None, byte_order: ByteOrder = "big") -> Frame:
+def tools_frame(*positions: tuple[float, float, float] | None, byte_order: ByteOrder = "big") -> RawFrame:
     """Return a frame of tools without rotation."""
     items = [None if each is None else (1.0, 0.0, 0.0, 0.0, *each, 0.1) for each in positions]
     return frame_of((ComponentType.TOOLS, items), byte_order=byte_order)

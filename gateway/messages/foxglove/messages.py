@@ -32,8 +32,8 @@ from gateway.messages.foxglove.topics import (
     FloatRecord,
     FloatTopics,
     FoxgloveMessage,
+    FoxgloveTopic,
     ProtobufRecord,
-    Topic,
     TopicMessages,
     field_names,
     json_topic,
@@ -110,7 +110,7 @@ class FoxgloveSource:
         self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
 
     @property
-    def known_topics(self) -> dict[Topic, ComponentType | None]:
+    def known_topics(self) -> dict[FoxgloveTopic, ComponentType | None]:
         """All topics and their components; those of numbers only if the parameters say how many there are."""
         return dict.fromkeys((self._description, self._outlines)) | {
             topic: component
@@ -128,7 +128,7 @@ class FoxgloveSource:
             found[component.key] = {label: name for label, name in names if label != name}
         return {key: names for key, names in found.items() if names}
 
-    def topics(self, component: ComponentType, num_items: int) -> tuple[Topic, ...]:
+    def topics(self, component: ComponentType, num_items: int) -> tuple[FoxgloveTopic, ...]:
         """Return the topics that a component with this many items has."""
         match component:
             case ComponentType.MARKERS:
@@ -170,7 +170,7 @@ class FoxgloveSource:
         items: Items,
         capture_utime: int,
         timestamp_us: int,
-        wanted: Container[Topic] | None = None,
+        wanted: Container[FoxgloveTopic] | None = None,
     ) -> list[FoxgloveMessage]:
         """Return the messages of one component, on the ``wanted`` topics; None means all.
 
@@ -274,7 +274,7 @@ class FoxgloveSource:
                 )
         return FrameTransforms(transforms=transforms).encode() if transforms else b""
 
-    def _new_records(self, component: ComponentType, num_items: int) -> dict[Topic, FloatRecord]:
+    def _new_records(self, component: ComponentType, num_items: int) -> dict[FoxgloveTopic, FloatRecord]:
         """Return the topics of a component's values by their labels; {} if there are none or too many."""
         if not 0 < num_items * NUMBERS_PER_ITEM[component] <= MAX_FIELDS:
             return {}

@@ -30,7 +30,7 @@ MAX_UTIME: Final = ((1 << 32) - 1) * 1_000_000
 """The latest time that Foxglove's messages can have, in µs since 1970; the earliest is 0."""
 
 
-class Topic(NamedTuple):
+class FoxgloveTopic(NamedTuple):
     """A topic and the type of its messages."""
 
     name: str
@@ -43,7 +43,7 @@ class Topic(NamedTuple):
 class FoxgloveMessage(NamedTuple):
     """One message. ``utime`` is its time in µs since 1970."""
 
-    topic: Topic
+    topic: FoxgloveTopic
     utime: int
     data: bytes
 
@@ -51,7 +51,7 @@ class FoxgloveMessage(NamedTuple):
 class TopicMessages(NamedTuple):
     """Messages of one topic, and the time of each in µs since 1970."""
 
-    topic: Topic
+    topic: FoxgloveTopic
     utimes: list[int]
     messages: list[bytes]
 
@@ -65,15 +65,15 @@ class MessageClass(Protocol):
 
 
 @cache
-def topic_of(name: str, message_class: MessageClass) -> Topic:
+def topic_of(name: str, message_class: MessageClass) -> FoxgloveTopic:
     """Return a topic with messages of one of Foxglove's own types."""
     schema = message_class.get_schema()
-    return Topic(name, "protobuf", schema.name, schema.encoding, schema.data)
+    return FoxgloveTopic(name, "protobuf", schema.name, schema.encoding, schema.data)
 
 
-def json_topic(name: str, schema_name: str, schema: dict[str, Any]) -> Topic:
+def json_topic(name: str, schema_name: str, schema: dict[str, Any]) -> FoxgloveTopic:
     """Return a topic with messages in JSON."""
-    return Topic(name, "json", schema_name, "jsonschema", json.dumps(schema).encode())
+    return FoxgloveTopic(name, "json", schema_name, "jsonschema", json.dumps(schema).encode())
 
 
 def timestamp(utime: int) -> Timestamp:
@@ -139,7 +139,7 @@ class CdrRecord:
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         names = fitting_labels(names, _ros_field, _MAX_NAME_BYTES, "number")
         schema = "".join(f"float32 {name}\n" for name in names).encode()
-        self.topic = Topic(topic_name, "cdr", schema_name, "ros2msg", schema)
+        self.topic = FoxgloveTopic(topic_name, "cdr", schema_name, "ros2msg", schema)
 
     def encode(self, values: Items) -> bytes:
         """Return the message with these values, one per field, in the order of the names."""
@@ -151,7 +151,9 @@ class ProtobufRecord:
     """The messages of a topic with a field of 32 bits for each name, at most MAX_FIELDS, in protobuf."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
-        self.topic = Topic(topic_name, "protobuf", schema_name, "protobuf", _schema(schema_name, names))
+        self.topic = FoxgloveTopic(
+            topic_name, "protobuf", schema_name, "protobuf", _schema(schema_name, names)
+        )
         data = bytearray()
         places = []
         for number in range(1, len(names) + 1):

@@ -7,13 +7,13 @@ import numpy as np
 from gateway.errors import SelectionError
 from gateway.messages.descriptions.force_plates import up_axis_of
 from gateway.takes.export.job import Axis, ExportJob
-from gateway.takes.export.measurements import Measurement
+from gateway.takes.export.measurements import ExportedMeasurement
 from gateway.takes.files.component_rows import Array
 
 _DEFAULT_UP: Final[Axis] = "z"
 
 
-def rotation_of(job: ExportJob, measurement: Measurement, file: str) -> Array:
+def rotation_of(job: ExportJob, measurement: ExportedMeasurement, file: str) -> Array:
     """Return the rotation of the server's axes to those of OpenSim, shape (3, 3), and report it.
 
     The axis that points up is that of ``job``, or else that of the force plates, or else z; the one that

@@ -28,7 +28,7 @@ from gateway.takes.export.bids_data_set import (
 from gateway.takes.export.changed_labels import note_event_labels, note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.measurements import (
-    Measurement,
+    ExportedMeasurement,
     check_number,
     event_seconds,
     measurements_by_component,
@@ -71,7 +71,7 @@ class _Recording(NamedTuple):
     """A measurement of one tracking system; the times are in s from the beginning of the take."""
 
     label: str
-    measurement: Measurement
+    measurement: ExportedMeasurement
     start_s: float
 
     @property
@@ -211,7 +211,7 @@ def _conversions(job: ExportJob, series: Series) -> list[list[tuple[str, float]]
 
 
 def _channels(
-    job: ExportJob, measurement: Measurement, conversions: list[list[tuple[str, float]]]
+    job: ExportJob, measurement: ExportedMeasurement, conversions: list[list[tuple[str, float]]]
 ) -> list[_Channel]:
     """Return the rows of channels.tsv."""
     series, fields = measurement.base, _FIELDS[measurement.base.key]
@@ -282,7 +282,7 @@ def _sidecar(data_set: DataSet, recording: _Recording, channels: list[_Channel])
     return content
 
 
-def _reference_frame(measurement: Measurement) -> dict[str, str]:
+def _reference_frame(measurement: ExportedMeasurement) -> dict[str, str]:
     """Return the description of the axes; where they point to is not known."""
     text = f"Origin and axes of the motion-capture server of {measurement.source.name}."
     frame = frame_of(measurement.source)

@@ -8,7 +8,7 @@ import numpy as np
 from gateway.messages.descriptions.force_plates import channels_from_loads
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.export.job import ExportJob
-from gateway.takes.export.measurements import Measurement, Placed, sampled, seconds_of_row
+from gateway.takes.export.measurements import ExportedMeasurement, Placed, sampled, seconds_of_row
 from gateway.takes.export.plates import PlatePlan, plan_plates
 from gateway.takes.files.component_rows import Array
 
@@ -64,7 +64,7 @@ _MAX_TRIMMED_S: Final = 1.0
 class C3dContent(NamedTuple):
     """What one file has. ``first_row`` is the row of the measurement that is its first frame."""
 
-    measurement: Measurement
+    measurement: ExportedMeasurement
     parameters: Parameters
     unit: str
     markers: Placed | None
@@ -142,7 +142,7 @@ class C3dContent(NamedTuple):
             return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
-def content_of(job: ExportJob, measurement: Measurement) -> C3dContent:
+def content_of(job: ExportJob, measurement: ExportedMeasurement) -> C3dContent:
     """Choose and align the components of a measurement."""
     base = measurement.frames
     markers = base if base.series.key == "3d" else None

@@ -19,7 +19,7 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
 from gateway.errors import TakeError
 from gateway.messages.encode import metres_per_unit
-from gateway.messages.foxglove.topics import MAX_UTIME, Topic, TopicMessages
+from gateway.messages.foxglove.topics import MAX_UTIME, FoxgloveTopic, TopicMessages
 from gateway.rtc3d.parameters import differ_in_statistics_only
 from gateway.takes.export.changed_labels import note_labels
 from gateway.takes.export.job import ExportJob, nothing_to_export
@@ -87,7 +87,7 @@ def export_to_mcap(
                 job.count_recorded(name, key, len(series))
                 for run in series.runs():
                     note_labels(job, name, run, exports[name].labels_of(run))
-                    num_messages: Counter[Topic] = Counter()
+                    num_messages: Counter[FoxgloveTopic] = Counter()
                     for messages in exports[name].messages(key, run):
                         file.add(messages)
                         num_messages[messages.topic] += len(messages.messages)
@@ -132,7 +132,7 @@ class McapFile:
         self._waiting: list[tuple[int, Callable[..., None], bytes]] = []
         self._file = _WatchedFile(file)
         self._context = foxglove.Context()
-        self._channels: dict[Topic, foxglove.Channel] = {}
+        self._channels: dict[FoxgloveTopic, foxglove.Channel] = {}
         options = MCAPWriteOptions(compression=MCAPCompression.Zstd, profile=profile)
         self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
 
@@ -171,7 +171,7 @@ class McapFile:
         self.num_messages += count
         self._file.raise_error()
 
-    def _channel(self, topic: Topic) -> foxglove.Channel:
+    def _channel(self, topic: FoxgloveTopic) -> foxglove.Channel:
         channel = self._channels.get(topic)
         if channel is None:
             if len(self._channels) == _MAX_CHANNELS:

@@ -78,7 +78,7 @@ class Placed:
         return block
 
 
-class Measurement(NamedTuple):
+class ExportedMeasurement(NamedTuple):
     """One measurement of a source. ``grid`` has the places of the frames of ``base``.
 
     ``runs`` are the runs of all components of the source, by key.
@@ -186,7 +186,9 @@ class Measurement(NamedTuple):
         return round(float(np.median(first_rows)))
 
 
-def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list[tuple[Measurement, Path]]:
+def named_measurements(
+    job: ExportJob, keys: tuple[str, ...], what: str
+) -> list[tuple[ExportedMeasurement, Path]]:
     """Return the measurements of a take, each with the name of its file. Raises TakeError if there are none.
 
     The frames are those of the first component of ``keys`` that a source has; ``what`` is what they are
@@ -223,7 +225,7 @@ def check_number(job: ExportJob, num_measurements: int) -> None:
         )
 
 
-def note_grid(job: ExportJob, measurement: Measurement, file: str) -> None:
+def note_grid(job: ExportJob, measurement: ExportedMeasurement, file: str) -> None:
     """Report that frames have the times of a grid, and by how much these are wrong."""
     grid = measurement.grid
     job.note("times of capture and frame numbers replaced by a regular grid", amount=f"{grid.rate_hz:.6g} Hz")
@@ -241,7 +243,7 @@ def _note_repeated(job: ExportJob, key: str, grid: Grid, file: str = "") -> None
 
 
 def _note_last_row(
-    job: ExportJob, measurement: Measurement, placed: "Placed", rows_per_row: int, file: str
+    job: ExportJob, measurement: ExportedMeasurement, placed: "Placed", rows_per_row: int, file: str
 ) -> None:
     """Report if the last row of a component has another time than its frame.
 
@@ -264,7 +266,9 @@ def _ms(microseconds: float) -> str:
     return f"{microseconds / 1000:.1f} ms"
 
 
-def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iterator[list[Measurement]]:
+def measurements_by_component(
+    source: TakeSource, keys: tuple[str, ...]
+) -> Iterator[list[ExportedMeasurement]]:
     """Yield the measurements of each of the components that a source has, with its frames as their base."""
     # A server may send a frame without items while it sees nothing: that is no measurement of its own.
     # Nor is a component that never has any, such as 6D without tools.
@@ -275,10 +279,10 @@ def measurements_by_component(source: TakeSource, keys: tuple[str, ...]) -> Iter
     }
     for key in keys:
         if key in runs:
-            yield [Measurement(source, runs, run, grid) for run in runs[key] for grid in place(run)]
+            yield [ExportedMeasurement(source, runs, run, grid) for run in runs[key] for grid in place(run)]
 
 
-def event_seconds(measurement: Measurement) -> Array:
+def event_seconds(measurement: ExportedMeasurement) -> Array:
     """Return when the events of the source were, in s from the first row of a measurement.
 
     Those of another measurement are NaN. The time of an event is its own, or that of its frame if it is far
@@ -302,7 +306,7 @@ _MAX_RATIO_ERROR: Final = 0.1
 
 
 def sampled(
-    job: ExportJob, measurement: Measurement, key: str, samples: int | None
+    job: ExportJob, measurement: ExportedMeasurement, key: str, samples: int | None
 ) -> tuple[Placed | None, int | None]:
     """Return a component, and its number of samples in each frame, which must be ``samples`` if given.
 
@@ -334,7 +338,9 @@ def sampled(
     return Placed(found[chosen]), chosen[0]
 
 
-def note_missing(job: ExportJob, path: Path, measurement: Measurement, first: int, count: int) -> None:
+def note_missing(
+    job: ExportJob, path: Path, measurement: ExportedMeasurement, first: int, count: int
+) -> None:
     """Report the rows of a file without a frame: ``count`` rows of the measurement, from ``first`` on."""
     start, stop = bounds(measurement.grid.rows, first, first + count)
     skipped, after = bounds(measurement.grid.skipped_rows, first, first + count)
@@ -377,7 +383,7 @@ _CLOCK_STEP_S: Final = 0.2
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def seconds_of_row(measurement: Measurement, row: int) -> float:
+def seconds_of_row(measurement: ExportedMeasurement, row: int) -> float:
     """Return when a row of a measurement was captured, in seconds since the beginning of the take."""
     base, grid = measurement.base, measurement.grid
     _, num_first = bounds(grid.rows, 0, max(math.ceil(_AVERAGED_S * grid.rate_hz), 1))
@@ -386,7 +392,7 @@ def seconds_of_row(measurement: Measurement, row: int) -> float:
     return float(np.median(starts_s[same_clock])) + row / grid.rate_hz
 
 
-def utc_text(measurement: Measurement, seconds: float = 0.0) -> str:
+def utc_text(measurement: ExportedMeasurement, seconds: float = 0.0) -> str:
     """Return a time of the take as in 2026-11-22T14:49:19.731938Z."""
     utime = measurement.base.start_utime + round(seconds * 1e6)
     try:

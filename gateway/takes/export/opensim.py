@@ -28,7 +28,7 @@ from gateway.messages.encode import metres_per_unit
 from gateway.takes.export.axes import rotation_of
 from gateway.takes.export.job import ExportJob, nothing_to_export
 from gateway.takes.export.measurements import (
-    Measurement,
+    ExportedMeasurement,
     Placed,
     named_measurements,
     sampled,
@@ -106,12 +106,12 @@ def _metres(job: ExportJob, unit: str) -> float:
 class _Samples(NamedTuple):
     """A component of a measurement, with ``per_frame`` samples in each row of the measurement."""
 
-    measurement: Measurement
+    measurement: ExportedMeasurement
     placed: Placed
     per_frame: int
 
     @classmethod
-    def of(cls, job: ExportJob, measurement: Measurement, key: str) -> "_Samples | None":
+    def of(cls, job: ExportJob, measurement: ExportedMeasurement, key: str) -> "_Samples | None":
         """Return a component; None if there is none, or if it is left out, which is reported."""
         placed, per_frame = sampled(job, measurement, key, None)
         return None if placed is None or per_frame is None else cls(measurement, placed, per_frame)
@@ -142,7 +142,11 @@ class _PlateLoads(NamedTuple):
 
     @classmethod
     def of(
-        cls, job: ExportJob, measurement: Measurement, analog: _Samples | None, forces: _Samples | None
+        cls,
+        job: ExportJob,
+        measurement: ExportedMeasurement,
+        analog: _Samples | None,
+        forces: _Samples | None,
     ) -> "_PlateLoads | None":
         """Return the loads; None if there are none. Plates that are left out are reported."""
         samples = forces or analog

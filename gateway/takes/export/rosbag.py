@@ -9,7 +9,7 @@ import numpy as np
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.descriptions.force_plates import units_of
 from gateway.messages.encode import metres_per_unit
-from gateway.messages.foxglove.topics import Topic, TopicMessages
+from gateway.messages.foxglove.topics import FoxgloveTopic, TopicMessages
 from gateway.messages.ros2.definitions import definition
 from gateway.messages.ros2.encode import (
     FLOAT_ARRAY,
@@ -77,7 +77,7 @@ class _RosExport(SourceExport):
         self._frame = frame_of(source)
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
         self._stamped = StampedEncoder(self._frame.frame_id)
-        self._topics: dict[tuple[str, RosType], Topic] = {}
+        self._topics: dict[tuple[str, RosType], FoxgloveTopic] = {}
 
     def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
         """Return the messages of a component; events are left out."""
@@ -155,8 +155,8 @@ class _RosExport(SourceExport):
     def _messages(self, name: str, ros_type: RosType, utimes: Array, encoded: list[bytes]) -> TopicMessages:
         return TopicMessages(self._topic(f"{self._base}/{name}", ros_type), utimes.tolist(), encoded)
 
-    def _topic(self, path: str, ros_type: RosType) -> Topic:
+    def _topic(self, path: str, ros_type: RosType) -> FoxgloveTopic:
         if (path, ros_type) not in self._topics:
             schema = definition(ros_type).encode()
-            self._topics[path, ros_type] = Topic(path, "cdr", ros_type.name, "ros2msg", schema)
+            self._topics[path, ros_type] = FoxgloveTopic(path, "cdr", ros_type.name, "ros2msg", schema)
         return self._topics[path, ros_type]

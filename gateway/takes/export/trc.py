@@ -9,7 +9,7 @@ from gateway.messages.descriptions.labels import printable
 from gateway.takes.export.axes import rotation_of
 from gateway.takes.export.job import ExportJob
 from gateway.takes.export.measurements import (
-    Measurement,
+    ExportedMeasurement,
     named_measurements,
     note_missing,
     seconds_of_row,
@@ -38,7 +38,7 @@ def export_trc(job: ExportJob) -> None:
 
 def write_trc(
     job: ExportJob,
-    measurement: Measurement,
+    measurement: ExportedMeasurement,
     path: Path,
     unit: str,
     rotation: Array | None,
@@ -70,7 +70,7 @@ def write_trc(
     job.written[measurement.source.name, "3d"] += frames.count(0, grid.num_rows)
 
 
-def _head(job: ExportJob, measurement: Measurement, name: str, unit: str) -> str:
+def _head(job: ExportJob, measurement: ExportedMeasurement, name: str, unit: str) -> str:
     """Return the five lines before the frames, and an empty one."""
     grid = measurement.grid
     labels = opensim_labels(job, name, measurement.source.name, measurement.base)

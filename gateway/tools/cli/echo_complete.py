@@ -11,7 +11,7 @@ from typing import Final, TextIO
 
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES, Reception
 from gateway.client.refill import END_S, Refill
-from gateway.client.sources import POSE, Series, Source
+from gateway.client.sources import POSE, ReceivedSeries, ReceivedSource
 from gateway.client.transport import GatewaySubscriber, close_in_time
 from gateway.messages.decode import decode
 from gateway.messages.texts import xml_bytes
@@ -27,7 +27,7 @@ _POLL_S: Final = 0.1
 _MAX_NOTES: Final = 10
 
 
-class CompleteMessages(Reception[Source, Series]):
+class CompleteMessages(Reception[ReceivedSource, ReceivedSeries]):
     """Messages that wait to be printed, each with its key or channel. ``name_of`` returns that of a series.
 
     When MAX_WAITING messages wait, those that arrive are let go and requested later, when there is room. What
@@ -61,28 +61,35 @@ class CompleteMessages(Reception[Source, Series]):
         self.is_ending = True
         refill.end()
 
-    def wants(self, series: Series) -> bool:
+    def wants(self, series: ReceivedSeries) -> bool:
         """Return whether the messages of a series are printed."""
         return self._wanted in {None, series.key, series.row}
 
-    def _completes(self, series: Series) -> bool:
+    def _completes(self, series: ReceivedSeries) -> bool:
         return self.wants(series) and not self.is_ending and super()._completes(series)
 
-    def _new_source(self, name: str, channels: str) -> Source:
-        return Source(name, channels, self.monotonic)
+    def _new_source(self, name: str, channels: str) -> ReceivedSource:
+        return ReceivedSource(name, channels, self.monotonic)
 
-    def _new_series(self, source: Source, key: str, channel: str) -> Series:
-        return Series(source, key, channel)
+    def _new_series(self, source: ReceivedSource, key: str, channel: str) -> ReceivedSeries:
+        return ReceivedSeries(source, key, channel)
 
-    def _take(self, series: Series, message: bytes) -> None:
+    def _take(self, series: ReceivedSeries, message: bytes) -> None:
         if self.wants(series):
             self._put(series, message)
 
-    def _take_parameters(self, series: Series, message: bytes, *, is_first: bool, is_made: bool) -> None:  # noqa: ARG002 - overrides
+    def _take_parameters(
+        self,
+        series: ReceivedSeries,
+        message: bytes,
+        *,
+        is_first: bool,  # noqa: ARG002 - it overrides
+        is_made: bool,
+    ) -> None:
         if self.wants(series):
             self._put(series, xml_bytes(decode(message).xml) if is_made else message)
 
-    def _put(self, series: Series, message: bytes) -> None:
+    def _put(self, series: ReceivedSeries, message: bytes) -> None:
         completion = series.completion
         if completion is None or completion.problem:
             if self.is_ending:

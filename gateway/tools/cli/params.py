@@ -27,7 +27,7 @@ from gateway.tools.cli import options
 from gateway.tools.cli.main import exit_with
 
 if TYPE_CHECKING:
-    from gateway.client.transport import Reply
+    from gateway.client.transport import QueryReply
 
 
 @options.with_options
@@ -79,7 +79,9 @@ def params(
 OutputFormat = Literal["table", "json", "xml"]
 
 
-def write_replies(replies: Sequence["Reply"], output_format: OutputFormat, out: TextIO) -> list[QueryError]:
+def write_replies(
+    replies: Sequence["QueryReply"], output_format: OutputFormat, out: TextIO
+) -> list[QueryError]:
     """Write the parameters of all sources to ``out``; return the problems in them.
 
     "table" means one list per section, "json" one object with the sources as keys, and "xml" the XML

@@ -15,7 +15,7 @@ from rich.text import Text
 from gateway.client.completion_states import Unknown
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES
 from gateway.client.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording
-from gateway.client.sources import POSE, Series
+from gateway.client.sources import POSE, ReceivedSeries
 from gateway.client.transport import GatewaySubscriber
 from gateway.runtime.safe_text import safe_text
 
@@ -287,7 +287,7 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
         yield f"{num_refused} messages were not written, because too many waited for the disk"
 
 
-def missing_texts(all_series: Sequence[Series]) -> Iterator[str]:
+def missing_texts(all_series: Sequence[ReceivedSeries]) -> Iterator[str]:
     """Yield how many messages of these series are missing, and which; nothing if none is."""
     incomplete = [series for series in all_series if series.check.num_lost]
     if incomplete:
@@ -308,7 +308,7 @@ _UNKNOWN_TEXTS: Final = {
 }
 
 
-def unknown_texts(all_series: Sequence[Series]) -> Iterator[str]:
+def unknown_texts(all_series: Sequence[ReceivedSeries]) -> Iterator[str]:
     """Yield of which parts of the sources it is not known whether something is missing."""
     names = dict.fromkeys(series.source.name for series in all_series)
     texts = []
@@ -327,7 +327,7 @@ def unknown_texts(all_series: Sequence[Series]) -> Iterator[str]:
         yield f"… and {len(texts) - _MAX_NOTES} such notes on other sources"
 
 
-def _missing_text(series: Series) -> str:
+def _missing_text(series: ReceivedSeries) -> str:
     """Return which messages of a series are missing, and why, if that is known."""
     gaps = series.check.gaps
     ranges = [

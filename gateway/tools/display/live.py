@@ -1,6 +1,6 @@
 """The newest data of all sources that are received, decoded when they are shown.
 
-``LiveData`` has a ``LiveSource`` for each source, and that a ``LiveComponent`` for each component.
+``LiveData`` has a ``DisplayedSource`` for each source, and that a ``LiveComponent`` for each component.
 """
 
 import logging
@@ -13,8 +13,8 @@ import numpy as np
 
 from gateway.client.queued_reception import (
     MAX_WAITING_BYTES,
-    Arrival,
     DescribedSource,
+    QueuedMessage,
     QueuedReception,
     QueuedSeries,
 )
@@ -79,7 +79,7 @@ class LiveComponent:
         return time.monotonic() - self._paused_s
 
     def update(
-        self, arrived: Sequence[Arrival], parameters: Parameters | None, gateway_utime: int = 0
+        self, arrived: Sequence[QueuedMessage], parameters: Parameters | None, gateway_utime: int = 0
     ) -> None:
         """Decode messages that have arrived, and describe their items by the source's parameters.
 
@@ -203,7 +203,7 @@ class LiveEvent(NamedTuple):
     text: EventText
 
 
-class LiveSource(DescribedSource):
+class DisplayedSource(DescribedSource):
     """What a source publishes now."""
 
     def __init__(self, name: str, channels: str) -> None:
@@ -256,7 +256,7 @@ class LiveSource(DescribedSource):
         """Whether some component has come before and comes no more."""
         return any(component.is_stopped for component in [*self.components.values()])
 
-    def update(self, arrived: dict[str, list[Arrival]]) -> None:
+    def update(self, arrived: dict[str, list[QueuedMessage]]) -> None:
         """Decode what has arrived since the last call, by the key of the component."""
         self.update_parameters()
         if self.status is not self._read_status:
@@ -285,7 +285,7 @@ class LiveSource(DescribedSource):
             logger.debug("%s: status: %s", self.name, error)
 
 
-class LiveData(QueuedReception[LiveSource]):
+class LiveData(QueuedReception[DisplayedSource]):
     """The newest data of all sources.
 
     Messages are received in the threads of Zenoh or LCM. ``update`` decodes them; it and everything that it
@@ -295,9 +295,9 @@ class LiveData(QueuedReception[LiveSource]):
 
     def __init__(self) -> None:
         super().__init__()
-        self._past: dict[QueuedSeries, list[Arrival]] = {}
+        self._past: dict[QueuedSeries, list[QueuedMessage]] = {}
 
-    def update(self) -> list[LiveSource]:
+    def update(self) -> list[DisplayedSource]:
         """Decode what has arrived; return the sources, sorted by name. Call it at least 10 times a second."""
         waiting = {series for series in self.all_series if series.is_past}
         for arrival in self.take_waiting():
@@ -346,10 +346,10 @@ class LiveData(QueuedReception[LiveSource]):
         is_complete = self.refill is not None and self.refill.completeness.is_complete
         return super()._completes(series) and (is_complete or series.key in COMPONENTS_BY_KEY)
 
-    def _new_source(self, name: str, channels: str) -> LiveSource:
-        return LiveSource(name, channels)
+    def _new_source(self, name: str, channels: str) -> DisplayedSource:
+        return DisplayedSource(name, channels)
 
-    def _new_series(self, source: LiveSource, key: str, channel: str) -> QueuedSeries:
+    def _new_series(self, source: DisplayedSource, key: str, channel: str) -> QueuedSeries:
         if key in COMPONENTS_BY_KEY:
             source.components[key] = LiveComponent(COMPONENTS_BY_KEY[key])
         return super()._new_series(source, key, channel)

@@ -12,7 +12,7 @@ from gateway.messages.encode import ITEMS_OFFSET
 from gateway.outputs.findings import MessageLoad
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.runtime.workers import WorkerThread
@@ -152,7 +152,7 @@ class ObservedStream:
         loads = [component.message_load for component in self.observed.values()]
         return sum(load.rate_hz * load.largest_bytes for load in loads)
 
-    def _on_frames(self, frames: list[Frame], _utime: int, steady_us: int) -> None:
+    def _on_frames(self, frames: list[RawFrame], _utime: int, steady_us: int) -> None:
         self.status.frames_in += len(frames)
         for frame in frames:
             for component in frame.components:

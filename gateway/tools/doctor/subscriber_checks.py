@@ -9,7 +9,7 @@ import zenoh
 
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.client.reception import Messages
-from gateway.client.sources import Source
+from gateway.client.sources import ReceivedSource
 from gateway.client.transport import GatewaySubscriber
 from gateway.errors import ConfigError, OutputError, QueryError
 from gateway.messages.source_report import SourceReport
@@ -149,7 +149,7 @@ def _receive(subscriber: GatewaySubscriber, reception: Messages, seconds: float)
             time.sleep(_POLL_S)
 
 
-def _data_finding(report: SourceReport, source: Source | None, seconds: float) -> Finding:
+def _data_finding(report: SourceReport, source: ReceivedSource | None, seconds: float) -> Finding:
     """Return what arrived of a source, and what was missing on the way."""
     check = Check(report.name, "data")
     all_series = [] if source is None else [each for each in source.series if each.has_data]

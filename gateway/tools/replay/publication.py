@@ -46,7 +46,7 @@ _NOT_IN_NAMES: Final = re.compile("[^A-Za-z0-9_-]+")
 """Names of sources are like those in a configuration; a log of other programs may have any."""
 
 
-class Refusal(NamedTuple):
+class PublicationRefusal(NamedTuple):
     """What an output did not accept: the key of the messages, the output, and its cause."""
 
     key: str
@@ -87,7 +87,7 @@ class Publication:
         self.sources = sources
         self.num_messages: Counter[str] = Counter()
         """How many messages were published, by key without the labels of tools."""
-        self.refusals: Counter[Refusal] = Counter()
+        self.refusals: Counter[PublicationRefusal] = Counter()
         """What the outputs did not accept."""
         self.num_unreadable: Counter[str] = Counter()
         """How many messages without a whole prefix, and parameters, could not be read, by source."""
@@ -119,7 +119,7 @@ class Publication:
             try:
                 publish(message)
             except OutputError as error:
-                self.refusals[Refusal(route.component, output, error.cause)] += 1
+                self.refusals[PublicationRefusal(route.component, output, error.cause)] += 1
         self.num_messages[route.component] += 1
 
     def _open(self, recorded_source: str, key: str, message: bytes) -> _Route | None:

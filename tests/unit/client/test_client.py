@@ -8,7 +8,7 @@ import pytest
 
 from gateway.client import GatewayAddress, GatewayClient, Messages
 from gateway.client.sources import FINGERPRINTS
-from gateway.client.transport import Replies, Reply, silence_text
+from gateway.client.transport import QueryReplies, QueryReply, silence_text
 from gateway.errors import QueryError
 from gateway.messages.encode import PREFIX
 from gateway.outputs.contract import ServerParameters, encode_parameters
@@ -39,8 +39,8 @@ def test_sources_that_are_not_concerned_are_left_out(
 ) -> None:
     """Replies of several sources to one command for takes."""
     problems = [QueryError(code, code=code) for code in CODES]
-    answers = [Reply(name, (), b"{}") for name in received]
-    monkeypatch.setattr(GatewayClient, "_ask", lambda *_: Replies(answers, problems))
+    answers = [QueryReply(name, (), b"{}") for name in received]
+    monkeypatch.setattr(GatewayClient, "_ask", lambda *_: QueryReplies(answers, problems))
     client = GatewayClient(GatewayAddress())
     replies = client.stop_take(source=source) if action == "stop" else client.start_take(source=source)
     assert replies.received == received

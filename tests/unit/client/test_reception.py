@@ -1,13 +1,13 @@
 """The messages of one key, counted, and when gateways are queried about their sources."""
 
-from gateway.client.sources import Series, Source
+from gateway.client.sources import ReceivedSeries, ReceivedSource
 from gateway.messages.encode import NOT_PUBLISHED, PREFIX
 from tests.support.clocks import Clock
 
 
 def test_messages_without_a_number_are_counted_and_show_no_loss() -> None:
     """A status that answers a query has no number, and a time of its own."""
-    series = Series(Source("lab", "MOCAP_LAB"), "3d", "MOCAP_LAB_3D")
+    series = ReceivedSeries(ReceivedSource("lab", "MOCAP_LAB"), "3d", "MOCAP_LAB_3D")
     for utime, number in ((10, 5), (99, NOT_PUBLISHED), (30, 7), (99, NOT_PUBLISHED)):
         series.count(bytes(8) + PREFIX.pack(utime, utime, number, 3, 1))
     assert (series.num_messages, series.check.num_lost, series.check.num_gaps) == (4, 1, 1)
@@ -17,7 +17,7 @@ def test_messages_without_a_number_are_counted_and_show_no_loss() -> None:
 def test_queries_without_a_reply_become_rarer() -> None:
     """Many recorders of a gateway of an earlier version must not load the network for ever."""
     clock = Clock()
-    source = Source("lab", "MOCAP_LAB", clock)
+    source = ReceivedSource("lab", "MOCAP_LAB", clock)
     due_s = []
     for tick in range(36_000):  # an hour
         clock.now_s = 1000.0 + tick / 10

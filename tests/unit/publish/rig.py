@@ -9,7 +9,7 @@ from gateway.messages.decode import decode
 from gateway.messages.encode import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, WIRE_ORDER, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, FrameLayout, encode_frame, split_frame
+from gateway.rtc3d.frames import FrameLayout, RawFrame, encode_frame, split_frame
 from gateway.runtime.losses import Losses
 from tests.support.toy_output import ToyOutput
 from tests.support.vectors import FULL_FRAME
@@ -24,7 +24,9 @@ STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
 NO_ROUTER = OutputError("no router is connected", cause="no router")
 
 
-def frame(number: int, *types: ComponentType, num_items: int = 1, timestamp_us: int | None = None) -> Frame:
+def frame(
+    number: int, *types: ComponentType, num_items: int = 1, timestamp_us: int | None = None
+) -> RawFrame:
     """Return frame ``number`` at 100 Hz, with items of each of these types; by default of 3D and 6D."""
     time_us = PERIOD_US * number if timestamp_us is None else timestamp_us
     components = [
@@ -73,7 +75,7 @@ class FrameOutput(ToyOutput):
         self.received = ALL
         self.prepared: list[tuple[FrameLayout, frozenset[ComponentType]]] = []
         self.on_change: Callable[[], None] = lambda: None
-        self.frames: list[tuple[Frame, Stamp, frozenset[ComponentType]]] = []
+        self.frames: list[tuple[RawFrame, Stamp, frozenset[ComponentType]]] = []
         self.sources: list[str] = []
         self.closed = 0
         self.losses: dict[str, Losses] = {}
@@ -103,7 +105,7 @@ class FrameOutputPublisher:
             raise self._output.error
         return not components.isdisjoint(self._output.received)
 
-    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         if self._output.error is not None:
             raise self._output.error
         self._output.frames.append((frame, stamp, components))

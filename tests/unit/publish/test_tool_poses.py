@@ -9,7 +9,7 @@ from gateway.messages.encode import Stamp
 from gateway.messages.history import WantedMessages
 from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
-from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.frames import RawFrame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
 from tests.support.errors import names
 from tests.support.parameters import in_metres
@@ -21,7 +21,7 @@ from tests.unit.publish.rig import ALL, STAMP
 IN_VIEW = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.5)
 
 
-def tools_frame(*poses: Sequence[float]) -> Frame:
+def tools_frame(*poses: Sequence[float]) -> RawFrame:
     """Return a frame with one 6D component; each pose is q0, qx, qy, qz, x, y, z, error."""
     wire = struct.pack(">IIIiqI", 1, 24 + 32 * len(poses), 4, 7, 7000, len(poses))
     wire += struct.pack(f">{8 * len(poses)}f", *chain.from_iterable(poses))

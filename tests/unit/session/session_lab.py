@@ -7,7 +7,7 @@ from typing import Any
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.rtc3d.commands import StreamFrames
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.packets import FilePiece
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.session.replies import Connection as ClientConnection
@@ -64,7 +64,7 @@ class Lab:
         self.control = StreamRequests(*common, self.session, self._read_parameters)
         self.changes = StreamTarget(*common, self.session, self.control, self._ask_for_subscribers)
 
-    def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
+    def _on_frames(self, frames: list[RawFrame], utime: int, steady_us: int) -> None:
         assert utime == EPOCH_UTIME + steady_us
         self.frames += [(frame.components[0].frame_number, steady_us / 1e6) for frame in frames]
 

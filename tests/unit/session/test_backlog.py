@@ -5,7 +5,7 @@ from typing import cast
 
 import pytest
 
-from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.frames import RawFrame, split_frame
 from gateway.session.backlog import MAX_TOGETHER, Backlog
 from gateway.session.clock import ServerClock
 from gateway.session.process_clock import running_clock
@@ -16,11 +16,11 @@ UTIME = 1_700_000_000_000_000
 MS = 0.001
 
 
-def frame(timestamp_ms: int) -> Frame:
+def frame(timestamp_ms: int) -> RawFrame:
     return split_frame(markers_frame(timestamp_ms, (0.0, 0.0, 0.0))[8:], "big")
 
 
-def frames(count: int, first_ms: int = 0, step_ms: int = 1) -> list[Frame]:
+def frames(count: int, first_ms: int = 0, step_ms: int = 1) -> list[RawFrame]:
     return [frame(first_ms + step_ms * number) for number in range(count)]
 
 
@@ -45,14 +45,14 @@ class Subscriber:
         """Do the same as HostClock.read."""
         return UTIME, round(1e6 * self.now_s)
 
-    def _publish(self, published: list[Frame], utime: int, steady_us: int) -> None:
+    def _publish(self, published: list[RawFrame], utime: int, steady_us: int) -> None:
         assert utime == UTIME
         assert steady_us == self.arrived_us
         for each in published:
             self.published.append((each.number_and_timestamp[0], self.now_s - 100.0))
             self.now_s += self.costs_s
 
-    def arrive(self, arrived: list[Frame]) -> None:
+    def arrive(self, arrived: list[RawFrame]) -> None:
         self.arrived_us = self.read_clocks()[1]
         self.backlog.receive(arrived, *self.read_clocks())
 
@@ -266,7 +266,7 @@ class Lab:
             self._on_frames, clock, 2.0, read_clocks, self.waiting.append, self.defects.append
         )
 
-    def _on_frames(self, passed: list[Frame], _utime: int, _steady_us: int) -> None:
+    def _on_frames(self, passed: list[RawFrame], _utime: int, _steady_us: int) -> None:
         if self.defect is not None:
             raise self.defect
         self.numbers += [each.number_and_timestamp[0] for each in passed]

@@ -6,7 +6,7 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.encode import Stamp
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.session.ingest import Ingest
 from gateway.session.status import StreamStatus
 from tests.support.errors import names
@@ -19,12 +19,12 @@ DTYPES = ITEM_DTYPES | {ComponentType.EVENT: LONG_EVENT}
 MARKERS, EVENT = ComponentType.MARKERS, ComponentType.EVENT
 
 
-def frame(number: int, *, event: bool = False) -> Frame:
+def frame(number: int, *, event: bool = False) -> RawFrame:
     """Return frame ``number`` with one marker and, if requested, an event."""
     return frame_of(number, *((MARKERS, number), (EVENT, number)) if event else ((MARKERS, number),))
 
 
-def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
+def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> RawFrame:
     """Return the frame of period ``tick`` with these components, each with its own frame number."""
     components = [
         encode_component(
@@ -72,26 +72,26 @@ class Lab:
     def _on_restart(self) -> None:
         self.restarts += 1
 
-    def _publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
+    def _publish(self, frame: RawFrame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         self.stamps.append(stamp)
         self._add(self.published, frame, wanted)
 
-    def _skip(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
+    def _skip(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
         assert stamp is self.stamps[-1]
         return self._add(self.skipped, frame, components)
 
     @staticmethod
-    def _add(numbers: list[tuple[int, list[str]]], frame: Frame, types: frozenset[ComponentType]) -> int:
+    def _add(numbers: list[tuple[int, list[str]]], frame: RawFrame, types: frozenset[ComponentType]) -> int:
         keys = [component.type.key for component in frame.components if component.type in types]
         if keys:
             numbers.append((frame.components[0].frame_number, keys))
         return len(keys)
 
-    def receive(self, *frames: Frame, late_us: int = 0) -> None:
+    def receive(self, *frames: RawFrame, late_us: int = 0) -> None:
         """Receive the frames together, ``late_us`` after the newest was captured."""
         self.receive_at(BOOT_UTIME + frames[-1].components[0].timestamp_us + late_us, *frames)
 
-    def receive_at(self, utime: int, *frames: Frame) -> None:
+    def receive_at(self, utime: int, *frames: RawFrame) -> None:
         self.ingest.receive(list(frames), utime + self.set_by_us, utime - BOOT_UTIME)
 
 
@@ -141,7 +141,7 @@ FORCE, TOOLS = ComponentType.FORCE, ComponentType.TOOLS
 
 
 @pytest.mark.parametrize("last", [(EMPTY,), (EMPTY, EMPTY), (frame_of(603, (FORCE, 603)),)])
-def test_while_late_the_newest_frame_that_is_not_empty_is_published(last: tuple[Frame, ...]) -> None:
+def test_while_late_the_newest_frame_that_is_not_empty_is_published(last: tuple[RawFrame, ...]) -> None:
     lab = learned_lab("latest", "3d", "event")
     late = [frame(600), frame(601, event=True), frame(602)]
     lab.receive_at(BOOT_UTIME + 605 * PERIOD_US + 200_000, *late, *last)
@@ -175,7 +175,7 @@ def test_without_a_clock_a_long_batch_is_late() -> None:
     assert amounts(lab.status.losses.report()) == {"skipped while behind": (399, 399)}
 
 
-def without_time(number: int) -> Frame:
+def without_time(number: int) -> RawFrame:
     """Return frame ``number`` with the time stamp 0."""
     marker = np.zeros(1, ITEM_DTYPES[MARKERS])
     return split_frame(encode_frame([encode_component(MARKERS, number, 0, marker)]), "big")

@@ -13,7 +13,7 @@ from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSet
 from gateway.messages.encode import Stamp
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.runtime.failures import HOLD_S, current_log_fields
 from gateway.session.replies import Connection
@@ -44,7 +44,7 @@ class Lab:
     def __init__(self, **stream: Any) -> None:
         self.server = ScriptedServer()
         self.status = StreamStatus("3d", name="lab (3d)")
-        self.published: list[tuple[Frame, Stamp]] = []
+        self.published: list[tuple[RawFrame, Stamp]] = []
         self.files = CollectedFiles()
         self.has_subscribers = True
         self.has_defect = False
@@ -70,7 +70,7 @@ class Lab:
             read_clocks=read_clocks,
         )
 
-    def _publish(self, frame: Frame, stamp: Stamp, _wanted: frozenset[ComponentType]) -> None:
+    def _publish(self, frame: RawFrame, stamp: Stamp, _wanted: frozenset[ComponentType]) -> None:
         self.published.append((frame, stamp))
 
     def _on_connected(self) -> None:

@@ -18,7 +18,7 @@ from websockets.protocol import State
 
 from gateway.errors import QueryError
 from gateway.messages.decode import json_text
-from gateway.messages.foxglove.topics import Topic
+from gateway.messages.foxglove.topics import FoxgloveTopic
 from gateway.outputs.listen_address import host_in_url
 from gateway.runtime.failures import EventLog
 from gateway.runtime.server_limits import Clients, ServerLimits
@@ -35,7 +35,7 @@ ERROR: Final = 2
 """The levels of messages that the viewer shows."""
 
 
-class Subscription(NamedTuple):
+class FoxgloveSubscription(NamedTuple):
     """The client chooses ``number``; the messages on ``channel`` have it."""
 
     number: int
@@ -47,7 +47,7 @@ def server_info(name: str, session: str) -> str:
     return json_text({"op": "serverInfo", "name": name, "capabilities": [], "sessionId": session})
 
 
-def channel_text(number: int, topic: Topic) -> str:
+def channel_text(number: int, topic: FoxgloveTopic) -> str:
     """Return a channel for ``advertise``."""
     is_text = topic.schema_encoding in {"jsonschema", "ros2msg"}
     return json_text(
@@ -82,7 +82,7 @@ def message_data(subscription: int, utime: int, data: bytes) -> bytes:
     return _MESSAGE_DATA.pack(_MESSAGE_DATA_OPCODE, subscription, utime * 1000) + data
 
 
-def parse_request(message: str | bytes) -> tuple[list[Subscription], list[int]]:
+def parse_request(message: str | bytes) -> tuple[list[FoxgloveSubscription], list[int]]:
     """Return which subscriptions a client begins, and the numbers of those that it ends.
 
     Raises QueryError for anything but subscriptions: the server announces no other capability.
@@ -101,10 +101,10 @@ def parse_request(message: str | bytes) -> tuple[list[Subscription], list[int]]:
     raise QueryError("only subscribe and unsubscribe are served")
 
 
-def _subscription(content: Any) -> Subscription:
+def _subscription(content: Any) -> FoxgloveSubscription:
     match content:
         case {"id": number, "channelId": channel}:
-            return Subscription(_number(number), _number(channel))
+            return FoxgloveSubscription(_number(number), _number(channel))
     raise QueryError("a subscription needs id and channelId")
 
 
@@ -141,10 +141,12 @@ _SLOW: Final = "Send buffer limit reached"
 """The words of Foxglove's own bridge. Lichtblick adds an explanation to them."""
 
 
-class Viewer(ServerConnection):
+class FoxgloveViewer(ServerConnection):
     """A viewer's connection. It ends if the viewer sends more than viewers do, or reads too little."""
 
-    def __init__(self, clients: "Clients[Viewer]", events: EventLog, *args: Any, **options: Any) -> None:
+    def __init__(
+        self, clients: "Clients[FoxgloveViewer]", events: EventLog, *args: Any, **options: Any
+    ) -> None:
         super().__init__(*args, **options)
         self.subscriptions: dict[int, int] = {}
         """The numbers of channels by those of subscriptions."""

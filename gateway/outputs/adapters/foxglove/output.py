@@ -14,16 +14,22 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.descriptions.source_frame import unknown_unit_text
 from gateway.messages.encode import Stamp, lcm_content
 from gateway.messages.foxglove.messages import NUMBERS_PER_ITEM, FoxgloveSource
-from gateway.messages.foxglove.topics import MAX_FIELDS, MAX_UTIME, FloatTopics, FoxgloveMessage, Topic
+from gateway.messages.foxglove.topics import (
+    MAX_FIELDS,
+    MAX_UTIME,
+    FloatTopics,
+    FoxgloveMessage,
+    FoxgloveTopic,
+)
 from gateway.messages.host_time import now_utime
-from gateway.outputs.adapters.foxglove.connections import Viewer
-from gateway.outputs.adapters.foxglove.server import Channel, FoxgloveServer, send
+from gateway.outputs.adapters.foxglove.connections import FoxgloveViewer
+from gateway.outputs.adapters.foxglove.server import FoxgloveChannel, FoxgloveServer, send
 from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
 from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParameters
 from gateway.outputs.frame_output import LoopThread, PortOpener, ServerOutput, in_this_loop
 from gateway.outputs.listen_address import host_in_url
 from gateway.rtc3d.components import COMPONENT_HEADER_BYTES, ITEM_DTYPES, WIRE_ORDER, ComponentType
-from gateway.rtc3d.frames import ComponentLayout, Frame, FrameLayout
+from gateway.rtc3d.frames import ComponentLayout, FrameLayout, RawFrame
 from gateway.rtc3d.parameters import Parameters
 from gateway.runtime.failures import DefectLog
 from gateway.runtime.losses import Losses
@@ -160,7 +166,7 @@ class FoxglovePublisher:
         self._call_in_time = call_in_time
         self._report_wanted: Callable[[frozenset[ComponentType]], None] = lambda _wanted: None
         self._on_change: Callable[[], None] = lambda: None
-        self._source: LiveSource | None = None  # assigned in the thread only
+        self._source: SourceChannels | None = None  # assigned in the thread only
         self._opened: set[ComponentType] = set()  # with numbers, since the newest parameters
         self._is_closed = False
 
@@ -180,7 +186,7 @@ class FoxglovePublisher:
 
     def _open(self) -> None:
         if self._source is None:
-            self._source = LiveSource(self._name, self._server, self.losses, self._report_wanted)
+            self._source = SourceChannels(self._name, self._server, self.losses, self._report_wanted)
 
     def _while_open(self, call: Callable[..., None], *arguments: Any) -> None:
         """Make a call of the source, in the thread, if it is open then."""
@@ -189,7 +195,7 @@ class FoxglovePublisher:
 
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Convert the next frames with these parameters."""
-        self._call(partial(self._while_open, LiveSource.set_parameters, parameters))
+        self._call(partial(self._while_open, SourceChannels.set_parameters, parameters))
         self._opened.clear()
         self._on_change()  # so that frames are looked at again for what the parameters do not mention
 
@@ -212,16 +218,16 @@ class FoxglovePublisher:
         for each in found if not self._is_closed else ():
             is_new = each.type in NUMBERS_PER_ITEM and each.num_items and each.type not in self._opened
             # If the queue is full, another layout or subscriber does it.
-            if is_new and self._call_in_time(partial(self._while_open, LiveSource.open_for, each), 0):
+            if is_new and self._call_in_time(partial(self._while_open, SourceChannels.open_for, each), 0):
                 self._opened.add(each.type)
         is_lost = any(map(has_too_many_numbers, found)) and bool(self.wanted)
         return self.wants([each.type for each in found]) or is_lost
 
-    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand over a frame; see FramePublisher."""
         if self._is_closed:
             raise OutputError(f"foxglove: {self._name} is closed; ask for a new publisher", cause="closed")
-        call = partial(self._while_open, LiveSource.send_frame, frame, stamp, components)
+        call = partial(self._while_open, SourceChannels.send_frame, frame, stamp, components)
         if self.wanted and not self._call_in_time(call, len(frame.body)):
             raise OutputError(
                 f"foxglove: the frames of {self._name} come faster than they can be converted; show fewer "
@@ -237,11 +243,11 @@ class FoxglovePublisher:
             self._call(self._close)
 
     def _close(self) -> None:
-        self._while_open(LiveSource.close)
+        self._while_open(SourceChannels.close)
         self._source = None
 
 
-class LiveSource:
+class SourceChannels:
     """The channels of one source, from its announcement until ``close``.
 
     All methods are called in the loop of ``server``. ``on_wanted`` is called whenever viewers subscribe to
@@ -264,7 +270,7 @@ class LiveSource:
         self._wanted: frozenset[ComponentType] = frozenset()
         self._topics = FloatTopics(name, is_live=True)
         # By the names of the topics.
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, FoxgloveChannel] = {}
         self._components: dict[str, ComponentType | None] = {}
         self._renamed_s: dict[str, float] = {}  # when it got other fields, on the monotonic clock
         self._description: Mapping[str, FoxgloveMessage] = {}
@@ -296,7 +302,7 @@ class LiveSource:
         topics = self._converter.topics(layout.type, layout.num_items)
         self._open_channels({each: layout.type for each in topics if each.name not in self._channels})
 
-    def send_frame(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def send_frame(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Send the components of a frame to the viewers that subscribe to them."""
         for index, layout in enumerate(frame.layout.components):
             if layout.type not in components:
@@ -326,7 +332,7 @@ class LiveSource:
 
     # Channels.
 
-    def _open_channels(self, topics: Mapping[Topic, ComponentType | None]) -> None:
+    def _open_channels(self, topics: Mapping[FoxgloveTopic, ComponentType | None]) -> None:
         """Open channels, in place of those of the same names."""
         for topic, component in topics.items():
             channel = self._channels.get(topic.name)
@@ -337,7 +343,7 @@ class LiveSource:
         found = [name for name in self._channels if name in names]
         self._server.close_channels([self._channels.pop(name) for name in found])
 
-    def _open_channel(self, topic: Topic, component: ComponentType | None) -> None:
+    def _open_channel(self, topic: FoxgloveTopic, component: ComponentType | None) -> None:
         before = self._channels.get(topic.name)
         if before is not None:
             self._renamed_s[topic.name] = time.monotonic()
@@ -348,7 +354,7 @@ class LiveSource:
         if before is not None:
             self._check_wanted()
 
-    def _has_subscribers(self, topic: Topic, component: ComponentType, stamp: Stamp) -> bool:
+    def _has_subscribers(self, topic: FoxgloveTopic, component: ComponentType, stamp: Stamp) -> bool:
         """Return whether a topic has subscribers. If it has other fields than before, announce it again."""
         channel = self._channels.get(topic.name)
         if channel is None or channel.topic != topic:
@@ -362,7 +368,7 @@ class LiveSource:
             return False
         return bool(channel.subscribers)
 
-    def _subscribers_changed(self, name: str, viewer: Viewer | None) -> None:
+    def _subscribers_changed(self, name: str, viewer: FoxgloveViewer | None) -> None:
         message = self._description.get(name)
         if viewer is not None and message is not None:
             self._send_description(viewer, message)
@@ -377,7 +383,7 @@ class LiveSource:
 
     # Messages.
 
-    def _send_description(self, viewer: Viewer, message: FoxgloveMessage) -> None:
+    def _send_description(self, viewer: FoxgloveViewer, message: FoxgloveMessage) -> None:
         # Now, because viewers show no messages from before they were opened.
         number = self._channels[message.topic.name].subscribers[viewer]
         if not viewer.send_message(number, now_utime(), message.data):
@@ -398,7 +404,7 @@ def has_too_many_numbers(layout: ComponentLayout) -> bool:
     return layout.num_items * NUMBERS_PER_ITEM.get(layout.type, 0) > MAX_FIELDS
 
 
-def _slow_text(viewer: Viewer) -> str:
+def _slow_text(viewer: FoxgloveViewer) -> str:
     return (
         f"the viewer at {viewer.address} does not read fast enough and loses messages; show fewer topics in "
         "it, or use a faster network"

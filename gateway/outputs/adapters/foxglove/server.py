@@ -18,9 +18,9 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from gateway.errors import QueryError
-from gateway.messages.foxglove.topics import Topic
+from gateway.messages.foxglove.topics import FoxgloveTopic
 from gateway.outputs.adapters.foxglove import connections
-from gateway.outputs.adapters.foxglove.connections import LIMITS, MAX_REQUEST_BYTES, Viewer
+from gateway.outputs.adapters.foxglove.connections import LIMITS, MAX_REQUEST_BYTES, FoxgloveViewer
 from gateway.outputs.listen_address import foreign_page
 from gateway.runtime.failures import DefectLog, EventLog
 from gateway.runtime.server_limits import Clients
@@ -41,17 +41,19 @@ _library_logger: Final = logging.getLogger(f"{__name__}.websockets")
 _library_logger.setLevel(logging.CRITICAL)  # websockets logs a traceback for whatever a port scan sends
 
 
-class Channel:
+class FoxgloveChannel:
     """An advertised topic. ``subscribers`` are the viewers, each with its number for the subscription.
 
     ``on_change`` is called with a viewer that subscribes, and with None when one unsubscribes.
     """
 
-    def __init__(self, number: int, topic: Topic, on_change: Callable[[Viewer | None], None]) -> None:
+    def __init__(
+        self, number: int, topic: FoxgloveTopic, on_change: Callable[[FoxgloveViewer | None], None]
+    ) -> None:
         self.number = number
         self.topic = topic
         self.text = connections.channel_text(number, topic)
-        self.subscribers: dict[Viewer, int] = {}
+        self.subscribers: dict[FoxgloveViewer, int] = {}
         self.on_change = on_change
 
 
@@ -66,10 +68,10 @@ class FoxgloveServer:
         self._host = host
         self._port = port
         self._info = connections.server_info(SERVER_NAME, session)
-        self._channels: dict[int, Channel] = {}
+        self._channels: dict[int, FoxgloveChannel] = {}
         self._last_number = 0
         self._origins = frozenset(origin.lower() for origin in origins)
-        self.clients: Clients[Viewer] = Clients(LIMITS, lambda each: each.transport.abort())
+        self.clients: Clients[FoxgloveViewer] = Clients(LIMITS, lambda each: each.transport.abort())
         self._events = EventLog(logger, "foxglove")
         self._server: Server | None = None
         self._opening = asyncio.Lock()
@@ -78,7 +80,7 @@ class FoxgloveServer:
 
     async def open(self) -> None:
         """Listen, unless ``close`` was called. Raises OSError."""
-        create: Any = partial(Viewer, self.clients, self._events)
+        create: Any = partial(FoxgloveViewer, self.clients, self._events)
         handler, refuse = cast(Any, self._serve), cast(Any, self._refuse)
         async with self._opening:
             if self._is_closed:
@@ -109,15 +111,17 @@ class FoxgloveServer:
 
     # Channels.
 
-    def open_channel(self, topic: Topic, on_change: Callable[[Viewer | None], None]) -> Channel:
+    def open_channel(
+        self, topic: FoxgloveTopic, on_change: Callable[[FoxgloveViewer | None], None]
+    ) -> FoxgloveChannel:
         """Advertise a topic. ``on_change`` is that of the channel."""
         self._last_number += 1
-        channel = Channel(self._last_number, topic, on_change)
+        channel = FoxgloveChannel(self._last_number, topic, on_change)
         self._channels[channel.number] = channel
         self._tell_all(connections.advertise([channel.text]))
         return channel
 
-    def close_channels(self, channels: list[Channel]) -> None:
+    def close_channels(self, channels: list[FoxgloveChannel]) -> None:
         """Withdraw channels, with all subscriptions to them."""
         for channel in channels:
             del self._channels[channel.number]
@@ -133,7 +137,7 @@ class FoxgloveServer:
 
     # Viewers.
 
-    def _refuse(self, viewer: Viewer, request: Request) -> Response | None:
+    def _refuse(self, viewer: FoxgloveViewer, request: Request) -> Response | None:
         """Return the response to a foreign page or to a viewer that is one too many; None to accept it."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         reason = foreign_page(self._host, hosts, origins, self._is_of_a_viewer)
@@ -153,7 +157,7 @@ class FoxgloveServer:
         origin = origin.lower()
         return origin in self._origins or origin == _DESKTOP or bool(_FOXGLOVE.fullmatch(origin))
 
-    async def _serve(self, viewer: Viewer) -> None:
+    async def _serve(self, viewer: FoxgloveViewer) -> None:
         """Serve a viewer until it disconnects."""
         self.clients.serve(viewer)
         logger.debug("foxglove: %s connected", viewer.address)
@@ -172,7 +176,7 @@ class FoxgloveServer:
                 self._unsubscribe(viewer, number)
             logger.debug("foxglove: %s disconnected", viewer.address)
 
-    def _handle(self, viewer: Viewer, message: str | bytes) -> None:
+    def _handle(self, viewer: FoxgloveViewer, message: str | bytes) -> None:
         try:
             begun, ended = connections.parse_request(message)
         except QueryError as error:
@@ -184,7 +188,7 @@ class FoxgloveServer:
         if problem := next(filter(None, problems), ""):  # one of them is enough for the user
             viewer.send_control(connections.status(connections.ERROR, problem))
 
-    def _subscribe(self, viewer: Viewer, number: int, channel_number: int) -> str:
+    def _subscribe(self, viewer: FoxgloveViewer, number: int, channel_number: int) -> str:
         """Subscribe a viewer to a channel. Return why the subscription is ignored; "" if it is not."""
         if channel_number > self._last_number:
             return f"there has never been a channel {channel_number}; the subscription is ignored"
@@ -200,14 +204,14 @@ class FoxgloveServer:
         channel.on_change(viewer)
         return ""
 
-    def _unsubscribe(self, viewer: Viewer, number: int) -> None:
+    def _unsubscribe(self, viewer: FoxgloveViewer, number: int) -> None:
         channel = self._channels.get(viewer.subscriptions.pop(number, -1))
         if channel is not None:
             del channel.subscribers[viewer]
             channel.on_change(None)
 
 
-def send(channel: Channel, utime: int, data: bytes) -> list[Viewer]:
+def send(channel: FoxgloveChannel, utime: int, data: bytes) -> list[FoxgloveViewer]:
     """Send a message to all subscribers; return those that lose it because they do not read fast enough."""
     subscribers = channel.subscribers.items()
     return [viewer for viewer, number in subscribers if not viewer.send_message(number, utime, data)]

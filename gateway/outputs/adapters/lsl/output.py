@@ -21,7 +21,7 @@ from gateway.outputs.contract import FramePublisher, OutputHealth, ServerParamet
 from gateway.outputs.frame_output import FrameOutput, in_this_loop
 from gateway.outputs.kind import missing_package
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.runtime.failures import DefectLog
 from gateway.runtime.losses import Losses
 from gateway.runtime.workers import WorkerThread
@@ -212,7 +212,7 @@ class LslFramePublisher:
                 self._append(functools.partial(self.streams.open_for, more), 0)
         return self.wants(num_items)
 
-    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Queue a frame. Raises OutputError if too many wait, or if receivers wait for LSL to come back."""
         if self._is_closed:
             raise OutputError("LSL is closed; ask for a new publisher", cause="closed")

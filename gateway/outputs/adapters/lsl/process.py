@@ -8,7 +8,7 @@ process. It has limits of its own, and the gateway starts another one if it ends
     python -m gateway.outputs.adapters.lsl.process SECONDS    prints the streams there are, for the doctor
 
 To the process, the gateway sends a header (kind, number of the stream, bytes that follow) and content. The
-process sends lines of JSON, see ``Report``.
+process sends lines of JSON, see ``LslReport``.
 """
 
 import contextlib
@@ -67,7 +67,7 @@ REPORT_INTERVAL_S: Final = 1.0
 """The process repeats its report this often, even if nothing has changed, to show that it does not hang."""
 
 
-class Report(NamedTuple):
+class LslReport(NamedTuple):
     """What the process reports. ``wanted`` are the numbers of the streams that somebody receives.
 
     ``ready`` is the version of liblsl, "" while it is not loaded. ``not_opened`` is a stream that liblsl
@@ -84,7 +84,7 @@ class Report(NamedTuple):
         return json.dumps(self._asdict()).encode() + b"\n"
 
     @classmethod
-    def decode(cls, line: bytes) -> "Report":
+    def decode(cls, line: bytes) -> "LslReport":
         """Return the report of one line."""
         fields = json.loads(line)
         return cls(**{**fields, "wanted": tuple(fields["wanted"])})
@@ -167,7 +167,7 @@ class _LslProcess:
         self._outlets: dict[int, Any] = {}
         self._failed: dict[int, Any] = {}  # the descriptions of streams that could not be opened
         self._retry_s = 0.0
-        self._report = Report()
+        self._report = LslReport()
         self._reported_s = 0.0
         self._closed: queue.SimpleQueue[list[Any]] = queue.SimpleQueue()
         # LSL's clock minus the monotonic one. In liblsl for Linux, both are the same clock.
@@ -179,7 +179,7 @@ class _LslProcess:
 
     def run(self) -> None:
         """Work until the gateway closes its socket."""
-        self._send(Report(ready=str(self._pylsl.library_version())))
+        self._send(LslReport(ready=str(self._pylsl.library_version())))
         next_poll_s = 0.0
         while True:
             if select.select([self._gateway], [], [], _POLL_S)[0]:
@@ -246,7 +246,7 @@ class _LslProcess:
         if report != self._report:
             self._send(report)
 
-    def _send(self, report: Report) -> None:
+    def _send(self, report: LslReport) -> None:
         self._report = report
         self._reported_s = time.monotonic()
         self._gateway.sendall(report.encode())
@@ -295,7 +295,7 @@ def _serve() -> None:
     except Exception as error:  # noqa: BLE001 - the gateway reports it
         text = safe_text(f"{type(error).__name__}: {error}", 300)
         with contextlib.suppress(OSError):
-            gateway.sendall(Report(failure=text).encode())
+            gateway.sendall(LslReport(failure=text).encode())
 
 
 def _find(seconds: float) -> None:

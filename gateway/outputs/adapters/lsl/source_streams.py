@@ -22,7 +22,7 @@ from gateway.outputs.adapters.lsl.process import Kind, Message, opening_content,
 from gateway.outputs.adapters.lsl.streams import (
     CHANNELS_PER_ITEM,
     MAX_CHANNELS,
-    DescribedSource,
+    LslSource,
     LslStream,
     changed_labels,
     lsl_stream,
@@ -30,7 +30,7 @@ from gateway.outputs.adapters.lsl.streams import (
 )
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters import Parameters
 from gateway.runtime.losses import Losses
 
@@ -108,7 +108,7 @@ logger = logging.getLogger(__name__)
 class CapturedFrame(NamedTuple):
     """A frame, which of its components to push, and when it was captured, on the steady clock in µs."""
 
-    frame: Frame
+    frame: RawFrame
     stamp: Stamp
     components: frozenset[ComponentType]
     captured_us: int
@@ -163,7 +163,7 @@ class SourceStreams:
         self._buffer_s = buffer_s
         self._next_numbers = numbers
         self._send = send
-        self._described = DescribedSource(name, computer, Parameters(), CoordinateFrame(name))
+        self._described = LslSource(name, computer, Parameters(), CoordinateFrame(name))
         self._version = 0  # counts the parameters
         self._streams: dict[ComponentType, _OpenStream] = {}
         self._opened_s: dict[ComponentType, float] = {}  # also of streams that are closed again
@@ -171,7 +171,7 @@ class SourceStreams:
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Open the streams that the parameters describe; close those of components without a section."""
         parsed = parameters.parsed
-        self._described = DescribedSource(self.source, self._computer, parsed, parameters.frame)
+        self._described = LslSource(self.source, self._computer, parsed, parameters.frame)
         self._version += 1
         for component in WIRE_ORDER:
             count = num_labels(component, parsed)

@@ -37,7 +37,7 @@ each gap. (https://github.com/sccn/xdf/wiki/Synchronization)
 _EMG: Final = re.compile(r"\bEMG", re.IGNORECASE)
 
 
-class Channel(NamedTuple):
+class LslChannel(NamedTuple):
     """One channel. ``marker`` and ``object`` are the labels of the marker or the tool that it belongs to."""
 
     label: str
@@ -64,7 +64,7 @@ class LslStream(NamedTuple):
     rate_hz: float
     is_text: bool
     source_id: str
-    channels: tuple[Channel, ...]
+    channels: tuple[LslChannel, ...]
     setup: tuple[Tree, ...]
     acquisition: tuple[Tree, ...]
 
@@ -79,7 +79,7 @@ class LslStream(NamedTuple):
         )
 
 
-class DescribedSource(NamedTuple):
+class LslSource(NamedTuple):
     """What all streams of a source have in common. ``computer`` is the name of the gateway's computer."""
 
     name: str
@@ -102,7 +102,7 @@ def _described_items(component: ComponentType, parameters: Parameters) -> tuple[
     return items
 
 
-def changed_labels(source: DescribedSource, component: ComponentType, num_items: int) -> dict[str, str]:
+def changed_labels(source: LslSource, component: ComponentType, num_items: int) -> dict[str, str]:
     """Return the names in the stream of items whose labels it cannot use as they are, by their labels."""
     if component is ComponentType.EVENT:
         return {}
@@ -117,7 +117,7 @@ def _labels(description: Description, component: ComponentType) -> tuple[str, ..
     return fitting_labels(description.labels, printable, _MAX_LABEL_BYTES, noun)
 
 
-def lsl_stream(source: DescribedSource, component: ComponentType, num_items: int) -> LslStream:
+def lsl_stream(source: LslSource, component: ComponentType, num_items: int) -> LslStream:
     """Return the description of the stream of a component with ``num_items`` items."""
     description = describe(component, source.parameters, num_items)
     labels = _labels(description, component)
@@ -149,12 +149,12 @@ def lsl_stream(source: DescribedSource, component: ComponentType, num_items: int
 
 def _channels(
     component: ComponentType, labels: tuple[str, ...], description: Description
-) -> tuple[Channel, ...]:
+) -> tuple[LslChannel, ...]:
     if component is ComponentType.EVENT:
-        return (Channel("event", "Marker", ""),)
+        return (LslChannel("event", "Marker", ""),)
     if component is ComponentType.ANALOG:
         types = ["EMG" if _EMG.search(label) else "Analog" for label in labels]
-        return tuple(map(Channel, labels, types, map(_short, description.units)))
+        return tuple(map(LslChannel, labels, types, map(_short, description.units)))
     channels = []
     for index, label in enumerate(labels):
         owner = (label, "") if component is ComponentType.MARKERS else ("", label)
@@ -162,7 +162,7 @@ def _channels(
             if component is ComponentType.FORCE:
                 is_moment = kind.startswith("Moment")
                 unit = _short(description.moment_unit if is_moment else description.units[index])  # noqa: PLW2901
-            channels.append(Channel(f"{label}_{suffix}", kind, unit, *owner))
+            channels.append(LslChannel(f"{label}_{suffix}", kind, unit, *owner))
     return tuple(channels)
 
 

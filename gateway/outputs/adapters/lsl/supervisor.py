@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from gateway.outputs.adapters.lsl.process import Message, Report
+from gateway.outputs.adapters.lsl.process import LslReport, Message
 from gateway.outputs.adapters.lsl.settings import LslSettings
 from gateway.runtime.failures import FailureLog
 from gateway.runtime.workers import module_environment, thread_starts
@@ -45,7 +45,7 @@ class LslProcesses:
         """
         self._on_wanted_changed = on_wanted_changed
         self._settings = settings
-        self._report = Report()
+        self._report = LslReport()
         self._problem = "the process for LSL has not started yet"
         self._socket: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -83,7 +83,7 @@ class LslProcesses:
         """Start a process if there is none; return whether there is a new one, which has no streams yet."""
         if not self.is_due:
             return False
-        self._report = Report()
+        self._report = LslReport()
         self._started_s = time.monotonic()
         self._retry_s = self._started_s + self._retry_delay_s
         try:
@@ -140,7 +140,7 @@ class LslProcesses:
             while data := ours.recv(_READ_BYTES):
                 *lines, unread = (unread + data).split(b"\n")
                 for line in lines:
-                    self._take(Report.decode(line))
+                    self._take(LslReport.decode(line))
         except TimeoutError:
             hung = True
         except (OSError, ValueError):  # ``stop`` has closed it, or it is no report
@@ -163,7 +163,7 @@ class LslProcesses:
         self._socket = None  # after problem and delay are known: from now on, others look at them
         ours.close()
 
-    def _take(self, report: Report) -> None:
+    def _take(self, report: LslReport) -> None:
         before, self._report = self._report, report
         if report.ready:
             self._set_wanted(frozenset(report.wanted))
@@ -207,7 +207,7 @@ def lsl_environment(settings: LslSettings) -> dict[str, str]:
     return {**module_environment(), "OPENBLAS_NUM_THREADS": "1", **config}
 
 
-def _not_opened(report: Report) -> str:
+def _not_opened(report: LslReport) -> str:
     return f"liblsl cannot open the stream {report.not_opened}"
 
 

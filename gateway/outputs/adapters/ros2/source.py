@@ -47,7 +47,7 @@ from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.outputs.zenoh.session import SessionHolder
 from gateway.rtc3d.components import Component, ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.runtime.failures import DefectLog
 from gateway.runtime.losses import Losses
 
@@ -175,7 +175,7 @@ class RosSource:
             self._num_items |= more
         return self.wants(counts)
 
-    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand a frame to the sending thread. Raises OutputError if too many wait there."""
         if self._is_closed:
             raise OutputError(f"the topics of {self.name} are closed", cause="closed")
@@ -331,7 +331,7 @@ class RosSource:
 
     def _send(
         self,
-        frame: Frame,
+        frame: RawFrame,
         stamp: Stamp,
         components: frozenset[ComponentType],
         parameters: ServerParameters,

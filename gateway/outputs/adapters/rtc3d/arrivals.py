@@ -10,7 +10,7 @@ from typing import Final, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, Component, ComponentType, Items, encode_component
-from gateway.rtc3d.frames import Frame, FrameLayout, encode_frame
+from gateway.rtc3d.frames import FrameLayout, RawFrame, encode_frame
 
 _KEPT_ARRIVALS: Final = 256
 _KEPT_BYTES: Final = 8 * 1024 * 1024
@@ -30,14 +30,14 @@ class Composition(NamedTuple):
     is_complete: bool
 
 
-class Arrival(NamedTuple):
+class ArrivedFrame(NamedTuple):
     """A frame, when it arrived and on which stream.
 
     ``time_us`` is on the clock of the measurement and grows with every arrival. ``timestamp_us`` is the
     server's. ``stream`` is the number of the connection.
     """
 
-    frame: Frame
+    frame: RawFrame
     composition: Composition
     stream: int
     time_us: int
@@ -126,7 +126,7 @@ class StreamRate:
         self._intervals_us: deque[int] = deque(maxlen=_INTERVALS)
         self._period_us = 0
 
-    def add(self, arrival: Arrival) -> None:
+    def add(self, arrival: ArrivedFrame) -> None:
         """Count a frame."""
         step_us = arrival.timestamp_us - self.timestamp_us
         elapsed_us = arrival.time_us - self.time_us
@@ -160,14 +160,14 @@ class StreamRate:
         return self._period_us
 
 
-class Arrivals:
+class NewestFrames:
     """The newest frames of a source, and the streams on which its components come.
 
     With ``streams: auto``, components of different rates come in different frames on different connections.
     """
 
     def __init__(self) -> None:
-        self.frames: Kept[Arrival] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES, attrgetter("num_bytes"))
+        self.frames: Kept[ArrivedFrame] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES, attrgetter("num_bytes"))
         """The newest frames."""
         self.stream_of: dict[ComponentType, int] = {}
         """On which stream each measured component came last."""
@@ -180,8 +180,8 @@ class Arrivals:
         self._composition = lru_cache(64)(_composition)
 
     def add(
-        self, frame: Frame, stream: int, wanted: frozenset[ComponentType], elapsed_us: int
-    ) -> Arrival | None:
+        self, frame: RawFrame, stream: int, wanted: frozenset[ComponentType], elapsed_us: int
+    ) -> ArrivedFrame | None:
         """Add a frame with its ``wanted`` components; return None if it has none of them."""
         composition = self._composition(frame.layout, wanted)
         if not composition.measured and not composition.has_events:
@@ -192,7 +192,7 @@ class Arrivals:
                 known.skip(self.newest_us - max(former_us, 0))
         if self.began_us is None:
             self.began_us = self.newest_us
-        arrival = Arrival(frame, composition, stream, self.newest_us, frame.number_and_timestamp[1])
+        arrival = ArrivedFrame(frame, composition, stream, self.newest_us, frame.number_and_timestamp[1])
         if composition.measured:
             rate = self.rates.get(stream)
             if rate is None:
@@ -246,7 +246,7 @@ class Events(NamedTuple):
         return sum(len(component.content) for component in self.components)
 
 
-def events_of(arrival: Arrival) -> Events:
+def events_of(arrival: ArrivedFrame) -> Events:
     """Return the events of a frame."""
     frame = arrival.frame
     return Events(
@@ -260,7 +260,7 @@ def events_of(arrival: Arrival) -> Events:
 
 
 def unchanged_body(
-    arrival: Arrival, chosen: frozenset[ComponentType], byte_order: ByteOrder, *, takes_all: bool
+    arrival: ArrivedFrame, chosen: frozenset[ComponentType], byte_order: ByteOrder, *, takes_all: bool
 ) -> bytes | None:
     """Return the body as it arrived; None if it has another byte order, or more than the chosen components.
 
@@ -277,7 +277,7 @@ def unchanged_body(
 
 
 def encode_joined(
-    arrivals: Iterable[Arrival],
+    arrivals: Iterable[ArrivedFrame],
     chosen: frozenset[ComponentType],
     events: Sequence[bytes],
     byte_order: ByteOrder,
@@ -308,7 +308,7 @@ def _encoded(component: Component, byte_order: ByteOrder) -> bytes:
     )
 
 
-def encode_events(events: Sequence[Events], main: Arrival, byte_order: ByteOrder) -> list[bytes]:
+def encode_events(events: Sequence[Events], main: ArrivedFrame, byte_order: ByteOrder) -> list[bytes]:
     """Return the event components of a frame: those of ``main`` as they came, if there are no others.
 
     Otherwise all events become one component for each size of events, as a server sends them at a low rate:

@@ -8,10 +8,10 @@ from operator import attrgetter
 from typing import Final, NamedTuple
 
 from gateway.outputs.adapters.rtc3d.arrivals import (
-    Arrival,
-    Arrivals,
+    ArrivedFrame,
     Events,
     Kept,
+    NewestFrames,
     encode_events,
     encode_joined,
     events_of,
@@ -64,8 +64,8 @@ class _LiveFrame(NamedTuple):
     """A frame for clients: one that arrived, and the samples of faster streams at its time stamp."""
 
     time_us: int
-    main: Arrival
-    others: tuple[Arrival, ...]
+    main: ArrivedFrame
+    others: tuple[ArrivedFrame, ...]
 
     @property
     def num_bytes(self) -> int:
@@ -90,7 +90,7 @@ class LiveFrames:
     def __init__(
         self,
         requested: Sequence[ComponentType],
-        arrivals: Arrivals,
+        arrivals: NewestFrames,
         announced_hz: Mapping[ComponentType, float],
     ) -> None:
         self.chosen = frozenset(requested or WIRE_ORDER)
@@ -107,9 +107,9 @@ class LiveFrames:
         self._events: Kept[Events] = Kept(KEPT_EVENTS, _KEPT_BYTES, _num_bytes)
         self._dropped_event_us = -1  # when the newest events came that are not kept any more
         # Frames that have arrived while it is not known yet what sets the rate; None once it is.
-        self._undecided: Kept[Arrival] | None = Kept(_KEPT_SAMPLES, _KEPT_BYTES, _num_bytes)
-        self._waiting: deque[Arrival] = deque()
-        self._samples: dict[int, Kept[Arrival]] = {}  # of faster streams, by the stream's number
+        self._undecided: Kept[ArrivedFrame] | None = Kept(_KEPT_SAMPLES, _KEPT_BYTES, _num_bytes)
+        self._waiting: deque[ArrivedFrame] = deque()
+        self._samples: dict[int, Kept[ArrivedFrame]] = {}  # of faster streams, by the stream's number
         self._joined: set[int] = set()  # the faster streams that have had a sample in a frame
         self._packets: dict[tuple[ByteOrder, int, int, int], DataPacket] = {}  # the newest
         self.update(arrivals.newest_us)
@@ -239,7 +239,7 @@ class LiveFrames:
         began_us = max(arrivals.newest_us, 0) if arrivals.began_us is None else arrivals.began_us
         return began_us + (_LEARN_ANNOUNCED_US if is_announced else _LEARN_US)
 
-    def _take(self, arrival: Arrival) -> None:
+    def _take(self, arrival: ArrivedFrame) -> None:
         composition = arrival.composition
         has_events = self.has_events and composition.has_events
         if has_events:
@@ -293,7 +293,7 @@ class LiveFrames:
                 slowest, slowest_us = stream, period_us
         return slowest
 
-    def _add_sample(self, arrival: Arrival) -> None:
+    def _add_sample(self, arrival: ArrivedFrame) -> None:
         samples = self._samples.get(arrival.stream)
         if samples is None:
             current = self._streams
@@ -311,7 +311,7 @@ class LiveFrames:
                 return
             self._add_joined(self._waiting.popleft())
 
-    def _has_all_samples(self, arrival: Arrival) -> bool:
+    def _has_all_samples(self, arrival: ArrivedFrame) -> bool:
         """Return whether all other streams have reached the frame's time stamp, or have no frames now."""
         for stream in self._streams:
             rate = self._arrivals.rates[stream]
@@ -325,7 +325,7 @@ class LiveFrames:
                 return False
         return True
 
-    def _add_joined(self, arrival: Arrival) -> None:
+    def _add_joined(self, arrival: ArrivedFrame) -> None:
         """Add a frame with the newest samples of the other streams up to its time stamp.
 
         At first, a stream may begin with a sample that is later. Then this frame is left out, because it is
@@ -335,7 +335,7 @@ class LiveFrames:
         until_us = arrival.timestamp_us + _ROUNDING_US
         for stream in self._streams - {arrival.stream}:
             rate, samples = self._arrivals.rates[stream], self._samples.get(stream, ())
-            newest: Arrival | None = None
+            newest: ArrivedFrame | None = None
             while samples and (not rate.has_times or samples.oldest.timestamp_us <= until_us):
                 newest = samples.pop_oldest()
             if newest is not None:
@@ -349,6 +349,6 @@ class LiveFrames:
                 return
         self._add(arrival, tuple(others))
 
-    def _add(self, arrival: Arrival, others: tuple[Arrival, ...] = ()) -> None:
+    def _add(self, arrival: ArrivedFrame, others: tuple[ArrivedFrame, ...] = ()) -> None:
         last_us = self._frames.newest.time_us if self._frames else -1
         self._frames.append(_LiveFrame(max(arrival.time_us, last_us + 1), arrival, others))

@@ -12,7 +12,7 @@ from typing import Final, cast
 from weakref import WeakValueDictionary
 
 from gateway.errors import CommandError
-from gateway.outputs.adapters.rtc3d.arrivals import Arrivals
+from gateway.outputs.adapters.rtc3d.arrivals import NewestFrames
 from gateway.outputs.adapters.rtc3d.client_filter import (
     SLOW_CLIENT,
     ClientFilter,
@@ -22,7 +22,7 @@ from gateway.outputs.adapters.rtc3d.client_filter import (
 from gateway.outputs.adapters.rtc3d.live_frames import KEPT_EVENTS, LiveFrames
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, described_rate_hz, num_described_items
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.rtc3d.parameters_xml import cut_sections
 from gateway.runtime.failures import EventLog
@@ -90,7 +90,7 @@ class LiveServer(RtServer):
         """Serve so many clients at most from now on; those that are connected may stay."""
         self.limits = self.clients.limits = replace(LIMITS, clients=max_clients)
 
-    def take(self, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
+    def take(self, frame: RawFrame, stream: int, wanted: frozenset[ComponentType]) -> None:
         """Send a frame that has just arrived on this stream to the clients that want it."""
         if not self._state.wanted:
             return
@@ -292,7 +292,7 @@ class LiveScene:
 
     def __init__(self, source: str) -> None:
         self._source = source
-        self._arrivals = Arrivals()
+        self._arrivals = NewestFrames()
         # What clients ask for, by its components. It is there while any client asks for it, and a bit longer,
         # because a client can ask for one frame after the other.
         self._frames: WeakValueDictionary[frozenset[ComponentType], LiveFrames] = WeakValueDictionary()
@@ -313,7 +313,7 @@ class LiveScene:
         }
         self._xml_of = lru_cache(_CACHED_SECTIONS)(partial(cut_sections, xml, parsed))
 
-    def add(self, frame: Frame, stream: int, wanted: frozenset[ComponentType], elapsed_us: int) -> bool:
+    def add(self, frame: RawFrame, stream: int, wanted: frozenset[ComponentType], elapsed_us: int) -> bool:
         """Add a frame that arrives now on this stream; return whether it has ``wanted`` components."""
         return self._arrivals.add(frame, stream, wanted, elapsed_us) is not None
 

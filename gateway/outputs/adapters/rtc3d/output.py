@@ -27,7 +27,7 @@ from gateway.outputs.frame_output import LoopThread, PortOpener, ServerOutput, i
 from gateway.outputs.listen_address import from_this_computer, listen_problem
 from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
 from gateway.runtime.failures import log_fields
 from gateway.runtime.losses import Losses
@@ -62,7 +62,7 @@ class Rtc3dPublisher:
         """See FramePublisher."""
         return self.wanted
 
-    def publish(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+    def publish(self, frame: RawFrame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Hand a frame over. Raises OutputError if too many wait."""
         if self._is_closed:
             raise OutputError(

@@ -19,7 +19,7 @@ from gateway.outputs.findings import Check, Finding, MessageLoad
 from gateway.outputs.frame_output import LoopThread, ServerOutput, in_this_loop
 from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.rtc3d.components import ComponentType, num_described_items
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import FrameLayout, RawFrame
 from gateway.runtime.losses import Losses
 
 MAX_TOOLS: Final = 256
@@ -71,7 +71,7 @@ class VrpnPublisher:
 
     def publish(
         self,
-        frame: Frame,
+        frame: RawFrame,
         stamp: Stamp,
         components: frozenset[ComponentType],  # noqa: ARG002 - see ``prepare``
     ) -> None:
@@ -98,7 +98,7 @@ class VrpnPublisher:
         self._server.describe_trackers()
         self._shown = parameters
 
-    def _send(self, parameters: ServerParameters, frame: Frame, stamp: Stamp) -> None:
+    def _send(self, parameters: ServerParameters, frame: RawFrame, stamp: Stamp) -> None:
         num_items = num_with_tracker = num_poses = 0
         messages: list[bytes] = []
         for index in _tool_indices(frame.layout):  # usually one

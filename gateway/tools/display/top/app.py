@@ -17,11 +17,11 @@ from gateway.messages.host_time import now_utime
 from gateway.outputs.findings import counted
 from gateway.outputs.kind import DISCOVERY_S, missing_source
 from gateway.runtime.safe_text import safe_json, safe_text
-from gateway.tools.display.live import LiveData, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveData
 from gateway.tools.display.terminal import Keyboard, Line, Screen, Style, encoded, is_in_front, line_text
 from gateway.tools.display.top.facts import source_facts
 from gateway.tools.display.top.pages import PAGES
-from gateway.tools.display.top.table import Order, Table, filtered, laid_out, sorted_by, wrapped
+from gateway.tools.display.top.table import Order, TopTable, filtered, laid_out, sorted_by, wrapped
 
 _MAX_FILTER: Final = 60
 _MAX_NOTICE_LINES: Final = 3
@@ -44,7 +44,7 @@ class Display:
         self._orders: list[Order | None] = [None] * len(PAGES)  # None: the usual one of the page
         self._filter = ""
         self._is_typing = False
-        self._shown = Table((), (), "")
+        self._shown = TopTable((), (), "")
         self._num_rows = 1  # that fit on the screen
         self.is_over = False
         """Whether q was pressed."""
@@ -103,7 +103,7 @@ class Display:
             self._orders[self._page] = Order(titles[index % len(titles)])
 
     def lines(
-        self, sources: Sequence[LiveSource], notices: Sequence[str], width: int, height: int
+        self, sources: Sequence[DisplayedSource], notices: Sequence[str], width: int, height: int
     ) -> list[Line]:
         """Return what the screen shows: titles, the page, and at the bottom what the keys do."""
         self._shown = PAGES[self._page].table(sources)
@@ -281,7 +281,7 @@ _PICTURE_S: Final = 2.5
 _LINE_S: Final = 1.0
 
 
-def wait_for_picture(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSource]:
+def wait_for_picture(live: LiveData, subscriber: GatewaySubscriber) -> list[DisplayedSource]:
     """Receive until the picture is complete; raises QueryError ("no-gateway") if nothing is heard."""
     start_s = time.monotonic()
     while True:
@@ -296,7 +296,7 @@ def wait_for_picture(live: LiveData, subscriber: GatewaySubscriber) -> list[Live
                 raise QueryError(problem, code="no-gateway")
 
 
-def missing_sources(sources: Sequence[LiveSource], wanted: Sequence[str]) -> list[QueryError]:
+def missing_sources(sources: Sequence[DisplayedSource], wanted: Sequence[str]) -> list[QueryError]:
     """Return an error for each of the ``wanted`` sources that is not found."""
     found = [source.name for source in sources if source.heard_s is not None]
     return [
@@ -304,7 +304,7 @@ def missing_sources(sources: Sequence[LiveSource], wanted: Sequence[str]) -> lis
     ]
 
 
-def receive_once(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSource]:
+def receive_once(live: LiveData, subscriber: GatewaySubscriber) -> list[DisplayedSource]:
     """Wait for a moment, and return the sources with what has come meanwhile."""
     time.sleep(_UPDATE_S)
     subscriber.tick()
@@ -312,7 +312,7 @@ def receive_once(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSour
     return live.update()
 
 
-def print_tables(sources: Sequence[LiveSource], out: TextIO, width: int, *, is_coloured: bool) -> None:
+def print_tables(sources: Sequence[DisplayedSource], out: TextIO, width: int, *, is_coloured: bool) -> None:
     """Print every page, one below the other."""
     encoding = out.encoding or "ascii"
     for page in PAGES:
@@ -327,7 +327,7 @@ def print_tables(sources: Sequence[LiveSource], out: TextIO, width: int, *, is_c
     out.flush()
 
 
-def json_line(live: LiveData, sources: Sequence[LiveSource]) -> str:
+def json_line(live: LiveData, sources: Sequence[DisplayedSource]) -> str:
     """Return one JSON object, in one line, with everything about the sources."""
     facts = {"utime": now_utime(), "sources": [source_facts(source) for source in sources]}
     counts = {"num_foreign": live.num_foreign, "num_beyond": live.num_beyond}

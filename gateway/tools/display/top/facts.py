@@ -8,12 +8,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gateway.client.sources import POSE, Series
+from gateway.client.sources import POSE, ReceivedSeries
 from gateway.messages.descriptions.labels import describe
 from gateway.messages.source_report import Level, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.runtime.safe_text import safe_text
-from gateway.tools.display.live import LiveComponent, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveComponent
 
 _MAX_LABEL: Final = 64
 """How much is shown of a marker's or tool's label, and of its unit."""
@@ -80,7 +80,7 @@ class EventFacts:
     parameters: str
 
 
-def state(source: LiveSource) -> State:
+def state(source: DisplayedSource) -> State:
     """Return the state of a source, in the words of the status line."""
     if source.is_silent:
         age_s = source.status_age_s
@@ -96,7 +96,7 @@ def state(source: LiveSource) -> State:
     return State(level, text)
 
 
-def components(source: LiveSource) -> list[ComponentFacts]:
+def components(source: DisplayedSource) -> list[ComponentFacts]:
     """Return the components that have come or that the streams request, in the order of frames."""
     wanted = {*source.components, *(source.report.components if source.report else ())}
     found = [_component(source, each) for each in WIRE_ORDER if each.key in wanted]
@@ -106,7 +106,7 @@ def components(source: LiveSource) -> list[ComponentFacts]:
     return found
 
 
-def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
+def _component(source: DisplayedSource, kind: ComponentType) -> ComponentFacts:
     component = source.components.get(kind.key) or LiveComponent(kind)
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
@@ -129,7 +129,7 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     )
 
 
-def _message_counts(series: Sequence[Series]) -> tuple[int, int, int, int, bool, int | None]:
+def _message_counts(series: Sequence[ReceivedSeries]) -> tuple[int, int, int, int, bool, int | None]:
     """Return how many messages came, were lost, in how many gaps; restarts; whether two gateways publish.
 
     The last one is how many were refilled; None if gaps are not filled.
@@ -146,18 +146,18 @@ def _message_counts(series: Sequence[Series]) -> tuple[int, int, int, int, bool,
     )
 
 
-def refill_problems(source: LiveSource) -> list[str]:
+def refill_problems(source: DisplayedSource) -> list[str]:
     """Return why gaps are not filled although they should be, each reason once."""
     completions = [series.completion for series in source.series if series.completion is not None]
     return [*dict.fromkeys(safe_text(each.problem) for each in completions if each.problem)]
 
 
-def has_two_gateways(source: LiveSource) -> bool:
+def has_two_gateways(source: DisplayedSource) -> bool:
     """Whether two gateways publish sources of this name, as far as the numbers of the messages show."""
     return any(series.check.has_two_publishers for series in source.series)
 
 
-def items(source: LiveSource, kind: ComponentType) -> list[ItemFacts]:
+def items(source: DisplayedSource, kind: ComponentType) -> list[ItemFacts]:
     """Return the markers or the tools, in the order of the server."""
     component = source.components.get(kind.key)
     if component is None:
@@ -182,7 +182,7 @@ def items(source: LiveSource, kind: ComponentType) -> list[ItemFacts]:
     return found
 
 
-def losses(source: LiveSource) -> list[LossFacts]:
+def losses(source: DisplayedSource) -> list[LossFacts]:
     """Return what was lost: before the outputs, on each of them, and on the way here."""
     found = []
     if source.report is not None:
@@ -200,7 +200,7 @@ def losses(source: LiveSource) -> list[LossFacts]:
     return found + [LossFacts("received here", cause, count, None) for cause, count in here.items() if count]
 
 
-def events(source: LiveSource) -> list[EventFacts]:
+def events(source: DisplayedSource) -> list[EventFacts]:
     """Return the last events, the newest one first."""
     return [
         EventFacts(event.capture_utime, safe_text(event.text.label), safe_text(event.text.description))
@@ -217,7 +217,7 @@ _LEVELS: Final = {Level.GOOD: "ok", Level.WAITING: "warning", Level.BAD: "error"
 _OUTPUT_FIELDS: Final = ("output", "is_connected", "problem", "messages", "queries")
 
 
-def source_facts(source: LiveSource) -> dict[str, Any]:
+def source_facts(source: DisplayedSource) -> dict[str, Any]:
     """Return everything about a source, for JSON."""
     found, report = state(source), source.report or SourceReport(source.name)
     return {

@@ -8,11 +8,20 @@ from typing import Final, NamedTuple
 from gateway.messages.source_report import Level, OutputReport
 from gateway.rtc3d.components import ComponentType
 from gateway.runtime.safe_text import safe_text
-from gateway.tools.display.live import SLOW_SHARE, LiveSource
+from gateway.tools.display.live import SLOW_SHARE, DisplayedSource
 from gateway.tools.display.statistics import visible_percent
 from gateway.tools.display.terminal import Style
 from gateway.tools.display.top import facts
-from gateway.tools.display.top.table import Cell, Column, Order, Row, Section, Table, number_cell, text_cell
+from gateway.tools.display.top.table import (
+    Cell,
+    Order,
+    Row,
+    TopColumn,
+    TopSection,
+    TopTable,
+    number_cell,
+    text_cell,
+)
 
 TWO_GATEWAYS: Final = (
     "two gateways publish a source of this name, so lost messages are not counted exactly: give one of them "
@@ -26,30 +35,30 @@ _SELDOM_SHARE: Final = 0.9
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-class Page(NamedTuple):
+class TopPage(NamedTuple):
     """A page: its name, and what it shows of all sources."""
 
     name: str
-    table: Callable[[Sequence[LiveSource]], Table]
+    table: Callable[[Sequence[DisplayedSource]], TopTable]
 
 
-def overview(sources: Sequence[LiveSource]) -> Table:
+def overview(sources: Sequence[DisplayedSource]) -> TopTable:
     """Each source with its state, and a line for each of its components."""
     is_complete = any(series.completion for source in sources for series in source.series)
     columns = (
-        Column("component"),
-        Column("Hz", is_number=True, width=6),
-        Column("announced", is_number=True, rank=1),
-        Column("lost", is_number=True),
-        *([Column("refilled", is_number=True)] if is_complete else []),
-        Column("gaps", is_number=True, rank=6),
-        Column("restarts", is_number=True, rank=7),
-        Column("→gateway ms", is_number=True, rank=2),
-        Column("→here ms", is_number=True, rank=2),
-        Column("items", is_number=True, rank=5),
-        Column("visible", is_number=True, rank=3),
-        Column("age s", is_number=True, rank=4),
-        Column("note"),
+        TopColumn("component"),
+        TopColumn("Hz", is_number=True, width=6),
+        TopColumn("announced", is_number=True, rank=1),
+        TopColumn("lost", is_number=True),
+        *([TopColumn("refilled", is_number=True)] if is_complete else []),
+        TopColumn("gaps", is_number=True, rank=6),
+        TopColumn("restarts", is_number=True, rank=7),
+        TopColumn("→gateway ms", is_number=True, rank=2),
+        TopColumn("→here ms", is_number=True, rank=2),
+        TopColumn("items", is_number=True, rank=5),
+        TopColumn("visible", is_number=True, rank=3),
+        TopColumn("age s", is_number=True, rank=4),
+        TopColumn("note"),
     )
     sections = []
     for source in sources:
@@ -60,8 +69,8 @@ def overview(sources: Sequence[LiveSource]) -> Table:
             heading.append((TWO_GATEWAYS, Style.BAD))
         heading += [(f"gaps are not filled: {text}", Style.WARNING) for text in facts.refill_problems(source)]
         rows = [_component_row(each, is_complete=is_complete) for each in facts.components(source)]
-        sections.append(Section(rows, heading + _output_problems(source)))
-    return Table(columns, sections, "no source so far")
+        sections.append(TopSection(rows, heading + _output_problems(source)))
+    return TopTable(columns, sections, "no source so far")
 
 
 def _component_row(component: facts.ComponentFacts, *, is_complete: bool) -> Row:
@@ -104,17 +113,17 @@ def _latency_cell(p50_ms: float | None, p99_ms: float | None) -> Cell:
     return Cell(f"{number_cell(p50_ms, 1).text}/{number_cell(p99_ms, 1).text}", Style.PLAIN, p99_ms)
 
 
-def items(sources: Sequence[LiveSource], kind: ComponentType, noun: str) -> Table:
+def items(sources: Sequence[DisplayedSource], kind: ComponentType, noun: str) -> TopTable:
     """How often each marker or tool was visible, the error of tools, and where they are."""
     has_error = kind is ComponentType.TOOLS
     columns = (
-        Column(noun),
-        Column("visible in 10 s", is_number=True),
-        Column("now"),
-        *([Column("error", is_number=True)] if has_error else []),
-        *(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"),
-        Column("unit", rank=3),
-        Column("source", rank=1),
+        TopColumn(noun),
+        TopColumn("visible in 10 s", is_number=True),
+        TopColumn("now"),
+        *([TopColumn("error", is_number=True)] if has_error else []),
+        *(TopColumn(axis, is_number=True, rank=2, width=7) for axis in "xyz"),
+        TopColumn("unit", rank=3),
+        TopColumn("source", rank=1),
     )
     rows = [
         (
@@ -129,7 +138,7 @@ def items(sources: Sequence[LiveSource], kind: ComponentType, noun: str) -> Tabl
         for source in sources
         for item in facts.items(source, kind)
     ]
-    return Table(columns, [Section(rows)], f"no {noun}s so far", Order("visible in 10 s"))
+    return TopTable(columns, [TopSection(rows)], f"no {noun}s so far", Order("visible in 10 s"))
 
 
 def _share_cell(share: float | None) -> Cell:
@@ -139,20 +148,20 @@ def _share_cell(share: float | None) -> Cell:
     return Cell(f"{visible_percent(share):.1f} %", style, share)
 
 
-def server(sources: Sequence[LiveSource]) -> Table:
+def server(sources: Sequence[DisplayedSource]) -> TopTable:
     """The streams of each source, and the clock of its server."""
     columns = (
-        Column("stream"),
-        Column("state"),
-        Column("Hz", is_number=True, width=6),
-        Column("session", is_number=True, rank=4),
-        Column("reconnects", is_number=True, rank=3),
-        Column("restarts", is_number=True, rank=6),
-        Column("byte order", rank=7),
-        Column("rate", rank=5),
-        Column("late ms", is_number=True, rank=1),
-        Column("drift ppm", is_number=True, rank=2),
-        Column("uncertainty µs", is_number=True, rank=2),
+        TopColumn("stream"),
+        TopColumn("state"),
+        TopColumn("Hz", is_number=True, width=6),
+        TopColumn("session", is_number=True, rank=4),
+        TopColumn("reconnects", is_number=True, rank=3),
+        TopColumn("restarts", is_number=True, rank=6),
+        TopColumn("byte order", rank=7),
+        TopColumn("rate", rank=5),
+        TopColumn("late ms", is_number=True, rank=1),
+        TopColumn("drift ppm", is_number=True, rank=2),
+        TopColumn("uncertainty µs", is_number=True, rank=2),
     )
     sections = []
     for source in sources:
@@ -184,18 +193,18 @@ def server(sources: Sequence[LiveSource]) -> Table:
                 found.append(("its time stamps are no clock", Style.WARNING))
             notes += [(f"{stream.components}: {text}", style) for text, style in found]
         style = _LEVEL_STYLES[facts.state(source).level]
-        sections.append(Section(rows, [(f"{_name(source)}{where}", style)], notes))
-    return Table(columns, sections, "no source so far")
+        sections.append(TopSection(rows, [(f"{_name(source)}{where}", style)], notes))
+    return TopTable(columns, sections, "no source so far")
 
 
-def drops(sources: Sequence[LiveSource]) -> Table:
+def drops(sources: Sequence[DisplayedSource]) -> TopTable:
     """What was lost, where, and why."""
     columns = (
-        Column("source", rank=2),
-        Column("where"),
-        Column("cause"),
-        Column("messages", is_number=True),
-        Column("frames", is_number=True, rank=1),
+        TopColumn("source", rank=2),
+        TopColumn("where"),
+        TopColumn("cause"),
+        TopColumn("messages", is_number=True),
+        TopColumn("frames", is_number=True, rank=1),
     )
     rows = [
         (
@@ -208,17 +217,17 @@ def drops(sources: Sequence[LiveSource]) -> Table:
         for source in sources
         for loss in facts.losses(source)
     ]
-    return Table(columns, [Section(rows)], "nothing was lost")
+    return TopTable(columns, [TopSection(rows)], "nothing was lost")
 
 
-def outputs(sources: Sequence[LiveSource]) -> Table:
+def outputs(sources: Sequence[DisplayedSource]) -> TopTable:
     """The outputs of the gateways: whether they are connected, and what they have sent."""
     columns = (
-        Column("source"),
-        Column("output"),
-        Column("state"),
-        Column("messages", is_number=True),
-        Column("of which", rank=1),
+        TopColumn("source"),
+        TopColumn("output"),
+        TopColumn("state"),
+        TopColumn("messages", is_number=True),
+        TopColumn("of which", rank=1),
     )
     rows, notes = [], []
     for source in sources:
@@ -235,12 +244,17 @@ def outputs(sources: Sequence[LiveSource]) -> Table:
                 )
             )
         notes += _output_problems(source)
-    return Table(columns, [Section(rows, (), notes)], "no output so far")
+    return TopTable(columns, [TopSection(rows, (), notes)], "no output so far")
 
 
-def questions(sources: Sequence[LiveSource]) -> Table:
+def questions(sources: Sequence[DisplayedSource]) -> TopTable:
     """How many queries of peers the gateways have answered, by result."""
-    columns = (Column("source"), Column("output"), Column("result"), Column("queries", is_number=True))
+    columns = (
+        TopColumn("source"),
+        TopColumn("output"),
+        TopColumn("result"),
+        TopColumn("queries", is_number=True),
+    )
     rows = [
         (
             text_cell(_name(source)),
@@ -252,12 +266,17 @@ def questions(sources: Sequence[LiveSource]) -> Table:
         for output in _outputs(source)
         for result, count in output.queries.items()
     ]
-    return Table(columns, [Section(rows)], "nobody has asked anything so far")
+    return TopTable(columns, [TopSection(rows)], "nobody has asked anything so far")
 
 
-def events(sources: Sequence[LiveSource]) -> Table:
+def events(sources: Sequence[DisplayedSource]) -> TopTable:
     """The last events of each source, the newest one first."""
-    columns = (Column("time"), Column("event"), Column("parameters", rank=2), Column("source", rank=1))
+    columns = (
+        TopColumn("time"),
+        TopColumn("event"),
+        TopColumn("parameters", rank=2),
+        TopColumn("source", rank=1),
+    )
     found = [(source, event) for source in sources for event in facts.events(source)]
     found.sort(key=lambda each: each[1].capture_utime, reverse=True)
     rows = [
@@ -269,18 +288,18 @@ def events(sources: Sequence[LiveSource]) -> Table:
         )
         for source, event in found
     ]
-    return Table(columns, [Section(rows)], "no events so far")
+    return TopTable(columns, [TopSection(rows)], "no events so far")
 
 
 PAGES: Final = (
-    Page("overview", overview),
-    Page("markers", partial(items, kind=ComponentType.MARKERS, noun="marker")),
-    Page("tools", partial(items, kind=ComponentType.TOOLS, noun="tool")),
-    Page("server", server),
-    Page("drops", drops),
-    Page("outputs", outputs),
-    Page("questions", questions),
-    Page("events", events),
+    TopPage("overview", overview),
+    TopPage("markers", partial(items, kind=ComponentType.MARKERS, noun="marker")),
+    TopPage("tools", partial(items, kind=ComponentType.TOOLS, noun="tool")),
+    TopPage("server", server),
+    TopPage("drops", drops),
+    TopPage("outputs", outputs),
+    TopPage("questions", questions),
+    TopPage("events", events),
 )
 """In the order of the keys 1 to 8."""
 
@@ -294,16 +313,16 @@ def event_time(utime: int) -> str:
     return local.strftime("%Y-%m-%d %H:%M:%S.%f")[:-3]
 
 
-def _output_problems(source: LiveSource) -> list[tuple[str, Style]]:
+def _output_problems(source: DisplayedSource) -> list[tuple[str, Style]]:
     problems = ((each.output, each.problem) for each in _outputs(source) if each.problem)
     return [(f"{_name(source)} to {output}: {problem}", Style.BAD) for output, problem in problems]
 
 
-def _outputs(source: LiveSource) -> Sequence[OutputReport]:
+def _outputs(source: DisplayedSource) -> Sequence[OutputReport]:
     return source.report.outputs if source.report else ()
 
 
-def _name(source: LiveSource) -> str:
+def _name(source: DisplayedSource) -> str:
     return safe_text(source.name, _MAX_NAME)
 
 

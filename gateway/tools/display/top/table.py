@@ -18,7 +18,7 @@ _DIGITS: Final = re.compile(r"(\d+)")
 _INDENT: Final = "  "
 
 
-class Column(NamedTuple):
+class TopColumn(NamedTuple):
     """A column, at least ``width`` wide, so that the others stay in place while its numbers change.
 
     Those with the highest ``rank`` are left out first where the screen is too narrow.
@@ -41,7 +41,7 @@ class Cell(NamedTuple):
 Row = tuple[Cell, ...]
 
 
-class Section(NamedTuple):
+class TopSection(NamedTuple):
     """Rows below a ``heading``, if it has one; ``notes`` are sentences after the rows."""
 
     rows: Sequence[Row]
@@ -49,11 +49,11 @@ class Section(NamedTuple):
     notes: Sequence[tuple[str, Style]] = ()
 
 
-class Table(NamedTuple):
+class TopTable(NamedTuple):
     """What a page shows. ``nothing`` is said instead if it has no rows. ``order`` is the usual one."""
 
-    columns: tuple[Column, ...]
-    sections: Sequence[Section]
+    columns: tuple[TopColumn, ...]
+    sections: Sequence[TopSection]
     nothing: str
     order: "Order | None" = None
 
@@ -86,7 +86,7 @@ def number_cell(value: float | None, digits: int = 0, style: Style = Style.PLAIN
     return Cell(text, style, value)
 
 
-def filtered(table: Table, wanted: str) -> Table:
+def filtered(table: TopTable, wanted: str) -> TopTable:
     """Return the rows with this text, in any case, in a cell; and all of a section with it in its heading."""
     if not wanted:
         return table
@@ -99,11 +99,11 @@ def filtered(table: Table, wanted: str) -> Table:
         rows = [row for row in section.rows if any(text in cell.text.casefold() for cell in row)]
         notes = [note for note in section.notes if text in note[0].casefold()]
         if rows or notes:
-            sections.append(Section(rows, section.heading, notes))
+            sections.append(TopSection(rows, section.heading, notes))
     return table._replace(sections=sections, nothing=f"nothing here contains {quoted(wanted)}")
 
 
-def sorted_by(table: Table, order: Order | None) -> Table:
+def sorted_by(table: TopTable, order: Order | None) -> TopTable:
     """Return the table with the rows of each section sorted; None means as they are."""
     titles = [column.title for column in table.columns]
     if order is None or order.title not in titles:
@@ -127,7 +127,7 @@ def _sort_key(value: float | str | None) -> tuple[float | str, ...]:
     return tuple(parts)
 
 
-def laid_out(table: Table, width: int, order: Order | None = None) -> LaidOut:
+def laid_out(table: TopTable, width: int, order: Order | None = None) -> LaidOut:
     """Return the lines of a table in ``width`` columns; ``order`` is marked at its title."""
     titles = [column.title for column in table.columns]
     if order is not None and order.title in titles:
@@ -168,7 +168,7 @@ def wrapped(text: str, width: int) -> list[str]:
     return [*lines, line] if line else lines
 
 
-def _fit(columns: Sequence[Column], widths: list[int], width: int) -> None:
+def _fit(columns: Sequence[TopColumn], widths: list[int], width: int) -> None:
     """Make the columns fit: cut long texts, leave out columns (0), and at last cut short texts, too."""
     for rank in sorted({column.rank for column in columns}, reverse=True):
         if _fits(columns, widths, width, _LONG_TEXT):
@@ -185,7 +185,7 @@ def _fit(columns: Sequence[Column], widths: list[int], width: int) -> None:
         widths[widest] -= 1
 
 
-def _fits(columns: Sequence[Column], widths: Sequence[int], width: int, least: int) -> bool:
+def _fits(columns: Sequence[TopColumn], widths: Sequence[int], width: int, least: int) -> bool:
     """Return whether the columns fit if texts are cut, but not to fewer than ``least`` characters."""
     pairs = zip(columns, widths, strict=True)
     return _total([each if column.is_number else min(each, least) for column, each in pairs]) <= width
@@ -195,7 +195,7 @@ def _total(widths: Sequence[int]) -> int:
     return sum(each + _GAP for each in widths if each) - _GAP
 
 
-def _row_line(row: Sequence[Cell], columns: Sequence[Column], widths: Sequence[int]) -> Line:
+def _row_line(row: Sequence[Cell], columns: Sequence[TopColumn], widths: Sequence[int]) -> Line:
     parts: list[tuple[str, Style]] = []
     for cell, column, width in zip(row, columns, widths, strict=True):
         if not width:

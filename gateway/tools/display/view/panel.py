@@ -9,7 +9,7 @@ import viser
 
 from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis
 from gateway.messages.source_report import Level, State
-from gateway.tools.display.live import LiveData, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveData
 from gateway.tools.display.view.plots import Plots
 from gateway.tools.display.view.scene_items import UP_AXES, Rgb
 from gateway.tools.display.view.texts import (
@@ -92,7 +92,7 @@ _MAX_CHARACTERS: Final = 160
 
 
 def banner_html(
-    sources: Sequence[LiveSource], now_s: float, *, is_take: bool = False, is_paused: bool = False
+    sources: Sequence[DisplayedSource], now_s: float, *, is_take: bool = False, is_paused: bool = False
 ) -> str:
     """Return a line for each source: red, with the reason, if its data have stopped.
 
@@ -107,7 +107,7 @@ def banner_html(
     return f"<section data-second={int(now_s)}>{''.join(lines)}</section>"
 
 
-def _banner_line(source: LiveSource, now_s: float, is_take: bool, is_paused: bool) -> str:
+def _banner_line(source: DisplayedSource, now_s: float, is_take: bool, is_paused: bool) -> str:
     name, state, last, recording = html_text(source.name), data_state(source), "", ""
     if is_take:
         if is_paused:
@@ -199,7 +199,7 @@ class _Turn:
 
     interval_s: float
     due_s: float
-    show: Callable[[Sequence[LiveSource]], None]
+    show: Callable[[Sequence[DisplayedSource]], None]
 
 
 _PLOT_INTERVAL_S: Final = 0.1
@@ -267,7 +267,7 @@ class Panel:
             if client.camera.image_width < _MIN_WINDOW_PX:
                 client.gui.main_panel.minimize()
 
-    def update(self, sources: list[LiveSource], *, is_paused: bool = False) -> None:
+    def update(self, sources: list[DisplayedSource], *, is_paused: bool = False) -> None:
         """Show the sources as they are now. Call it after the picture was sent, at every picture.
 
         ``is_paused`` says that a take stands still on purpose.
@@ -291,11 +291,11 @@ class Panel:
                     turn.due_s = now_s + turn.interval_s
                 turn.show(sources)
 
-    def _show_banner(self, sources: Sequence[LiveSource]) -> None:
+    def _show_banner(self, sources: Sequence[DisplayedSource]) -> None:
         banner = banner_html(sources, time.time(), is_take=self._is_take, is_paused=self._is_paused)
         _show(self._banner, [banner])
 
-    def _show_sources(self, sources: Sequence[LiveSource]) -> None:
+    def _show_sources(self, sources: Sequence[DisplayedSource]) -> None:
         shown = sources[:MAX_SOURCES]
         texts = [source_html(each, is_take=self._is_take, is_paused=self._is_paused) for each in shown]
         _show(self._sources, [*texts, ignored_html(self._live)])

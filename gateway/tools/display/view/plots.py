@@ -13,7 +13,7 @@ from viser import uplot
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.component_rows import Array, Rows
-from gateway.tools.display.live import LiveComponent, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveComponent
 
 MAX_CHOICES: Final = 1000
 """How many channels can be chosen from."""
@@ -25,7 +25,7 @@ _FIELDS: Final = ITEM_DTYPES[ComponentType.FORCE].names or ()
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class PlotChannel:
     """A channel of a source: an analog channel, or one field of a force plate.
 
     ``position`` is that of the channel or the plate, ``field`` is "" for analog channels.
@@ -37,9 +37,9 @@ class Channel:
     field: str
 
 
-def choices(sources: Sequence[LiveSource]) -> dict[str, Channel]:
+def choices(sources: Sequence[DisplayedSource]) -> dict[str, PlotChannel]:
     """Return the channels that can be plotted, at most MAX_CHOICES, by what they are called."""
-    found: dict[str, Channel] = {}
+    found: dict[str, PlotChannel] = {}
     for source in sources:
         for channel, text in _channels(source):
             if len(found) == MAX_CHOICES:
@@ -48,7 +48,7 @@ def choices(sources: Sequence[LiveSource]) -> dict[str, Channel]:
     return found
 
 
-def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
+def _channels(source: DisplayedSource) -> Iterator[tuple[PlotChannel, str]]:
     for key in _KEYS:
         component = source.components.get(key)
         if component is None:
@@ -62,14 +62,14 @@ def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
             for field in _FIELDS if key == ComponentType.FORCE.key else ("",):
                 of_field = moment_unit if field.startswith("m") else unit
                 words = [name, field.capitalize(), f"({of_field})" if of_field else ""]
-                yield Channel(source.name, key, position, field), " ".join(filter(None, words))
+                yield PlotChannel(source.name, key, position, field), " ".join(filter(None, words))
 
 
 def _cut(text: str) -> str:
     return safe_text(text, _MAX_LABEL_CHARACTERS)
 
 
-def samples(channel: Channel, batch: Rows) -> Iterator[tuple[Array, Array]]:
+def samples(channel: PlotChannel, batch: Rows) -> Iterator[tuple[Array, Array]]:
     """Return the samples of a channel in messages of its component: times and values.
 
     Times are those of capture, in µs since the Unix epoch on the gateway's clock.
@@ -197,7 +197,7 @@ class _Plot:
     """The plot of one channel."""
 
     def __init__(
-        self, server: viser.ViserServer, channel: Channel, title: str, recent: Iterable[Rows]
+        self, server: viser.ViserServer, channel: PlotChannel, title: str, recent: Iterable[Rows]
     ) -> None:
         self.channel = channel
         self._envelope = Envelope()
@@ -221,7 +221,7 @@ class _Plot:
             padding=(8, 8, 0, 0),
         )
 
-    def take(self, source: LiveSource | None) -> None:
+    def take(self, source: DisplayedSource | None) -> None:
         """Take what came since the last call."""
         component = self._component = source.components.get(self.channel.key) if source else None
         if component is not None:
@@ -260,13 +260,13 @@ class Plots:
         self._add = server.gui.add_dropdown("Plot", [_CHOOSE], visible=False)
         self._remove = server.gui.add_dropdown("Remove", [_CHOOSE], visible=False)
         self._folder = server.gui.add_folder(None)
-        self._choices: dict[str, Channel] = {}
+        self._choices: dict[str, PlotChannel] = {}
         self._plots: dict[str, _Plot] = {}  # by their titles
         self._recent: dict[tuple[str, str], RecentRows] = {}  # by source and key of a component
         self._has_begun = False
         """Whether somebody has chosen a channel, or the first one was chosen for them."""
 
-    def take(self, sources: Sequence[LiveSource]) -> None:
+    def take(self, sources: Sequence[DisplayedSource]) -> None:
         """Take what came since the last call."""
         by_name = {source.name: source for source in sources}
         batches = {
@@ -304,7 +304,7 @@ class Plots:
         with self._folder:
             self._plots[title] = _Plot(self._server, channel, title, recent.batches)
 
-    def offer(self, sources: Sequence[LiveSource]) -> None:
+    def offer(self, sources: Sequence[DisplayedSource]) -> None:
         """Offer the channels that there are now. The first time that they are known, plot a useful one."""
         former, self._choices = self._choices, choices(sources)
         forces = [text for text, channel in self._choices.items() if channel.field == "fz"]

@@ -13,7 +13,7 @@ import viser
 from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis, up_axis_of
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array
-from gateway.tools.display.live import LiveComponent, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveComponent
 from gateway.tools.display.view.panel import Switches
 from gateway.tools.display.view.scene_items import (
     GREY,
@@ -144,7 +144,7 @@ class SourceScene:
     """
 
     def __init__(
-        self, scene: viser.SceneApi, source: LiveSource, number: int, switch: viser.GuiCheckboxHandle
+        self, scene: viser.SceneApi, source: DisplayedSource, number: int, switch: viser.GuiCheckboxHandle
     ) -> None:
         self._number = number
         self._name = source.name
@@ -160,7 +160,7 @@ class SourceScene:
         )
 
     def update(
-        self, source: LiveSource, up: UpAxis, switches: Switches, now_s: float, *, is_alone: bool
+        self, source: DisplayedSource, up: UpAxis, switches: Switches, now_s: float, *, is_alone: bool
     ) -> None:
         """Show the newest data of the source. If it is not alone, its labels begin with its name."""
         if source.name != self._name:  # on LCM, a status says the name
@@ -219,7 +219,7 @@ _SETTLE_S: Final = 0.3
 """How long after the first data the view is fitted: other sources may come at the same time."""
 
 
-class Scene:
+class ViewScene:
     """The picture of all sources. Everything is called in one thread, except what viser calls."""
 
     def __init__(self, server: viser.ViserServer, tabs: viser.GuiTabGroupHandle) -> None:
@@ -237,7 +237,7 @@ class Scene:
             server, tabs.add_tab("Scene"), lambda client: self._fitted.discard(client.client_id)
         )
 
-    def update(self, sources: list[LiveSource], clients: dict[int, viser.ClientHandle]) -> None:
+    def update(self, sources: list[DisplayedSource], clients: dict[int, viser.ClientHandle]) -> None:
         """Show the newest data of the sources to the browsers."""
         now_s = time.monotonic()
         for source in sources:

@@ -13,7 +13,7 @@ from gateway.rtc3d.components import WIRE_ORDER
 from gateway.runtime.losses import counts_text
 from gateway.runtime.safe_text import safe_text
 from gateway.session.status import FRAME_REJECTED, NOT_SENT, SKIPPED
-from gateway.tools.display.live import LiveComponent, LiveData, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveComponent, LiveData
 from gateway.tools.display.statistics import Percentiles, visible_percent
 
 NONE: Final = "–"
@@ -96,7 +96,7 @@ def event_time_text(utime: int) -> str:
     return text if text == NONE else f"{text}.{utime % 1_000_000 // 1000:03d}"
 
 
-def data_state(source: LiveSource) -> State:
+def data_state(source: DisplayedSource) -> State:
     """Return whether data come now: "live", "no analog for 0.7 s", "no data for 12 s"."""
     age_s = source.age_s
     if age_s is None:
@@ -115,7 +115,7 @@ def data_state(source: LiveSource) -> State:
     return State(Level.BAD, ", ".join(texts))
 
 
-def gateway_states(source: LiveSource) -> list[State]:
+def gateway_states(source: DisplayedSource) -> list[State]:
     """Return what the gateway says about each of its streams, in the words of its status line.
 
     If it says the same about all, that is one state. If the gateway is not heard, that is the state.
@@ -134,7 +134,7 @@ _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
 """A median latency between computers outside of these says that their clocks differ."""
 
 
-def source_html(source: LiveSource, *, is_take: bool, is_paused: bool = False) -> str:
+def source_html(source: DisplayedSource, *, is_take: bool, is_paused: bool = False) -> str:
     """Return everything about a source but its markers, tools and events.
 
     A take has no gateway now, so its latency to here is left out, and if it ``is_paused``, it has no rate.
@@ -202,7 +202,7 @@ def _clock_warning(components: Mapping[str, LiveComponent]) -> str:
     return ""
 
 
-def _origin(source: LiveSource) -> Iterator[str]:
+def _origin(source: DisplayedSource) -> Iterator[str]:
     """Say where the data come from, and whether the gateway records them."""
     report = source.report
     if report is None:
@@ -220,7 +220,7 @@ _NOTE: Final = (
 )
 
 
-def _losses_html(source: LiveSource, components: Mapping[str, LiveComponent]) -> str:
+def _losses_html(source: DisplayedSource, components: Mapping[str, LiveComponent]) -> str:
     """Return what is lost, by component and place, and the causes."""
     report, figures = source.report, {}
     for key, component in components.items():
@@ -260,7 +260,7 @@ def _dropped(report: SourceReport | None, key: str, *causes: str) -> int:
     )
 
 
-def _causes(source: LiveSource, components: Mapping[str, LiveComponent]) -> Iterator[tuple[Level, str]]:
+def _causes(source: DisplayedSource, components: Mapping[str, LiveComponent]) -> Iterator[tuple[Level, str]]:
     """Say why something is lost, skipped or wrong anywhere."""
     for key, component in components.items():
         check = source.series_by_key[key].check
@@ -327,7 +327,7 @@ _LEGEND: Final = (
 )
 
 
-def items_html(source: LiveSource) -> str:
+def items_html(source: DisplayedSource) -> str:
     """Return the markers and tools of a source with their visibility over the last seconds."""
     tables = [
         _visibility_html(source.components[key], noun)
@@ -370,7 +370,7 @@ def _visibility_html(component: LiveComponent, noun: str) -> str:
     return f"{table(headings, rows)}<p class=dim>{counted(num_hidden, f'more {noun}')}, {how}</p>"
 
 
-def events_html(source: LiveSource) -> str:
+def events_html(source: DisplayedSource) -> str:
     """Return the newest events of a source, the newest one first."""
     rows = []
     for event in reversed([*source.events]):

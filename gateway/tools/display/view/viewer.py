@@ -25,7 +25,7 @@ from gateway.runtime.safe_text import quoted, safe_text
 from gateway.takes.files.reader import TakeReader
 from gateway.tools.display.live import LiveData
 from gateway.tools.display.view.panel import Panel, set_theme
-from gateway.tools.display.view.scene import Scene
+from gateway.tools.display.view.scene import ViewScene
 from gateway.tools.replay.play_list import Selection, take_length_us
 from gateway.tools.replay.player import Player
 from gateway.tools.replay.timeline import time_text
@@ -280,7 +280,7 @@ class Viewer:
             playback.add_controls(server.gui)
         tabs = server.gui.add_tab_group()
         self.panel = Panel(server, tabs, live, is_take=playback is not None)
-        self.scene = Scene(server, tabs)
+        self.scene = ViewScene(server, tabs)
         self.num_defects = 0
         """How many pictures were not complete, because of a defect in this program."""
 

@@ -21,7 +21,7 @@ from gateway.messages.encode import Stamp
 from gateway.messages.host_time import HostClock, host_clock
 from gateway.rtc3d.client_protocol import ProtocolState
 from gateway.rtc3d.components import ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.runtime.failures import DefectLog
 from gateway.session.state import StreamState
 from tests.support.configurations import make_settings
@@ -70,7 +70,7 @@ class Lab:
         return {labels[label]: value for labels, value in self.samples(name) if wanted <= labels.items()}
 
 
-def analog_frame() -> Frame:
+def analog_frame() -> RawFrame:
     """Return a frame with one analog component of three channels."""
     analog = encode_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
     return split_frame(encode_frame([analog]), "big")

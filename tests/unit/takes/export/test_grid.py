@@ -8,7 +8,7 @@ import pytest
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.takes import open_take
 from gateway.takes.export.grid import Grid, place
-from gateway.takes.export.measurements import Measurement
+from gateway.takes.export.measurements import ExportedMeasurement
 from gateway.takes.files import spool
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import TakeSource
@@ -151,7 +151,7 @@ def test_the_rate_of_capture_is_the_slope_through_all_frames(
     monkeypatch.setattr(spool, "_PIECE_ROWS", 7)
     found = series(tmp_path, [(n, 10_010 * n) for n in range(100) if n % 9])
     [placed] = place(found)
-    measurement = Measurement(TakeSource("lab"), {}, found, placed)
+    measurement = ExportedMeasurement(TakeSource("lab"), {}, found, placed)
     slope_us = np.polyfit(placed.rows, found.capture_utime - START_UTIME, 1)[0]
     assert measurement.captured_rate_hz == pytest.approx(1e6 / slope_us, rel=1e-9)
     assert 99 < 1e6 / slope_us < 101

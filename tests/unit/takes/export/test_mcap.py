@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
-from gateway.messages.foxglove.topics import Topic, TopicMessages
+from gateway.messages.foxglove.topics import FoxgloveTopic, TopicMessages
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import (
@@ -400,7 +400,7 @@ def test_without_foxglove_sdk_the_error_has_a_remedy(tmp_path: Path, monkeypatch
 
 
 def test_a_full_disk_is_its_own_error_whatever_is_written() -> None:
-    topic = Topic("/lab/test", "json", "test", "jsonschema", b"{}")
+    topic = FoxgloveTopic("/lab/test", "json", "test", "jsonschema", b"{}")
     messages = TopicMessages(topic, [START_UTIME], [os.urandom(2_000_000)])
     entry = ParametersEntry(START_UTIME, 1, Parameters(), bytes(2_000_000))
 

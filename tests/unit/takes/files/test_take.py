@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rtc3d
 
-from gateway.client.transport import Reply
+from gateway.client.transport import QueryReply
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.decode import decode
 from gateway.rtc3d.components import ComponentType
@@ -385,7 +385,7 @@ def test_summaries_are_short(tmp_path: Path) -> None:
         source.parameters[0],
         source.markers,
         content,
-        Reply("lab", (), bytes(10_000)),
+        QueryReply("lab", (), bytes(10_000)),
     ):
         assert len(repr(each)) < 100
     assert "lab" in repr(take)

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.sources import FINGERPRINTS, Series
+from gateway.client.sources import FINGERPRINTS, ReceivedSeries
 from gateway.messages.encode import PREFIX
 from gateway.messages.topics import lcm_channel
 from gateway.tools.cli import echo_complete
@@ -43,7 +43,7 @@ class Gateway:
         assert messages.refill is not None
         return Mock(close=messages.refill.close)
 
-    def answer(self, _series: Series, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
+    def answer(self, _series: ReceivedSeries, request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
         first = int(request.options["from"])
         last = min(int(request.options.get("to", self._newest)), first + ANSWER_MESSAGES, self._newest)
         found = [self.history[number] for number in range(first, last + 1) if number in self.history]

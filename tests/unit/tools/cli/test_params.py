@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from gateway.client.transport import Reply
+from gateway.client.transport import QueryReply
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.tools.cli.params import OutputFormat, write_replies
@@ -16,11 +16,11 @@ from tests.support.parameters import ALL, in_root, spec_body, spec_xml
 EVERYTHING = in_root(*(spec_body(section).decode() for section in ("general", "3d", "6d", "analog")))
 
 
-def reply(source: str, sections: tuple[str, ...], xml: bytes, age_s: float | None = 0.0) -> Reply:
-    return Reply(source, sections, xml, {"age_s": age_s})
+def reply(source: str, sections: tuple[str, ...], xml: bytes, age_s: float | None = 0.0) -> QueryReply:
+    return QueryReply(source, sections, xml, {"age_s": age_s})
 
 
-def written(output_format: OutputFormat, *replies: Reply) -> tuple[str, list[tuple[str, str]]]:
+def written(output_format: OutputFormat, *replies: QueryReply) -> tuple[str, list[tuple[str, str]]]:
     """Return the text written, and code and text of each problem."""
     buffer = io.BytesIO()
     out = io.TextIOWrapper(buffer, encoding="utf-8", write_through=True)

@@ -10,7 +10,7 @@ import rtc3d
 
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
-from gateway.tools.display.live import LiveData, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveData
 from tests.support.takes import frame, parameters
 
 NAN = float("nan")
@@ -26,7 +26,7 @@ class Lab:
         self._sequences: dict[ComponentType, int] = {}
 
     @property
-    def source(self) -> LiveSource:
+    def source(self) -> DisplayedSource:
         """The source, with everything that was sent."""
         return next(source for source in self.live.update() if source.name == self.name)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from gateway.client import queued_reception
-from gateway.client.queued_reception import Arrival, DescribedSource, QueuedSeries
+from gateway.client.queued_reception import DescribedSource, QueuedMessage, QueuedSeries
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
 from gateway.tools.display.live import NUM_EVENTS, LiveComponent, LiveData
@@ -110,7 +110,7 @@ def test_a_message_of_the_wrong_length_is_counted() -> None:
     component = LiveComponent(MARKERS)
     _, whole = frame(MARKERS, [ONE])
     series = QueuedSeries(DescribedSource("lab", "MOCAP_LAB"), "3d", "MOCAP_LAB_3D")
-    component.update([Arrival(series, each, 0, 0) for each in (whole, whole[:-1], whole[:45])], None)
+    component.update([QueuedMessage(series, each, 0, 0) for each in (whole, whole[:-1], whole[:45])], None)
     assert component.num_malformed == 2
     assert component.newest_items["x"].tolist() == [1]
 

@@ -10,12 +10,12 @@ import pytest
 from gateway.client.history_requests import Completeness, HistoryAnswer, HistoryRequest
 from gateway.client.queued_reception import QueuedSeries
 from gateway.client.refill import KeptSeries
-from gateway.client.sources import Source
+from gateway.client.sources import ReceivedSource
 from gateway.errors import QueryError
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
 from gateway.tools.display import live as live_module
-from gateway.tools.display.live import LiveSource
+from gateway.tools.display.live import DisplayedSource
 from tests.support.takes import frame
 from tests.support.waiting import wait_until
 from tests.unit.tools.display.live_lab import MISSING, Lab
@@ -57,7 +57,7 @@ class PastLab(Lab):
         self.newest["3d"] = NUM_MARKERS
         self.send(ComponentType.MARKERS, [MISSING], sequence=NUM_MARKERS, utime=self.begin_utime)
 
-    def wait_for_past(self) -> LiveSource:
+    def wait_for_past(self) -> DisplayedSource:
         """Return the source after everything of the past has come."""
         self.may_answer.set()
         wait_until(lambda: not any(series.is_past for series in self.live.all_series))
@@ -70,7 +70,7 @@ class PastLab(Lab):
         last = min(first + 299, len(messages) - 1)
         return HistoryAnswer(messages[first : last + 1], first, last, self.newest[series.key])
 
-    def _find(self, source: Source, _last_s: float, _timeout_s: float) -> list[Any]:
+    def _find(self, source: ReceivedSource, _last_s: float, _timeout_s: float) -> list[Any]:
         if self.failures:
             raise QueryError("no answer", code=self.failures.popleft())
         found: Any = source

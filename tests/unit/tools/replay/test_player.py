@@ -16,7 +16,7 @@ from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from gateway.takes.files.reader import TakeReader
 from gateway.tools.replay.play_list import Selection
 from gateway.tools.replay.player import Player
-from gateway.tools.replay.publication import MAX_TOPICS, Publication, Refusal
+from gateway.tools.replay.publication import MAX_TOPICS, Publication, PublicationRefusal
 from gateway.tools.replay.replay import playing
 from tests.support.takes import (
     START_UTIME,
@@ -162,7 +162,7 @@ async def test_what_an_output_refuses_is_counted_and_the_other_gets_it(replayed:
     broken.error = OutputError("full; empty it", cause="queue full")
     replayed.outputs = (broken, replayed.output)
     assert await replayed.play(messages) == keyed(messages)
-    refusals = {Refusal(key, "broken", "queue full"): 20 for key in ("3d", "analog")}
+    refusals = {PublicationRefusal(key, "broken", "queue full"): 20 for key in ("3d", "analog")}
     assert replayed.publication.refusals == refusals
     replayed.output.error = ZeroDivisionError()  # a defect
     with pytest.raises(ZeroDivisionError):

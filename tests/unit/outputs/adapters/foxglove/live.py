@@ -14,7 +14,7 @@ from gateway.outputs.adapters.foxglove.settings import FoxgloveSettings
 from gateway.outputs.contract import ServerParameters
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ByteOrder, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog, Plate, Point
 from tests.support.foxglove_viewer import Viewer, viewing
 from tests.support.networks import free_port
@@ -43,7 +43,7 @@ ITEMS: Final[Mapping[ComponentType, list[Any]]] = {
 
 def frame_of(
     items: Mapping[ComponentType, Iterable[Any]], order: ByteOrder = "big", timestamp_us: int = 0
-) -> Frame:
+) -> RawFrame:
     """Return a frame with these components."""
     encoded = [
         encode_component(kind, 1, timestamp_us, np.array(list(each), ITEM_DTYPES[kind]), order)
@@ -73,7 +73,7 @@ class LiveSource:
         described = ServerParameters(b"<xml/>", 1, version, parsed=parsed, frame=frame)
         self.output.publish_parameters(self.name, described)
 
-    def publish(self, frame: Frame, utime: int = UTIME) -> None:
+    def publish(self, frame: RawFrame, utime: int = UTIME) -> None:
         self.fan_out.publish(frame, Stamp(utime, utime, 1, 1), frozenset(WIRE_ORDER))
 
     def publish_items(
@@ -81,7 +81,7 @@ class LiveSource:
     ) -> None:
         self.publish(frame_of({kind: ITEMS[kind] if items is None else items}), utime)
 
-    async def publish_until(self, frame: Frame, condition: Callable[[], _Result]) -> _Result:
+    async def publish_until(self, frame: RawFrame, condition: Callable[[], _Result]) -> _Result:
         """Publish a frame again and again until a condition holds; return its result."""
 
         def is_true() -> bool:

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import QueryError
-from gateway.messages.foxglove.topics import Topic
+from gateway.messages.foxglove.topics import FoxgloveTopic
 from gateway.outputs.adapters.foxglove import connections
 from gateway.outputs.adapters.foxglove.connections import (
     ERROR,
     LIMITS,
     WARNING,
-    Subscription,
-    Viewer,
+    FoxgloveSubscription,
+    FoxgloveViewer,
     advertise,
     channel_text,
     message_data,
@@ -36,8 +36,8 @@ def test_message_data_is_opcode_subscription_and_nanoseconds_little_endian() -> 
 
 def test_messages_of_the_server() -> None:
     """Binary schemas are advertised as Base64, and JSON schemas as text."""
-    cloud = Topic("/lab/markers", "protobuf", "foxglove.PointCloud", "protobuf", b"\x00\xff\x10")
-    text = Topic('/lab/"parameters"', "json", "rtc3d.Parameters", "jsonschema", b'{"type": "object"}')
+    cloud = FoxgloveTopic("/lab/markers", "protobuf", "foxglove.PointCloud", "protobuf", b"\x00\xff\x10")
+    text = FoxgloveTopic('/lab/"parameters"', "json", "rtc3d.Parameters", "jsonschema", b'{"type": "object"}')
     keys = ("id", "topic", "encoding", "schemaName", "schemaEncoding", "schema")
     first = (1, "/lab/markers", "protobuf", "foxglove.PointCloud", "protobuf", "AP8Q")
     second = (2, '/lab/"parameters"', "json", "rtc3d.Parameters", "jsonschema", '{"type": "object"}')
@@ -62,7 +62,7 @@ def test_requests_of_viewers() -> None:
     subscribe = (
         '{"op":"subscribe","subscriptions":[{"id":0,"channelId":3.0},{"id":4294967295,"channelId":5,"x":1}]}'
     )
-    assert parse_request(subscribe) == ([Subscription(0, 3), Subscription(4294967295, 5)], [])
+    assert parse_request(subscribe) == ([FoxgloveSubscription(0, 3), FoxgloveSubscription(4294967295, 5)], [])
     assert parse_request('{"op":"unsubscribe","subscriptionIds":[1, 2]}') == ([], [1, 2])
 
 
@@ -111,7 +111,7 @@ def test_a_viewer_is_disconnected_after_one_long_stall_and_not_after_many_short_
         for wait_s, is_full in steps:
             now_s += wait_s
             viewer._waiting_bytes = 11 if is_full else 10
-            assert Viewer.send_message(viewer, 1, 0, b"") is not is_full
+            assert FoxgloveViewer.send_message(viewer, 1, 0, b"") is not is_full
             if not is_full:
                 stalled_s = None
             elif stalled_s is None:

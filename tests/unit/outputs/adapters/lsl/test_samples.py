@@ -14,9 +14,9 @@ from gateway.messages.host_time import HostClock, now_steady_us
 from gateway.outputs.adapters.lsl.output import CaptureTimes, SuspendedTime
 from gateway.outputs.adapters.lsl.process import (
     Kind,
+    LslReport,
     Message,
     MessageReader,
-    Report,
     decode_samples,
     opening_content,
     samples_content,
@@ -151,9 +151,9 @@ def test_samples_keep_times_and_values_and_reports_are_lines() -> None:
     times, found = decode_samples(samples_content([100.000001, 100.000002], values))
     assert times.tolist() == [100.000001, 100.000002]
     assert np.array_equal(found, values, equal_nan=True)
-    report = Report("118", (1, 2), "lab_3d: a\nproblem", "why")
+    report = LslReport("118", (1, 2), "lab_3d: a\nproblem", "why")
     line = report.encode()
-    assert (line.count(b"\n"), Report.decode(line)) == (1, report)
+    assert (line.count(b"\n"), LslReport.decode(line)) == (1, report)
 
 
 def test_trees_are_json() -> None:

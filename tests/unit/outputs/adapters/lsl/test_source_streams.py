@@ -12,7 +12,7 @@ from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
 from gateway.outputs.adapters.lsl.output import MAX_WAITING, LslFramePublisher
-from gateway.outputs.adapters.lsl.process import Kind, Message, Report, decode_samples
+from gateway.outputs.adapters.lsl.process import Kind, LslReport, Message, decode_samples
 from gateway.outputs.adapters.lsl.settings import LslSettings
 from gateway.outputs.adapters.lsl.source_streams import MAX_BUFFER_BYTES, CapturedFrame, SourceStreams
 from gateway.outputs.adapters.lsl.streams import lsl_stream
@@ -27,7 +27,7 @@ from gateway.rtc3d.components import (
     ComponentType,
     encode_component,
 )
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -102,7 +102,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Streams:
     return Streams(monkeypatch)
 
 
-def frame_of(*components: bytes, order: ByteOrder = "big") -> Frame:
+def frame_of(*components: bytes, order: ByteOrder = "big") -> RawFrame:
     return split_frame(encode_frame(components, order), order)
 
 
@@ -350,7 +350,7 @@ class Publisher(Streams):
     def receive(self, *components: ComponentType) -> None:
         """Have a receiver of the streams of these components, and of no others."""
         wanted = tuple(self.streams.numbers[each] for each in components)
-        self.processes._take(Report(ready="118", wanted=wanted))
+        self.processes._take(LslReport(ready="118", wanted=wanted))
 
     def prepare(self, *components: bytes) -> bool:
         is_wanted = self.publisher.prepare(frame_of(*components).layout, ALL)
@@ -396,7 +396,7 @@ def test_frames_of_received_streams_are_refused_until_the_next_process_is_ready(
     publisher.prepare(markers(3))
     publisher.receive(MARKERS)
     publisher.publish(markers(3))
-    publisher.processes._report = Report()
+    publisher.processes._report = LslReport()
     assert publisher.prepare(markers(3))
     with pytest.raises(OutputError, match="LSL: ") as refused:
         publisher.publish(markers(3))

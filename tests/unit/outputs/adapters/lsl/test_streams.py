@@ -13,7 +13,7 @@ from gateway.outputs.adapters.lsl.settings import LslSettings
 from gateway.outputs.adapters.lsl.streams import (
     CHANNELS_PER_ITEM,
     MAX_RATE_HZ,
-    DescribedSource,
+    LslSource,
     LslStream,
     changed_labels,
     lsl_stream,
@@ -62,7 +62,7 @@ def stream_of(
     frame: CoordinateFrame = FRAME,
     computer: str = "lab-pc",
 ) -> LslStream:
-    return lsl_stream(DescribedSource("lab", computer, parameters, frame), component, num_items)
+    return lsl_stream(LslSource("lab", computer, parameters, frame), component, num_items)
 
 
 def positions(name: str) -> list[tuple[str, str, str]]:
@@ -148,7 +148,7 @@ def test_labels_are_printable_unique_and_short() -> None:
 
 def test_labels_that_a_stream_cannot_use_are_known() -> None:
     tools = Parameters6D(50.0, tuple(Tool("1", label) for label in ("Wand", "Wand", "a\x00b", "Probe")))
-    source = DescribedSource("lab", "lab-pc", Parameters(tools=tools), FRAME)
+    source = LslSource("lab", "lab-pc", Parameters(tools=tools), FRAME)
     assert changed_labels(source, ComponentType.TOOLS, 4) == {"Wand": "Wand_2", "a\x00b": "a_b"}
     assert changed_labels(source, ComponentType.EVENT, 1) == {}
 

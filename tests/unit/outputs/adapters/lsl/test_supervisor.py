@@ -20,7 +20,7 @@ from gateway.errors import ConfigError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.adapters.lsl import supervisor
 from gateway.outputs.adapters.lsl.output import LslOutput
-from gateway.outputs.adapters.lsl.process import Kind, Message, MessageReader, Report
+from gateway.outputs.adapters.lsl.process import Kind, LslReport, Message, MessageReader
 from gateway.outputs.adapters.lsl.settings import LslSettings
 from gateway.outputs.adapters.lsl.supervisor import LslProcesses
 from gateway.outputs.contract import ServerParameters
@@ -296,7 +296,7 @@ def test_each_change_of_what_is_received_is_reported_once(monkeypatch: pytest.Mo
     lab.processes.restart()
     assert not lab.processes.is_due  # there is one
     for wanted, failed in (((1,), ""), ((1,), "x"), ((1, 2), "x"), ((), "x"), ((3,), "")):
-        report = Report(ready="116", wanted=wanted, not_opened=failed)
+        report = LslReport(ready="116", wanted=wanted, not_opened=failed)
         lab.theirs.sendall(report.encode())
         wait_until(lambda report=report: lab.processes._report == report)  # type: ignore[misc]
     assert lab.changes == [{1}, {1, 2}, set(), {3}]

@@ -15,7 +15,7 @@ from gateway.outputs.adapters.ros2.topic import RosTopic
 from gateway.outputs.contract import OutputHealth, ServerParameters
 from gateway.outputs.zenoh.confirmation import SentMessages
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import RawFrame
 from gateway.runtime.losses import Losses
 from tests.support import ros_messages as ros
 from tests.support.ros_lab import ALL, stamp
@@ -166,10 +166,10 @@ class Source:
             if not names or topic.name in names:
                 topic._on_matching(is_there)
 
-    def offer(self, frame: Frame, components: frozenset[ComponentType] = ALL) -> None:
+    def offer(self, frame: RawFrame, components: frozenset[ComponentType] = ALL) -> None:
         self.publisher.publish(frame, stamp(), components)
 
-    def send(self, frame: Frame, components: frozenset[ComponentType] = ALL) -> None:
+    def send(self, frame: RawFrame, components: frozenset[ComponentType] = ALL) -> None:
         self.offer(frame, components)
         self.sender.run()
 

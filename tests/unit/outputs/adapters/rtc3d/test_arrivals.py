@@ -7,7 +7,13 @@ from typing import Any
 
 import pytest
 
-from gateway.outputs.adapters.rtc3d.arrivals import Arrival, Arrivals, Kept, StreamRate, encode_joined
+from gateway.outputs.adapters.rtc3d.arrivals import (
+    ArrivedFrame,
+    Kept,
+    NewestFrames,
+    StreamRate,
+    encode_joined,
+)
 from gateway.outputs.adapters.rtc3d.live_frames import KEPT_EVENTS, LiveFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
@@ -34,14 +40,14 @@ class Source:
     def __init__(
         self, requested: Kinds = BOTH, *, is_new: bool = False, played: int = 0, **announced_hz: Any
     ) -> None:
-        self.arrivals = Arrivals()
+        self.arrivals = NewestFrames()
         if not is_new:
             self.arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
         rates_hz = {ComponentType[name]: rate_hz for name, rate_hz in announced_hz.items()}
         self.frames = LiveFrames(requested, self.arrivals, rates_hz)
         self.play(played)
 
-    def add(self, at_us: int, *components: bytes, stream: int = SLOW) -> Arrival:
+    def add(self, at_us: int, *components: bytes, stream: int = SLOW) -> ArrivedFrame:
         arrival = self.arrivals.add(
             split_frame(body(*components), "big"), stream, frozenset(WIRE_ORDER), at_us
         )

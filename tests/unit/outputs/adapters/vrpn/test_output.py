@@ -19,7 +19,7 @@ from gateway.outputs.adapters.vrpn.settings import VrpnSettings
 from gateway.outputs.adapters.vrpn.trackers import Trackers
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import ITEM_DTYPES, ByteOrder, ComponentType, encode_component
-from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from gateway.runtime.losses import Losses
 from tests.support.errors import names
@@ -37,7 +37,7 @@ def parameters(*labels: str, unit_m: float | None = 1e-3) -> ServerParameters:
     return ServerParameters(b"", 1, 1, parsed=parsed, frame=CoordinateFrame("lab", unit_m))
 
 
-def frame(*components: Sequence[float], order: ByteOrder = "big") -> Frame:
+def frame(*components: Sequence[float], order: ByteOrder = "big") -> RawFrame:
     """Return a frame with one component of tools for each list of positions in mm."""
     arrays = [
         np.array([(1.0, 0.0, 0.0, 0.0, x, 0.0, 0.0, 0.0) for x in xs], ITEM_DTYPES[ComponentType.TOOLS])
@@ -91,7 +91,7 @@ class Lab:
         while self.calls:
             self.calls.pop(0)[0]()
 
-    def offer(self, frame: Frame) -> None:
+    def offer(self, frame: RawFrame) -> None:
         self.publisher.publish(frame, STAMP, TOOLS)
 
     def send(self, *components: Sequence[float], order: ByteOrder = "big") -> None:

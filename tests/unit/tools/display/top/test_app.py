@@ -7,10 +7,10 @@ from gateway.tools.display.terminal import Line, Style
 from gateway.tools.display.top.app import Display
 from gateway.tools.display.top.pages import PAGES
 from gateway.tools.display.top.table import (
-    Column,
     Order,
-    Section,
-    Table,
+    TopColumn,
+    TopSection,
+    TopTable,
     filtered,
     laid_out,
     number_cell,
@@ -21,19 +21,19 @@ from gateway.tools.display.top.table import (
 from tests.support.statuses import stream
 from tests.unit.tools.display.live_lab import Lab
 
-COLUMNS = (Column("marker"), Column("%", is_number=True), Column("unit", rank=1))
+COLUMNS = (TopColumn("marker"), TopColumn("%", is_number=True), TopColumn("unit", rank=1))
 
 
-def table(*rows: tuple[str, float | None]) -> Table:
+def table(*rows: tuple[str, float | None]) -> TopTable:
     cells = [(text_cell(name), number_cell(value, 1), text_cell("mm")) for name, value in rows]
-    return Table(COLUMNS, [Section(cells, [("lab: streaming", Style.GOOD)])], "nothing")
+    return TopTable(COLUMNS, [TopSection(cells, [("lab: streaming", Style.GOOD)])], "nothing")
 
 
 def texts(lines: list[Line]) -> list[str]:
     return ["".join(text for text, _ in line) for line in lines]
 
 
-def names(found: Table) -> list[str]:
+def names(found: TopTable) -> list[str]:
     return [row[0].text for section in found.sections for row in section.rows]
 
 

@@ -6,14 +6,14 @@ import time
 import pytest
 
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.sources import Series
+from gateway.client.sources import ReceivedSeries
 from gateway.errors import QueryError
 from gateway.messages.decode import json_text
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
-from gateway.tools.display.live import LiveData, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveData
 from gateway.tools.display.top import facts
-from gateway.tools.display.top.pages import PAGES, TWO_GATEWAYS, Page, event_time
+from gateway.tools.display.top.pages import PAGES, TWO_GATEWAYS, TopPage, event_time
 from gateway.tools.display.top.table import laid_out, sorted_by
 from tests.support.statuses import count, loss, output, stream
 from tests.support.takes import frame
@@ -21,7 +21,7 @@ from tests.support.waiting import wait_until
 from tests.unit.tools.display.live_lab import Lab
 
 
-def shown(page: str, *sources: LiveSource) -> list[str]:
+def shown(page: str, *sources: DisplayedSource) -> list[str]:
     table = next(each for each in PAGES if each.name == page).table(sources)
     lines = laid_out(sorted_by(table, table.order), 200, table.order)
     return [" ".join("".join(text for text, _ in line).split()) for line in (lines.titles, *lines.body)]
@@ -61,7 +61,7 @@ def test_what_was_refilled_and_what_stays_lost() -> None:
     """It says whether a recording on this computer would be complete."""
     lab = Lab()
 
-    def ask(series: Series, _request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
+    def ask(series: ReceivedSeries, _request: HistoryRequest, _timeout_s: float) -> HistoryAnswer:
         if series.key != "3d":
             raise QueryError("the gateway keeps no such messages", code="disabled")
         kept = [frame(ComponentType.MARKERS, [(1, 2, 3, 0.1)], number)[1] for number in (7, 8)]
@@ -134,7 +134,7 @@ def test_events_have_a_time_and_the_newest_one_comes_first() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_hostile_texts_keep_every_line_printable(page: Page) -> None:
+def test_hostile_texts_keep_every_line_printable(page: TopPage) -> None:
     lab = Lab(name="lab")
     hostile = "\x1b]0;title\x07\u202e\u0301" + "漢" * 3000
     lab.send_labels("\u202eRASI", "漢" * 400, "e\u0301" * 100)

@@ -6,8 +6,8 @@ import time
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from gateway.tools.display.live import LiveSource
-from gateway.tools.display.view.plots import MAX_CHOICES, Channel, choices, samples
+from gateway.tools.display.live import DisplayedSource
+from gateway.tools.display.view.plots import MAX_CHOICES, PlotChannel, choices, samples
 from gateway.tools.display.view.texts import MAX_ROWS, events_html, items_html
 from tests.support.takes import START_UTIME
 from tests.unit.tools.display.live_lab import NAN, Lab, text_of, wait
@@ -90,7 +90,7 @@ ANALOG = """<Analog><Channels>2</Channels><Channel><Label>EMG</Label><Unit>V</Un
 <Channel><Label>Sync</Label></Channel></Analog>"""
 
 
-def values(source: LiveSource, channel: Channel) -> list[tuple[list[int], list[float]]]:
+def values(source: DisplayedSource, channel: PlotChannel) -> list[tuple[list[int], list[float]]]:
     found = samples(channel, source.components[channel.key].batch)
     return [(utimes.tolist(), values.tolist()) for utimes, values in found]
 
@@ -101,7 +101,7 @@ def test_channels_have_names_and_units(lab: Lab) -> None:
     lab.send_parameters(ANALOG)
     found = choices([lab.source])
     assert [*found][:3] == ["lab analog 1: EMG (V)", "lab analog 2: Sync (mV)", "lab force 1: plate 1 Fx"]
-    assert [*found.values()][2] == Channel("lab", "force", 0, "fx")
+    assert [*found.values()][2] == PlotChannel("lab", "force", 0, "fx")
     assert len(found) == 2 + 6
 
 
@@ -117,6 +117,6 @@ def test_samples_of_a_force_plate_and_while_the_number_of_channels_changes(lab: 
     for number in range(4):
         lab.send(ComponentType.ANALOG, [number] * (1 + number % 3), utime=START_UTIME + 2000 + number)
     source = lab.source
-    assert values(source, Channel("lab", "force", 1, "mx")) == [([START_UTIME], [10])]
-    channel = Channel("lab", "analog", 1, "")
+    assert values(source, PlotChannel("lab", "force", 1, "mx")) == [([START_UTIME], [10])]
+    channel = PlotChannel("lab", "analog", 1, "")
     assert values(source, channel) == [([START_UTIME + 1], [1]), ([START_UTIME + 2], [2])]

@@ -11,7 +11,7 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
 from gateway.tools.display.live import LiveComponent
-from gateway.tools.display.view.scene import Scene, Sphere
+from gateway.tools.display.view.scene import Sphere, ViewScene
 from gateway.tools.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
 from gateway.tools.display.view.viewer import ViewServer
 from tests.support.takes import parameters
@@ -33,7 +33,7 @@ class Picture:
         self._server = server
         self.now_s = time.monotonic()
         monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
-        self.scene = Scene(server, server.gui.add_tab_group())
+        self.scene = ViewScene(server, server.gui.add_tab_group())
         self.labs: list[Lab] = []
 
     def lab(self, name: str = "lab") -> Lab:

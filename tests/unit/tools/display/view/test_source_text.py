@@ -10,7 +10,7 @@ import rtc3d
 from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
-from gateway.tools.display.live import LiveComponent, LiveSource
+from gateway.tools.display.live import DisplayedSource, LiveComponent
 from gateway.tools.display.view.panel import MAX_SOURCES, banner_html
 from gateway.tools.display.view.texts import clock_text, data_state, gateway_states, ignored_html, source_html
 from tests.support.statuses import loss, output, stream
@@ -283,7 +283,7 @@ def test_a_take_that_is_paused_has_no_rate_and_goes_on_as_before(
 
 
 def test_many_sources_with_hostile_names() -> None:
-    sources = [LiveSource("<img src=x>" + "y" * 1000, "MOCAP_X") for _ in range(64)]
+    sources = [DisplayedSource("<img src=x>" + "y" * 1000, "MOCAP_X") for _ in range(64)]
     html = banner_html(sources, time.time())
     assert "<img" not in html
     assert html.count("&lt;img") == MAX_SOURCES
