@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Final
 
 import rtc3d
+from typing_extensions import override
 
 from gateway.client.history_requests import (
     BUSY_CODES,
@@ -64,8 +65,8 @@ class LcmTransport(Transport):
 
     # Finding sources.
 
+    @override
     def find(self, wanted: str | None) -> FoundSources:
-        """See Transport."""
         with self._hear(wanted) as found:
             _wait_for_all(found)
         if not found.heard:
@@ -106,8 +107,9 @@ class LcmTransport(Transport):
 
     # Queries.
 
+    @override
     def ask(self, query: Query, source: str | None, timeout_s: float) -> QueryReplies[list[QueryReply]]:
-        """See Transport. It repeats requests: they and their replies can get lost."""
+        """It repeats requests: they and their replies can get lost."""
         replies: QueryReplies[list[QueryReply]] = QueryReplies([], [])
         with self._hear(source) as found:
             if source is None:
@@ -164,6 +166,7 @@ class LcmTransport(Transport):
 
     # Subscribing.
 
+    @override
     def subscribe(
         self,
         sources: Collection[str],
@@ -171,15 +174,14 @@ class LcmTransport(Transport):
         reception: Reception[Any, Any],
         completeness: Completeness = INCOMPLETE,
     ) -> "LcmGatewaySubscriber":
-        """See Transport."""
         return LcmGatewaySubscriber(
             *(self._url, self._prefix, sources, components, reception, completeness),
             requester=self._requester,
             refill=LcmRefill(self._queries_url, self._prefix, self._requester),
         )
 
+    @override
     def close(self) -> None:
-        """See Transport."""
         self._requester.close()
 
 
@@ -276,8 +278,9 @@ class LcmGatewaySubscriber(GatewaySubscriber):
             source.has_known_name = True
         return source, key, address
 
-    def _take(self, series: ReceivedSeries, message: bytes, sample: Any) -> None:  # noqa: ARG002 - overrides
-        """See GatewaySubscriber. The status says the name of a source: channels have only capital letters."""
+    @override
+    def _take(self, series: ReceivedSeries, message: bytes, sample: Any) -> None:
+        """The status says the name of a source: channels have only capital letters."""
         source = series.source
         if series.key == "parameters" and series.accepts(message):
             self._reception.receive_parameters(series, message, is_made=False)
@@ -289,10 +292,10 @@ class LcmGatewaySubscriber(GatewaySubscriber):
                 if lcm_channel(self._prefix, name) == source.channels:
                     source.name, source.has_known_name = name, True
 
+    @override
     def _ask_history(
         self, series: ReceivedSeries, request: HistoryRequest, timeout_s: float
     ) -> HistoryAnswer:
-        """See GatewaySubscriber."""
         key = self._pose_keys.get(series, series.key)
         if key.startswith(POSE) and series not in self._pose_keys:
             for each in self._history_overview(series.source, timeout_s).get("keys", ()):
@@ -300,12 +303,12 @@ class LcmGatewaySubscriber(GatewaySubscriber):
                     key = self._pose_keys[series] = each
         return self._refill.ask(series.source.channels, {"key": key, **request.options}, timeout_s)
 
+    @override
     def _history_overview(self, source: ReceivedSource, timeout_s: float) -> Mapping[str, Any]:
-        """See GatewaySubscriber."""
         return self._refill.overview(source.channels, timeout_s)
 
+    @override
     def _kept_series(self, source: ReceivedSource, key: str) -> ReceivedSeries | None:
-        """See GatewaySubscriber."""
         channel = _channel(source, key)
         is_pose = key.startswith(POSE)
         series_key = f"{POSE}{channel.rpartition(_POSE_MARK)[2]}" if is_pose else key
@@ -314,8 +317,9 @@ class LcmGatewaySubscriber(GatewaySubscriber):
             self._pose_keys[series] = key
         return series
 
+    @override
     def _query(self, source: ReceivedSource) -> None:
-        """See GatewaySubscriber. Every gateway sends its status."""
+        """Every gateway sends its status."""
 
         def take(reply: Any) -> None:
             if reply.error_code in BUSY_CODES:
@@ -330,9 +334,8 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         if not source.has_answer:
             self._send(source, self._requester.prepare(rtc3d.parameters_request_t(), take))
 
+    @override
     def query_takes(self, source: ReceivedSource) -> None:
-        """See GatewaySubscriber."""
-
         def take(reply: Any) -> None:
             newest = self._take_requests[source.channels].request_id
             if not reply.error and reply.request_id == newest:
@@ -349,8 +352,8 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         except OSError as error:
             logger.debug("asking %s: %s", source.name, error)
 
+    @override
     def silence(self) -> str:
-        """See GatewaySubscriber."""
         return no_gateway_on_lcm(" ".join(self._names) or self._prefix, self._url)
 
     def _close(self) -> None:

@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
+from typing_extensions import override
+
 from gateway.client.reception import Reception
 from gateway.client.sources import ReceivedSeries, ReceivedSource
 from gateway.errors import ProtocolError
@@ -195,8 +197,9 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         return len(self._waiting) < MAX_WAITING // 2 and self._waiting_bytes < MAX_WAITING_BYTES // 2
 
     @property
+    @override
     def is_full(self) -> bool:
-        """See Reception. There is still room for what was requested."""
+        """There is still room for what was requested."""
         return len(self._waiting) >= _FULL * MAX_WAITING or self._waiting_bytes >= _FULL * MAX_WAITING_BYTES
 
     def close(self) -> None:

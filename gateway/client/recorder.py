@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
+from typing_extensions import override
+
 from gateway.client.reception import Reception
 from gateway.client.sources import ReceivedSeries, ReceivedSource
 from gateway.errors import SelectionError, TakeError
@@ -126,8 +128,9 @@ class TakeRecording(Reception[RecordedSource, RecordedSeries]):
     # Messages and answers. Any thread.
 
     @property
+    @override
     def has_room(self) -> bool:
-        """See Reception. What arrives needs the rest of the queue while the disk is slow."""
+        """What arrives needs the rest of the queue while the disk is slow."""
         return self.queued_bytes - self._early_bytes < MAX_QUEUED_BYTES // 16
 
     def _completes(self, series: RecordedSeries) -> bool:
@@ -307,22 +310,23 @@ class FileWriter(TakeWriter):
         """The size of the file."""
         return self._file.num_bytes
 
-    def log_for(self, utime: int) -> LogFile:  # noqa: ARG002 - one file for all times
-        """See TakeWriter."""
+    @override
+    def log_for(self, utime: int) -> LogFile:
         return self._file
 
+    @override
     def succeeded(self) -> None:
-        """See TakeWriter."""
         self.problem = ""
 
+    @override
     def failed(self, error: OSError) -> None:
-        """See TakeWriter. A problem counts once, however often the disk is tried."""
+        """A problem counts once, however often the disk is tried."""
         if not self.problem:
             self.num_errors += 1
         self.problem = f"{self.path} cannot be written: {error.strerror or error}"
 
+    @override
     def lose(self, messages: Messages) -> None:
-        """See TakeWriter."""
         for channel, message in messages:
             self.lost[channel] += 1
             self.lost_bytes[channel] += len(message)

@@ -11,6 +11,7 @@ from typing import Any, Final
 from urllib.parse import unquote
 
 import zenoh
+from typing_extensions import override
 
 from gateway.client.history_requests import (
     BUSY_CODES,
@@ -63,8 +64,9 @@ class ZenohTransport(Transport):
 
     # Finding sources.
 
+    @override
     def find(self, wanted: str | None) -> FoundSources:
-        """See Transport. Queries that get an error are repeated."""
+        """Queries that get an error are repeated."""
         served = self._served()
         found = FoundSources()
         found.absence = self._absence(wanted, served)
@@ -104,8 +106,9 @@ class ZenohTransport(Transport):
 
     # Queries.
 
+    @override
     def ask(self, query: Query, source: str | None, timeout_s: float) -> QueryReplies[list[QueryReply]]:
-        """See Transport. It repeats the queries that get no reply, as happens while Zenoh reconnects."""
+        """It repeats the queries that get no reply, as happens while Zenoh reconnects."""
         limits = TimeLimits(timeout_s)
         replies: QueryReplies[list[QueryReply]] = QueryReplies([], [])
         reason: QueryError | None = None
@@ -205,6 +208,7 @@ class ZenohTransport(Transport):
 
     # Subscribing.
 
+    @override
     def subscribe(
         self,
         sources: Collection[str],
@@ -212,13 +216,12 @@ class ZenohTransport(Transport):
         reception: Reception[Any, Any],
         completeness: Completeness = INCOMPLETE,
     ) -> "ZenohGatewaySubscriber":
-        """See Transport."""
         return ZenohGatewaySubscriber(
             self._session, self._prefix, sources, components, reception, completeness
         )
 
+    @override
     def close(self) -> None:
-        """See Transport."""
         self._session.close()
 
 
@@ -300,10 +303,10 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             float(age_s) if isinstance(age_s, int | float) and 0 <= age_s < 1e9 else 0.0,
         )
 
+    @override
     def _ask_history(
         self, series: ReceivedSeries, request: HistoryRequest, timeout_s: float
     ) -> HistoryAnswer:
-        """See GatewaySubscriber."""
         options = ";".join(f"{name}={value}" for name, value in request.options.items())
         selector = f"{zenoh_key(self._prefix, series.source.name)}/{series.key}?{options}"
         first: HistoryAnswer | None = None
@@ -321,8 +324,8 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
             raise QueryError(str(problem), code="zenoh") from problem
         return first
 
+    @override
     def _history_overview(self, source: ReceivedSource, timeout_s: float) -> Mapping[str, Any]:
-        """See GatewaySubscriber."""
         sample = self._first_reply(zenoh_key(self._prefix, source.name, "history"), timeout_s)
         overview = None
         if len(sample.payload) <= MAX_STATUS_BYTES:
@@ -330,8 +333,8 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
                 overview = json.loads(sample.payload.to_bytes())
         return overview if isinstance(overview, dict) else {}
 
+    @override
     def _kept_series(self, source: ReceivedSource, key: str) -> ReceivedSeries | None:
-        """See GatewaySubscriber."""
         path = "/".join(map(escape_key_chunk, key.split("/", 1)))
         return self._reception.series(source, path, _channel(source, path))
 
@@ -375,17 +378,17 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
         if source.status is None:
             self._get(source, "status", take_status)
 
+    @override
     def query_takes(self, source: ReceivedSource) -> None:
-        """See GatewaySubscriber."""
-
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None and len(reply.ok.payload) <= MAX_XML_BYTES:
                 self._reception.answered_takes(source, reply.ok.payload.to_bytes())
 
         self._get(source, "take", take)
 
+    @override
     def query_routers(self) -> None:
-        """See GatewaySubscriber. It takes what the queries before have found."""
+        """It takes what the queries before have found."""
         sources = self._reception.sources_now
         is_known = all(source.routers is not None for source in sources)
         now_s = time.monotonic()
@@ -407,8 +410,8 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
     def _get(self, source: ReceivedSource, key: str, on_reply: Callable[[zenoh.Reply], None]) -> None:
         self._session.get(zenoh_key(self._prefix, source.name, key), on_reply, timeout=_QUERY_S)
 
+    @override
     def silence(self) -> str:
-        """See GatewaySubscriber."""
         return no_gateway_on_zenoh(self._prefix, self._sources, served_sources(self._session, self._prefix))
 
     def _close(self) -> None:

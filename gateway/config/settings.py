@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 from pydantic.json_schema import SkipJsonSchema
+from typing_extensions import override
 
 from gateway.config import values
 from gateway.config.section import Effective, Section, expects, validation_error, validation_errors
@@ -268,8 +269,8 @@ class SpoolSettings(Section):
     """The maximum total size of the files of each source. Its oldest are deleted first."""
 
     @property
+    @override
     def effective(self) -> dict[str, Effective]:
-        """See Section."""
         return default_folder(self.directory, "c3d")
 
     @property

@@ -5,6 +5,8 @@ from functools import partial
 from logging import getLogger
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
+from typing_extensions import override
+
 from gateway.errors import OutputError, QueryError, raise_unless_defect
 from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.topics import Topic
@@ -90,25 +92,28 @@ class GuardedOutput(Output):
     topic_names = _guarded(Output.topic_names, {}, is_repeated=True)
     oldest_recorded = _guarded(Output.oldest_recorded, None, is_repeated=True)
 
+    @override
     def publisher(self, topic: Topic) -> Publisher:
-        """See Output. After a defect, the publisher accepts nothing, so that every message counts as lost."""
+        """After a defect, the publisher accepts nothing, so that every message counts as lost."""
         return _GuardedPublisher(
             self.try_once(self.output.publisher, _Refusal(topic.source), topic), self.defects
         )
 
+    @override
     def frame_publisher(self, source: str) -> FramePublisher | None:
-        """See Output. After a defect, the publisher accepts nothing, so that every frame counts as lost."""
+        """After a defect, the publisher accepts nothing, so that every frame counts as lost."""
         publisher = self.try_once(self.output.frame_publisher, _Refusal(source), source)
         return None if publisher is None else _GuardedPublisher(publisher, self.defects)
 
+    @override
     def take_over(self, other: Output) -> bool:
-        """See Output."""
         differs = self.try_once(self.output.take_over, True, _inner(other))
         self.has_tool_poses = self.output.has_tool_poses
         return differs
 
+    @override
     def health(self) -> OutputHealth:
-        """See Output. A defect is a problem of the output."""
+        """A defect is a problem of the output."""
         if self._damage:
             return OutputHealth(
                 False, f"{self._damage}; reload the gateway to repair it, and report this with the log"
@@ -120,13 +125,15 @@ class GuardedOutput(Output):
             self.defects.log(defect)
             return OutputHealth(False, f"{defect_text(defect)}; report this with the log")
 
+    @override
     def is_configured_like(self, other: Output) -> bool:
-        """See Output. One that a defect has damaged is like no other, so that a reload replaces it."""
+        """One that a defect has damaged is like no other, so that a reload replaces it."""
         is_like = partial(self.output.is_configured_like, _inner(other))
         return not self._damage and self.defects.attempt(is_like, False)
 
+    @override
     async def follow_recording(self, source: str, *, start: bool, name: str) -> Mapping[str, Any]:
-        """See Output. After a defect, the recording starts nevertheless."""
+        """After a defect, the recording starts nevertheless."""
         try:
             return await self.output.follow_recording(source, start=start, name=name)
         except BaseException as defect:  # noqa: BLE001 - other outputs continue
@@ -134,8 +141,8 @@ class GuardedOutput(Output):
             self.defects.log(defect)
             return {}
 
+    @override
     async def recorded_messages(self, source: str, key: str, wanted: WantedMessages) -> FoundMessages | None:
-        """See Output."""
         try:
             return await self.output.recorded_messages(source, key, wanted)
         except QueryError:
@@ -145,8 +152,8 @@ class GuardedOutput(Output):
             self.defects.log(defect)
             return None
 
+    @override
     async def stop_queries(self) -> None:
-        """See Output."""
         try:
             await self.output.stop_queries()
         except BaseException as defect:  # noqa: BLE001 - the output is closed nevertheless
@@ -154,13 +161,13 @@ class GuardedOutput(Output):
             self.defects.log(defect)
 
     @property
+    @override
     def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
-        """See Output."""
         return self.defects.attempt(lambda: self.output.query_results, None)
 
     @property
+    @override
     def commands(self) -> Mapping[str, Command]:
-        """See Output."""
         return self.defects.attempt(lambda: self.output.commands, {})
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from typing_extensions import override
 
 from gateway.config.files import check_is_file
 from gateway.errors import TakeError
@@ -52,13 +53,14 @@ class C3dScene(ComputedScene):
         self.num_frames = recording.num_frames
         self.parameters = recording.parameters
 
+    @override
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See ComputedScene."""
         items = self._items[component]
         return items.take(samples, axis=0, mode="wrap")
 
+    @override
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See ComputedScene. Those of the file happen again in each pass."""
+        """Those of the file happen again in each pass."""
         first, stop = self._num_events_before(start_us), self._num_events_before(stop_us)
         if first >= stop:
             return NO_EVENTS

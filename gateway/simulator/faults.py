@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Final, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from gateway.config.section import Section, expects, validation_error
 from gateway.rtc3d.packets import PACKET_HEADER, Packet, PacketType
@@ -236,8 +237,8 @@ class Split(LastingConnectionFault):
     pause_ms: Milliseconds = 1.0
     """Milliseconds between two pieces."""
 
+    @override
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """See LastingConnectionFault."""
         pieces = []
         pause_s = self.pause_ms / 1000
         for write in writes:
@@ -256,8 +257,8 @@ class Merge(LastingConnectionFault):
     window_ms: Milliseconds = 20.0
     """How long the server collects packets, in milliseconds."""
 
+    @override
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """See LastingConnectionFault."""
         window_s = self.window_ms / 1000
         return [
             write._replace(due_s=math.ceil(write.due_s / window_s) * window_s, joins_previous=True)
@@ -271,8 +272,8 @@ class Delay(LastingConnectionFault):
     delay_ms: Milliseconds = 100.0
     """The delay in milliseconds."""
 
+    @override
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """See LastingConnectionFault."""
         return [write._replace(due_s=write.due_s + self.delay_ms / 1000) for write in writes]
 
 
@@ -282,8 +283,8 @@ class Jitter(LastingConnectionFault):
     mean_ms: Milliseconds = 5.0
     """The mean delay in milliseconds."""
 
+    @override
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """See LastingConnectionFault."""
         delay_s = float(active.rng.exponential(self.mean_ms / 1000))
         return [write._replace(due_s=write.due_s + delay_s) for write in writes]
 
@@ -291,12 +292,12 @@ class Jitter(LastingConnectionFault):
 class HalfOpen(LastingConnectionFault):
     """The server neither reads nor writes nor closes connections; what it would have sent is lost."""
 
+    @override
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """See LastingConnectionFault."""
         return []
 
+    @override
     def read_delay_s(self, num_bytes: int) -> float:
-        """See LastingConnectionFault."""
         return math.inf
 
 
@@ -306,8 +307,8 @@ class SlowReader(LastingConnectionFault):
     bytes_per_s: Speed = 100.0
     """The speed in bytes per second."""
 
+    @override
     def read_delay_s(self, num_bytes: int) -> float:
-        """See LastingConnectionFault."""
         return num_bytes / self.bytes_per_s
 
 
@@ -325,16 +326,16 @@ class Garbage(MomentaryFault):
     num_bytes: NumBytes = 64
     """The number of bytes."""
 
+    @override
     def data(self, rng: np.random.Generator) -> bytes:
-        """See MomentaryFault."""
         return rng.bytes(self.num_bytes)
 
 
 class _WrongSize(MomentaryFault):
     size_bytes: int
 
+    @override
     def data(self, rng: np.random.Generator) -> bytes:
-        """See MomentaryFault."""
         return PACKET_HEADER.pack(self.size_bytes, PacketType.DATA)
 
 
@@ -358,8 +359,8 @@ class Cut(MomentaryFault):
     reset: Switch = False
     """End connections with RST instead of FIN, as a server's computer does after a restart."""
 
+    @override
     def data(self, rng: np.random.Generator) -> bytes:
-        """See MomentaryFault."""
         return PACKET_HEADER.pack(1000, PacketType.DATA) + bytes(100)
 
 

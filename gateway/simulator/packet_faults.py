@@ -9,6 +9,7 @@ from typing import Annotated, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field
+from typing_extensions import override
 
 from gateway.config.section import expects
 from gateway.config.words import join_or
@@ -65,8 +66,8 @@ class RefusedCommands(LastingConnectionFault):
     commands: CommandNames = ("version",)
     """The commands that the server refuses."""
 
+    @override
     def refusal(self, command: Packet) -> str | None:
-        """See LastingConnectionFault."""
         name = _command_name(command)
         return f"{name} is refused" if name in self.commands else None
 
@@ -77,8 +78,8 @@ class MinimalServer(LastingConnectionFault):
     Field note 2.
     """
 
+    @override
     def refusal(self, command: Packet) -> str | None:
-        """See LastingConnectionFault."""
         text = " ".join(decode_text(command.body).lower().split())
         if command.type != PacketType.COMMAND or _MINIMAL.fullmatch(text):
             return None
@@ -91,8 +92,8 @@ class _AcknowledgementFault(LastingConnectionFault):
     commands: CommandNames = COMMAND_NAMES
     """The commands whose acknowledgements change."""
 
+    @override
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
-        """See LastingConnectionFault."""
         if _command_name(command) not in self.commands:
             return replies
         changed: list[Reply] = []
@@ -108,8 +109,8 @@ class _AcknowledgementFault(LastingConnectionFault):
 class MissingAcknowledgements(_AcknowledgementFault):
     """The server executes commands but does not acknowledge them."""
 
+    @override
     def acknowledgements(self, reply: Reply) -> list[Reply]:
-        """See _AcknowledgementFault."""
         return []
 
 
@@ -122,8 +123,8 @@ class DoubledAcknowledgements(_AcknowledgementFault):
     copies: Copies = 2
     """The number of acknowledgements."""
 
+    @override
     def acknowledgements(self, reply: Reply) -> list[Reply]:
-        """See _AcknowledgementFault."""
         return [reply] * self.copies
 
 
@@ -133,8 +134,8 @@ class LateAcknowledgements(_AcknowledgementFault):
     delay_ms: Milliseconds = 500.0
     """The delay in milliseconds."""
 
+    @override
     def acknowledgements(self, reply: Reply) -> list[Reply]:
-        """See _AcknowledgementFault."""
         return [reply._replace(delay_s=self.delay_ms / 1000)]
 
 
@@ -147,8 +148,8 @@ class FramesFirst(LastingConnectionFault):
     frames: Count = 3
     """The number of frames before the acknowledgement; a No Data packet also ends the wait."""
 
+    @override
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
-        """See LastingConnectionFault."""
         if _command_name(command) != "streamframes" or decode_text(command.body).lower().endswith("stop"):
             return replies
         return [
@@ -166,8 +167,8 @@ class ReplyText(LastingConnectionFault):
     form: Annotated[Literal["echo", "ok-verb"], expects("echo or ok-verb")] = "ok-verb"
     """echo: the command as it was sent; ok-verb: a text such as ok-streamframes."""
 
+    @override
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
-        """See LastingConnectionFault."""
         acknowledgement = decode_text(command.body) if self.form == "echo" else f"ok-{_command_name(command)}"
         changed = []
         for reply in replies:
@@ -216,8 +217,8 @@ class Values(NamedTuple):
 class FrameFault(LastingConnectionFault):
     """A fault of data frames. It leaves other packets, and frames damaged by another fault, unchanged."""
 
+    @override
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """See LastingConnectionFault."""
         changed = []
         for write in writes:
             packet = write.data
@@ -254,8 +255,8 @@ class Occlusion(FrameFault):
     tools: Fraction = 1.0
     """The fraction of the tools that is out of view."""
 
+    @override
     def change(self, component: Values, active: ActiveFault) -> Values:
-        """See FrameFault."""
         items = component.items.copy()
         order = np.random.default_rng(active.variant).permutation(len(items))
         if component.type is ComponentType.MARKERS:
@@ -268,8 +269,8 @@ class Occlusion(FrameFault):
 class FrozenTimestamps(FrameFault):
     """Time stamps keep the value that they have when the fault begins."""
 
+    @override
     def change(self, component: Values, active: ActiveFault) -> Values:
-        """See FrameFault."""
         if active.timestamp_us is None:
             active.timestamp_us = component.timestamp_us
         return component._replace(timestamp_us=active.timestamp_us)
@@ -281,8 +282,8 @@ class JumpingTimestamps(FrameFault):
     jump_ms: Jump = -5000.0
     """The jump in milliseconds; a negative value jumps into the past."""
 
+    @override
     def change(self, component: Values, active: ActiveFault) -> Values:
-        """See FrameFault."""
         return component._replace(timestamp_us=component.timestamp_us + round(self.jump_ms * 1000))
 
 
@@ -295,8 +296,8 @@ class ConstantFrameNumbers(FrameFault):
     frame_number: FrameNumber = 0
     """The frame number."""
 
+    @override
     def change(self, component: Values, active: ActiveFault) -> Values:
-        """See FrameFault."""
         return component._replace(frame_number=self.frame_number)
 
 
@@ -306,8 +307,8 @@ class ShortEvents(FrameFault):
     Field note 6.
     """
 
+    @override
     def change(self, component: Values, active: ActiveFault) -> Values:
-        """See FrameFault."""
         if component.type is not ComponentType.EVENT:
             return component
         return component._replace(items=component.items[list(SHORT_EVENT.names or ())].astype(SHORT_EVENT))
@@ -322,8 +323,8 @@ class WrongByteOrder(FrameFault):
     byte_order: Annotated[Literal["big", "little", "other"], expects("big, little or other")] = "other"
     """big or little: always this byte order; other: the one that the client did not request."""
 
+    @override
     def change(self, component: Values, active: ActiveFault) -> Values:
-        """See FrameFault."""
         if self.byte_order != "other":
             return component._replace(byte_order=self.byte_order)
         return component._replace(byte_order="little" if component.byte_order == "big" else "big")
@@ -338,8 +339,8 @@ class UnknownComponent(FrameFault):
     data_bytes: DataBytes = 32
     """The size of its data in bytes, all zeros."""
 
+    @override
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
-        """See FrameFault."""
         header = struct.Struct("<IIiq" if byte_order == "little" else ">IIiq")
         (count,) = _COUNT[byte_order].unpack_from(body)
         component = header.pack(header.size + self.data_bytes, self.component_type, 0, 0)
@@ -352,8 +353,8 @@ class WrongCounts(FrameFault):
     field: Annotated[Literal["components", "size", "items"], expects("components, size or items")] = "items"
     """The field that is 1000 too large: the number of components, or the first component's size or items."""
 
+    @override
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
-        """See FrameFault."""
         damaged = bytearray(body)
         (count,) = _COUNT[byte_order].unpack_from(damaged, _OFFSETS[self.field])
         _COUNT[byte_order].pack_into(damaged, _OFFSETS[self.field], (count + _WRONG_BY) % 2**32)

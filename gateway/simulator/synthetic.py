@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from pydantic import Field
+from typing_extensions import override
 
 from gateway.config.section import Section, expects
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, Items
@@ -89,12 +90,13 @@ class SyntheticScene(ComputedScene):
             events=_EVENTS,
         )
 
+    @override
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See ComputedScene."""
         return self._items[component](samples)
 
+    @override
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See ComputedScene. Once a second, a button is pressed and released."""
+        """Once a second, a button is pressed and released."""
         first, stop = _events_before(start_us), _events_before(stop_us)
         if first >= stop:
             return NO_EVENTS

@@ -7,6 +7,7 @@ from typing import Annotated, Final
 from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import AfterValidator, TypeAdapter
+from typing_extensions import override
 
 from gateway.config.section import Effective, expects, validation_error
 from gateway.config.settings import OutputSettings
@@ -159,8 +160,8 @@ class LcmSettings(OutputSettings):
     """How many bytes a second to send in replies, which every program on the network receives."""
 
     @property
+    @override
     def effective(self) -> dict[str, Effective]:
-        """See Section."""
         url = {} if self.url is not None else {"url": Effective(self.effective_url, ("LCM_DEFAULT_URL",))}
         return {**url, "queries_url": Effective(self.effective_queries_url)}
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from typing_extensions import override
+
 from gateway.errors import QueryError, TakeError
 from gateway.messages.history import FoundMessages, WantedMessages, sequence_of
 from gateway.messages.take_names import default_name
@@ -159,8 +161,8 @@ class RollingSegments(SourceWriter):
             self._written_s = now_s
         return self._log
 
+    @override
     def make_room(self, error: OSError) -> bool:
-        """See TakeWriter."""
         return is_full(error) and self.delete_less_important()
 
     def delete_less_important(self) -> bool:
@@ -214,8 +216,8 @@ class RollingSegments(SourceWriter):
 
     # Reading, in other threads.
 
+    @override
     def written(self, begin: int, messages: Messages) -> None:
-        """See TakeWriter."""
         assert self._log is not None  # noqa: S101 - it has the messages
         self._num_in_log += len(messages)
         newest = {channel: sequence_of(message) for channel, message in dict(messages).items()}

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 from gateway.config.section import Effective, expects, validation_error
 from gateway.config.settings import OutputSettings, default_folder, folder_of
@@ -85,8 +86,8 @@ class TakesSettings(OutputSettings):
         return self
 
     @property
+    @override
     def effective(self) -> dict[str, Effective]:
-        """See Section."""
         return default_folder(self.directory, "takes")
 
     @property

@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from typing_extensions import override
+
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import published_again
 from gateway.outputs.takes.disk import Disk
@@ -57,16 +59,16 @@ class SourceWriter(TakeWriter):
         """How many messages were published, but are in no log."""
         return self.num_refused + self._num_unwritten
 
+    @override
     def succeeded(self) -> None:
-        """See TakeWriter."""
         self.disk.succeeded()
 
+    @override
     def failed(self, error: OSError) -> None:
-        """See TakeWriter."""
         self.disk.failed(self.path, error)
 
+    @override
     def write(self, messages: Messages) -> None:
-        """See TakeWriter."""
         for start in range(0, len(messages), _CHUNK_MESSAGES):
             chunk = messages[start : start + _CHUNK_MESSAGES]
             super().write(chunk)
@@ -74,8 +76,8 @@ class SourceWriter(TakeWriter):
             if newest is not None:
                 self._parameters = newest
 
+    @override
     def sync(self) -> None:
-        """See TakeWriter."""
         super().sync()
         if self._log is not None:
             self._is_in_place = self._log.is_in_place()
@@ -95,12 +97,12 @@ class SourceWriter(TakeWriter):
             self._num_lost_before = self.num_lost
         return log
 
+    @override
     def lose(self, messages: Messages) -> None:
-        """See TakeWriter."""
         self._count_lost(len(messages), max(Counter(channel for channel, _ in messages).values()))
 
-    def lose_newest(self, error: OSError) -> None:  # noqa: ARG002 - the disk knows what is wrong
-        """See TakeWriter."""
+    @override
+    def lose_newest(self, error: OSError) -> None:
         self._count_lost(1, 1)
 
     def _count_lost(self, num_messages: int, num_frames: int) -> None:
@@ -144,12 +146,13 @@ class TakeFile(SourceWriter):
         self.path = log_path(self.stem)
         self._log = self._begin_log(self.path, self.name, self.utime)
 
+    @override
     def make_room(self, error: OSError) -> bool:
-        """See TakeWriter."""
         return is_full(error) and self._delete_less_important()
 
+    @override
     def log_for(self, utime: int) -> LogFile:
-        """See TakeWriter. If the file was removed, another one takes its place.
+        """If the file was removed, another one takes its place.
 
         That has another name if somebody has put something else there: the take is renamed.
         """
@@ -169,8 +172,8 @@ class TakeFile(SourceWriter):
         self._is_in_place = True
         return log
 
+    @override
     def write(self, messages: Messages) -> None:
-        """See TakeWriter."""
         if self._log is not None:
             super().write(messages)
 

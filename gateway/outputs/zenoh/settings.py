@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Final
 
 import zenoh
 from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo
+from typing_extensions import override
 
 from gateway.config.section import expects, validation_error
 from gateway.config.settings import OutputSettings
@@ -120,8 +121,9 @@ class ZenohSettings(OutputSettings):
     """How many bytes a second to send in replies. Those of more than 1 MiB (C3D files) count apart."""
 
     @property
+    @override
     def certificates(self) -> Mapping[str, Path]:
-        """See OutputSettings. Reads the file of Zenoh's configuration; raises ConfigError."""
+        """Reads the file of Zenoh's configuration; raises ConfigError."""
         tls = json.loads(zenoh_config(self.config).get_json("transport/link/tls"))
         return {key: Path(tls[key]) for key in _CERTIFICATES if tls[key]}
 

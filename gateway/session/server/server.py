@@ -7,6 +7,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from typing_extensions import override
+
 from gateway.errors import PortError, system_reason
 from gateway.session.server.client_connection import ClientConnection, ConnectionFilter, ConnectionOwner
 from gateway.session.server.measurement import Measurement, call_after_us
@@ -141,8 +143,8 @@ class RtServer(ConnectionOwner):
     ) -> None:
         await self.close()
 
+    @override
     def connection_opened(self, connection: ClientConnection) -> int:
-        """See ConnectionOwner."""
         number = super().connection_opened(connection)
         if not self.is_listening:
             connection.transport.abort()  # accepted at the moment of a crash
@@ -185,8 +187,8 @@ class RtServer(ConnectionOwner):
             connection.session.scene_changed(self.elapsed_us() or 0)
         self.schedule()
 
+    @override
     def frames_requested(self) -> int | None:
-        """See ConnectionOwner."""
         if self._starts_on_request:
             self.start_measurement()
         else:
@@ -200,8 +202,8 @@ class RtServer(ConnectionOwner):
         due_us = (connection.due_us for connection in self.connections)
         return min((time_us for time_us in due_us if time_us is not None), default=None)
 
+    @override
     def schedule(self) -> None:
-        """See ConnectionOwner."""
         if not self._is_scheduling:
             self._is_scheduling = True
             asyncio.get_running_loop().call_soon(self._set_timer)

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Final, TextIO
 
+from typing_extensions import override
+
 from gateway.client.reception import MAX_SERIES, MAX_SOURCES, Reception
 from gateway.client.refill import END_S, Refill
 from gateway.client.sources import POSE, ReceivedSeries, ReceivedSource
@@ -47,13 +49,13 @@ class CompleteMessages(Reception[ReceivedSource, ReceivedSeries]):
         """Whether nothing more is taken of what is published."""
 
     @property
+    @override
     def has_room(self) -> bool:
-        """See Reception."""
         return self.waiting.qsize() < MAX_WAITING // 2
 
     @property
+    @override
     def is_full(self) -> bool:
-        """See Reception."""
         return self.waiting.qsize() >= MAX_WAITING
 
     def end(self, refill: Refill) -> None:

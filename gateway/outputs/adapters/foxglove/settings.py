@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Annotated, Final
 
 from pydantic import Field
+from typing_extensions import override
 
 from gateway.config.section import expects
 from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
@@ -37,8 +38,8 @@ class FoxgloveSettings(OutputSettings):
     """Addresses of further pages with viewers. Those of Foxglove and of this computer may always connect."""
 
     @property
+    @override
     def listens_on(self) -> Sequence[ListenAddress]:
-        """See OutputSettings."""
         return [ListenAddress(("port",), self.host, self.port)]
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Final, cast
 from weakref import WeakValueDictionary
 
+from typing_extensions import override
+
 from gateway.errors import CommandError
 from gateway.outputs.adapters.rtc3d.arrivals import NewestFrames
 from gateway.outputs.adapters.rtc3d.client_filter import (
@@ -152,46 +154,51 @@ class LiveServer(RtServer):
 
     # RtServer -------------------------------------------------------------------------------
 
+    @override
     def elapsed_us(self) -> int | None:
-        """See RtServer. The newest frame is never in the future."""
+        """The newest frame is never in the future."""
         elapsed_us = super().elapsed_us()
         return None if elapsed_us is None else max(elapsed_us, self._live_scene.newest_us)
 
+    @override
     def frames(self, components: Sequence[ComponentType]) -> FrameSource:
-        """See RtServer. Frames that no client asks for are not made."""
+        """Frames that no client asks for are not made."""
         self.apply_parameters()
         return self._live_scene.frames(components)
 
+    @override
     def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
-        """See RtServer."""
         self.apply_parameters()
         return super().parameters_xml(sections, general)
 
+    @override
     def next_frame_us(self) -> int | None:
-        """See RtServer. Frames are sent when they arrive."""
+        """Frames are sent when they arrive."""
         return None
 
+    @override
     def send_frames(self, elapsed_us: int) -> None:
-        """See RtServer. Most frames of a fast stream are none for clients that want a slower one, too."""
+        """Most frames of a fast stream are none for clients that want a slower one, too."""
         if self._live_scene.has_new_frames:
             self._live_scene.has_new_frames = False
             super().send_frames(elapsed_us)
 
+    @override
     def frames_requested(self) -> int | None:
-        """See RtServer."""
         if self.elapsed_us() is None and not self._state.has_no_measurement:
             self.start_measurement()
             if not self._state.is_streaming:
                 self._giving_up = asyncio.get_running_loop().call_later(_NO_FRAMES_S, self._give_up)
         return self.elapsed_us()
 
+    @override
     def schedule(self) -> None:
-        """See RtServer. What clients ask for may have changed."""
+        """What clients ask for may have changed."""
         self.check_wanted()
         super().schedule()
 
+    @override
     async def close(self) -> None:
-        """See RtServer."""
         self._stop_waiting()
         if self._ending is not None:
             self._ending.cancel()
@@ -232,8 +239,8 @@ class LiveServer(RtServer):
         reason = f" ({error})" if error else ""
         self._events.log(logging.INFO, f"client {connection.name} disconnected{reason}", "disconnected")
 
+    @override
     def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
-        """See RtServer."""
         mib = self.limits.unread_bytes_each / 2**20
         text = (
             f"client {connection.name} does not read: {mib:.2g} MiB wait for it; "
@@ -241,8 +248,8 @@ class LiveServer(RtServer):
         )
         self._events.log(logging.WARNING if is_first else logging.DEBUG, text, "slow")
 
+    @override
     def reading_resumed(self, connection: ClientConnection) -> None:
-        """See RtServer."""
         self._count_dropped(connection)
         num_dropped = connection.session.frames_dropped
         text = f"client {connection.name} reads again; {num_dropped} of its frames were dropped"

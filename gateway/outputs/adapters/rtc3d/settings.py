@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Annotated, Final, Self
 
 from pydantic import Field, PlainSerializer, model_validator
+from typing_extensions import override
 
 from gateway.config.section import expects, validation_error, validation_errors
 from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
@@ -41,8 +42,8 @@ class Rtc3dSettings(OutputSettings):
     """How many clients each source can have at the same time."""
 
     @property
+    @override
     def listens_on(self) -> Sequence[ListenAddress]:
-        """See OutputSettings."""
         return [ListenAddress(("ports", source), self.host, port) for source, port in self.ports.items()]
 
     @model_validator(mode="after")

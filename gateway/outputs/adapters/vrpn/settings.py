@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Annotated, Final
 
+from typing_extensions import override
+
 from gateway.config.section import expects
 from gateway.config.settings import ListenAddress, OutputSettings, SourceSettings
 from gateway.config.values import Host, Port, Switch
@@ -30,8 +32,8 @@ class VrpnSettings(OutputSettings):
     """The names of trackers: tool, source/tool, or auto for tool if there is only one source."""
 
     @property
+    @override
     def listens_on(self) -> Sequence[ListenAddress]:
-        """See OutputSettings."""
         return [ListenAddress(("port",), self.host, self.port)]
 
 
