@@ -9,6 +9,7 @@ import rtc3d
 from gateway.errors import ParametersError
 from gateway.messages.source_report import LossReport, SourceReport, source_report
 from gateway.messages.texts import xml_bytes
+from gateway.rtc3d.components import POSE_FIELDS
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.runtime.losses import counts_text
@@ -112,9 +113,14 @@ def _frame_content(message: Any, units: Sequence[str]) -> str:
 
 
 def _visibility(items: Sequence[Any], units: Sequence[str]) -> str:
-    visible = [(item.x, item.y, item.z) for item in items if not math.isnan(item.x)]
+    visible = [(item.x, item.y, item.z) for item in items if _is_visible(item)]
     first = f", first visible at {_with_unit(_rounded(visible[0]), units[:1])}" if visible else ""
     return f"{len(items) - len(visible)} missing{first}"
+
+
+def _is_visible(item: Any) -> bool:
+    """``rtc3d.components.is_visible`` for one item of a decoded message."""
+    return not any(math.isnan(getattr(item, name, 0.0)) for name in POSE_FIELDS)
 
 
 def _first(

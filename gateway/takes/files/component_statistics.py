@@ -7,7 +7,7 @@ import numpy as np
 
 from gateway.messages.descriptions.labels import describe
 from gateway.messages.sequence_check import SequenceCheck
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import ComponentType, is_visible
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array, Rows, find_restarts
 
@@ -140,9 +140,7 @@ class ComponentStatistics(MessageStatistics):
     def _count_visible(self, num_items: int, items: Array, versions: Array) -> None:
         if not num_items:
             return
-        fields = slice(0, 3) if self.component is ComponentType.MARKERS else slice(None)
-        words = items.view(np.float32).reshape(len(items), num_items, -1)[..., fields]
-        visible = ~np.asarray(np.isnan(words).any(axis=2))
+        visible = is_visible(items)
         for version in np.unique(versions).tolist():
             chosen = visible[versions == version]
             key = (version, num_items)

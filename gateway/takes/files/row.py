@@ -8,7 +8,7 @@ import numpy as np
 from gateway.config.words import spelling_hint
 from gateway.errors import TakeError
 from gateway.messages.descriptions.labels import Description, common, describe, event_labels
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import ComponentType, is_visible
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array
 
@@ -110,8 +110,7 @@ class ItemValues(ABC):
     @property
     def is_visible(self) -> Array:
         """Whether each marker or tool is visible, bool, shape (…, items)."""
-        values = self.values if self.component is ComponentType.TOOLS else self.positions
-        return ~np.asarray(np.isnan(values).any(axis=-1))
+        return is_visible(self.items)
 
     def _field(self, name: str) -> int:
         names = NATIVE_ITEM_DTYPES[self.component].names or ()

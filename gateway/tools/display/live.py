@@ -24,7 +24,7 @@ from gateway.messages.descriptions.labels import Description, EventText, describ
 from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import SourceReport, source_report
 from gateway.messages.topics import lcm_channel
-from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType, is_visible
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array, decode_rows
 from gateway.tools.display.statistics import WINDOW_S, Latency, Visibility
@@ -110,7 +110,7 @@ class LiveComponent:
                 self.latency.add(rows.heads["capture_utime"], rows.heads["utime"], times)
             if self.type in {ComponentType.MARKERS, ComponentType.TOOLS}:  # the others are never missing
                 for num_items, items in rows.items.items():
-                    self._visibility.add(_is_visible(items), times_s[rows.heads["num_items"] == num_items])
+                    self._visibility.add(is_visible(items), times_s[rows.heads["num_items"] == num_items])
         num_items = len(self.newest_items)
         if self._described[0] is not parameters or self._described[1] != num_items:
             self._described = (parameters, num_items)
@@ -143,7 +143,7 @@ class LiveComponent:
     @property
     def is_visible(self) -> Array:
         """Whether each marker or tool is visible now, shape (items,): none is if data have stopped."""
-        return _is_visible(self.newest_items) & (not self.is_stopped)
+        return is_visible(self.newest_items) & (not self.is_stopped)
 
     @property
     def visible_shares(self) -> Array:
@@ -173,18 +173,6 @@ class LiveComponent:
             return False
         frames_s = _STOPPED_FRAMES / self._rate_before_stop_hz if self._rate_before_stop_hz else 0.0
         return age_s > max(_STOPPED_S, frames_s)
-
-
-def _is_visible(items: Array) -> Array:
-    """Return for each marker or tool of an array whether it is visible, in the shape of ``items``.
-
-    Any NaN in a position or orientation means missing (§7.3, field note 7).
-    """
-    visible: Array = np.ones(items.shape, bool)
-    for name in items.dtype.names or ():
-        if name not in {"reliability", "error"}:
-            visible &= np.isfinite(items[name])
-    return visible
 
 
 NUM_EVENTS: Final = 20

@@ -11,7 +11,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.outputs.findings import MessageLoad
 from gateway.rtc3d.commands import SendParameters
-from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType, is_visible
 from gateway.rtc3d.frames import RawFrame
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
@@ -50,9 +50,7 @@ class ObservedComponent:
         self._largest_message_bytes = max(self._largest_message_bytes, message_bytes)
         if component.type not in COMPONENTS_WITH_VISIBILITY:
             return
-        items = component.items()
-        # A NaN in any coordinate means missing (field note 7).
-        visible = ~(np.isnan(items["x"]) | np.isnan(items["y"]) | np.isnan(items["z"]))
+        visible = is_visible(component.items())
         self._num_items += len(visible)
         self._num_visible_items += int(np.count_nonzero(visible))
         if len(visible) != len(self._was_visible):  # the layout has changed: start again

@@ -1,6 +1,7 @@
 """What a person reads of a message, and the server's XML as text in messages."""
 
 import logging
+import math
 
 import pytest
 import rtc3d
@@ -73,6 +74,17 @@ def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
         "lost 1 message (C3D file), 872 messages of 436 frames (skipped while behind); "
         "outputs: zenoh ok, lost 5 messages of 1 frame (no router)"
     )
+
+
+def test_an_item_with_any_missing_coordinate_is_not_shown_as_visible() -> None:
+    """As in all other displays; "first visible at (1, nan, 2)" helps nobody."""
+    marker, tool = rtc3d.marker_t(), rtc3d.tool_t()
+    marker.y = tool.qz = math.nan
+    markers, tools = rtc3d.markers_t(), rtc3d.tools_t()
+    markers.num_markers, markers.markers = 2, [marker, rtc3d.marker_t()]
+    tools.num_tools, tools.tools = 1, [tool]
+    assert summarise(markers).endswith("2 markers, 1 missing, first visible at (0, 0, 0)")
+    assert summarise(tools).endswith("1 tools, 1 missing")
 
 
 def test_small_and_large_numbers_are_shown_without_rounding_errors() -> None:

@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 from gateway.tools.cli.main import EXIT_STATUSES, app
 
-REFERENCE = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text(encoding="utf-8")
+REFERENCE = (Path(__file__).parents[4] / "docs/reference/commands.md").read_text(encoding="utf-8")
 
 
 def commands(command: object = None, name: str = "rtc3d-gateway") -> Iterator[tuple[str, TyperCommand]]:

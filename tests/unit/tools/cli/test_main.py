@@ -12,7 +12,7 @@ from gateway.tools.cli.main import ALIASES, COMMANDS, app
 from tests.support.errors import names
 from tests.unit.tools.cli.test_commands_reference import COMMANDS as ALL_COMMANDS
 
-DEMO = Path(__file__).parents[3] / "config/demo.yaml"
+DEMO = Path(__file__).parents[4] / "config/demo.yaml"
 SLOW = (
     *("cysystemd", "ezc3d", "foxglove", "lcm", "lxml", "numpy", "prometheus_client", "rtc3d"),
     *("textual", "uvloop", "viser", "zenoh"),

@@ -39,7 +39,7 @@ def _process_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "setswitchinterval", lambda _seconds: None)
 
 
-DEMO = Path(__file__).parents[3] / "config/demo.yaml"
+DEMO = Path(__file__).parents[4] / "config/demo.yaml"
 
 
 def printed(*arguments: str) -> str:

@@ -13,7 +13,7 @@ from gateway.tools.cli import view as view_command
 from gateway.tools.cli.view import VISER
 from tests.support.errors import names
 
-PROJECT = Path(__file__).parents[3] / "pyproject.toml"
+PROJECT = Path(__file__).parents[4] / "pyproject.toml"
 WITHOUT_VISER = "import sys; sys.modules['viser'] = None; from gateway.tools.cli.main import main; main()"
 
 

@@ -16,7 +16,7 @@ from gateway.tools.doctor.reach import Reach
 from tests.support.configurations import make_settings
 from tests.support.findings import is_finding
 
-ROOT: Final = Path(__file__).parents[3]
+ROOT: Final = Path(__file__).parents[4]
 PORT: Final = OpenPort("tcp", "::", 7447, Access.CONTROL, "peers publish", "Do this.")
 EVERYBODY: Final = ExposedPort("zenoh", PORT, Reach.EVERY_NETWORK, "every network", True)
 SOURCE: Final = SourceSettings(name="lab", host="192.0.2.20", remote_control=True)

@@ -237,7 +237,7 @@ def test_an_unknown_size_or_load_is_not_tested(tmp_path: Path) -> None:
     assert buffer_finding(tmp_path, LINUX, 0.0).result is Result.NOT_TESTED
 
 
-GUIDE = (Path(__file__).parents[3] / "docs/how-to/troubleshoot.md").read_text(encoding="utf-8")
+GUIDE = (Path(__file__).parents[4] / "docs/how-to/troubleshoot.md").read_text(encoding="utf-8")
 
 
 def test_the_guide_lists_every_check_in_order() -> None:
