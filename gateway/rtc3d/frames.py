@@ -135,6 +135,10 @@ class RawFrame:
         )
 
 
+Frame = RawFrame
+"""Its name in version 1.0, for the outputs of other packages."""
+
+
 def split_frame(body: bytes, byte_order: ByteOrder) -> RawFrame:
     """Split a type-3 packet's body into components (§7.1).
 
