@@ -94,11 +94,6 @@ def failing_first(failing: Finding, later: Iterable[str]) -> list[Finding]:
     return [failing, *(Check(failing.subject, name).not_tested(reason) for name in later)]
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number of things, such as "1 router" or "2 routers"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def as_sentence(text: str) -> str:
     """Return the words of an error, such as what to do about it, with a capital letter and a full stop."""
     return f"{text[:1].upper()}{text[1:]}."

@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate, StreamFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, described_rate_hz, num_described_items
 from gateway.rtc3d.parameters import Parameters
+from gateway.runtime.quantities import rate_text
 
 _SAME_RATE: Final = 1.01
 """Rates within this factor are one rate: servers round the rates in their parameters."""
@@ -88,11 +89,6 @@ def keys_text(components: Sequence[ComponentType]) -> str:
     """Return for example "3d, 6d and event"."""
     *others, last = (component.key for component in components)
     return f"{', '.join(others)} and {last}" if others else last
-
-
-def rate_text(rate_hz: float) -> str:
-    """Return a rate with at most one decimal."""
-    return f"{rate_hz:.1f}".removesuffix(".0")
 
 
 LATE_S: Final = 1.0

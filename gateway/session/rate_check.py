@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 from gateway.config.settings import StreamSettings
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
-from gateway.session.plan import keys_text, rate_text
+from gateway.runtime.quantities import rate_text
+from gateway.session.plan import keys_text
 from gateway.session.state import StreamState
 from gateway.session.status import StreamStatus
 

@@ -16,12 +16,13 @@ import zenoh
 from gateway.config.words import mask_secrets_in_text
 from gateway.errors import ConfigError
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.findings import Check, Finding, MessageLoad, counted, failing_first
+from gateway.outputs.findings import Check, Finding, MessageLoad, failing_first
 from gateway.outputs.zenoh.config import command_config, endpoints, mode_of, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.router_checks import Absence, check_routers, why_absent
 from gateway.outputs.zenoh.routers import read_routers
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.tls_checks import tls_problem
+from gateway.runtime.quantities import counted
 
 _ROUTER_REMEDY: Final = (
     "Start zenohd at that address, or correct connect/endpoints in zenoh.config. With TLS, check that all "

@@ -12,9 +12,9 @@ import typer
 from gateway.config.document import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.errors import ConfigError
-from gateway.outputs.findings import counted
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 from gateway.runtime.log_format import LogFormat, LogLevel, set_up_log
+from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_lines
 from gateway.tools.cli import options
 from gateway.tools.cli.main import print_json

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TextIO
 import typer
 
 from gateway.errors import ParametersError, QueryError
-from gateway.outputs.findings import counted
 from gateway.rtc3d.parameters import (
     SECTIONS,
     General,
@@ -22,6 +21,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
+from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_json, safe_text
 from gateway.tools.cli import options
 from gateway.tools.cli.main import exit_with

@@ -17,6 +17,7 @@ from gateway.client.reception import MAX_SERIES, MAX_SOURCES
 from gateway.client.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording
 from gateway.client.sources import POSE, ReceivedSeries
 from gateway.client.transport import GatewaySubscriber
+from gateway.runtime.quantities import size_text
 from gateway.runtime.safe_text import safe_text
 
 SILENCE_S: Final = 2.0
@@ -182,13 +183,6 @@ class RecordProgress:
             f"{size_text(recording.queued_bytes)} to be written",
         ]
         return "  ".join(parts)
-
-
-def size_text(num_bytes: float) -> str:
-    """Return a size in decimal units: "12.3 MB"."""
-    if num_bytes < 1e6:
-        return f"{num_bytes / 1e3:.0f} kB"
-    return f"{num_bytes / 1e6:.1f} MB" if num_bytes < 1e9 else f"{num_bytes / 1e9:.2f} GB"
 
 
 _ORDER: Final = ("3d", "6d", f"{POSE}*", "analog", "force", "event", "status", "clock", "parameters")

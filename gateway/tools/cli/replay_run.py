@@ -15,8 +15,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.outputs.findings import counted
 from gateway.rtc3d.components import WIRE_ORDER
+from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.reader import TakeReader
 from gateway.tools.display.terminal import keys

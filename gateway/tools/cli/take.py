@@ -128,9 +128,9 @@ def fetch(
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
     from gateway.client.client import GatewayAddress, GatewayClient
+    from gateway.runtime.quantities import size_text
     from gateway.takes.files.new_file import NewFiles
     from gateway.takes.files.reader import SUFFIX
-    from gateway.tools.cli.take_report import size_text
 
     address = GatewayAddress(connect=connect, zenoh_config=zenoh_config, prefix=prefix)
     log = f"{name}{SUFFIX}"
@@ -287,7 +287,7 @@ def export(
     """
     from rich.console import Console
 
-    from gateway.tools.cli.take_report import size_text
+    from gateway.runtime.quantities import size_text
     from gateway.tools.display.terminal import print_list
 
     if from_s is not None and to_s is not None and from_s >= to_s:

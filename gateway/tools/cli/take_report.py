@@ -9,8 +9,8 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gateway.outputs.findings import counted
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.runtime.quantities import counted, duration_text, size_text
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.component_statistics import ComponentStatistics, MessageStatistics
 from gateway.takes.files.description import TakeDetails
@@ -35,17 +35,7 @@ class ListedTake:
     @property
     def facts(self) -> str:
         """The duration, the size and the problem."""
-        return ", ".join(filter(None, (self.duration_text, size_text(self.num_bytes), self.problem)))
-
-    @property
-    def duration_text(self) -> str:
-        """The duration, such as "12.3 s", "4 min 12.3 s" or "1 h 2 min 3.4 s"."""
-        minutes, seconds = divmod(round(self.seconds, 1), 60)
-        hours, minutes = divmod(int(minutes), 60)
-        text = f"{seconds:.1f} s"
-        if hours or minutes:
-            text = f"{minutes} min {text}"
-        return f"{hours} h {text}" if hours else text
+        return ", ".join(filter(None, (duration_text(self.seconds), size_text(self.num_bytes), self.problem)))
 
     @property
     def begin_text(self) -> str:
@@ -63,14 +53,6 @@ class ListedTake:
         return ", ".join(filter(None, ("cut off" if self.is_cut_off else "", lost)))
 
 
-def size_text(num_bytes: float) -> str:
-    """Return a size, such as "3.4 MB"."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if num_bytes >= factor:
-            return f"{num_bytes / factor:.1f} {unit}"
-    return f"{num_bytes:.0f} bytes"
-
-
 def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> None:
     """Write the list of the takes of all sources, and below it or on stderr what is not in it."""
     headings = ["source", "name", "begin", "duration", "size", "state", "about"]
@@ -83,7 +65,7 @@ def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> No
         for take in takes:
             states = ", ".join(filter(None, ("running" if take.is_running else "", take.problem)))
             size = size_text(take.num_bytes)
-            facts = [source, take.name, take.begin_text, take.duration_text, size, states]
+            facts = [source, take.name, take.begin_text, duration_text(take.seconds), size, states]
             records.append([*facts, take.details.text])
         num_takes, kept_s = round(_number(content, "num_takes")), _number(content, "kept_s")
         if not num_takes:
@@ -222,7 +204,7 @@ def _report(statistics: TakeStatistics) -> Iterator[RenderableType]:
     except (OverflowError, OSError, ValueError):
         begin_text = f"{statistics.start_utime} µs after 1970"
     messages = counted(statistics.num_messages, "message")
-    yield f"{begin_text}, {_duration(statistics.seconds)}, {messages}"
+    yield f"{begin_text}, {duration_text(statistics.seconds)}, {messages}"
     yield from _incomplete(statistics)
     for source in statistics.sources.values():
         yield ""
@@ -396,11 +378,3 @@ def _at(statistics: TakeStatistics, utime: int) -> str:
 
 def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(seconds, 60)
-    hours, minutes = divmod(int(minutes), 60)
-    if hours:
-        return f"{hours} h {minutes} min {rest:.0f} s"
-    return f"{minutes} min {rest:.1f} s" if minutes else f"{rest:.3f} s"

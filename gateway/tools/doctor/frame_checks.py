@@ -8,7 +8,7 @@ from gateway.outputs.findings import Check, Finding
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import ComponentType, described_labels, described_rate_hz, num_described_items
 from gateway.rtc3d.parameters import Parameters
-from gateway.session.plan import rate_text
+from gateway.runtime.quantities import rate_text
 from gateway.session.state import StreamState
 from gateway.session.status import FRAME_REJECTED
 from gateway.tools.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream

@@ -8,7 +8,8 @@ from typing import Final
 from rich.console import Console
 from rich.text import Text
 
-from gateway.outputs.findings import Finding, Result, counted
+from gateway.outputs.findings import Finding, Result
+from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_json, safe_lines
 
 _MARKS: Final = {

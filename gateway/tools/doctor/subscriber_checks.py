@@ -13,12 +13,13 @@ from gateway.client.sources import ReceivedSource
 from gateway.client.transport import GatewaySubscriber
 from gateway.errors import ConfigError, OutputError, QueryError
 from gateway.messages.source_report import SourceReport
-from gateway.outputs.findings import Check, Finding, Result, counted, failing_first
+from gateway.outputs.findings import Check, Finding, Result, failing_first
 from gateway.outputs.zenoh.checks import AFTER_LINK, GATEWAY, LINK, no_session
 from gateway.outputs.zenoh.router_checks import carried, check_links, check_routers, why_absent
 from gateway.outputs.zenoh.routers import RouterNetwork, read_routers
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.outputs.zenoh.subscriber import no_gateway_on_zenoh, served_sources, subscriber_config
+from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_text
 
 _ANSWER_S: Final = 2.0

@@ -15,8 +15,8 @@ import yaml
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
+from gateway.runtime.quantities import size_text
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.tools.cli.take_report import size_text
 from tests.support.commands import run_in_process
 from tests.support.errors import names as names_values
 from tests.support.gateway_process import PROGRAM

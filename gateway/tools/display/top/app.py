@@ -14,8 +14,8 @@ from gateway.client.transport import GatewaySubscriber, silence_text
 from gateway.errors import QueryError
 from gateway.messages.decode import json_text
 from gateway.messages.host_time import now_utime
-from gateway.outputs.findings import counted
 from gateway.outputs.kind import DISCOVERY_S, missing_source
+from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_json, safe_text
 from gateway.tools.display.live import DisplayedSource, LiveData
 from gateway.tools.display.terminal import Keyboard, Line, Screen, Style, encoded, is_in_front, line_text

@@ -9,12 +9,12 @@ import viser
 
 from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis
 from gateway.messages.source_report import Level, State
+from gateway.runtime.quantities import counted
 from gateway.tools.display.live import DisplayedSource, LiveData
 from gateway.tools.display.view.plots import Plots
 from gateway.tools.display.view.scene_items import UP_AXES, Rgb
 from gateway.tools.display.view.texts import (
     clock_text,
-    counted,
     data_state,
     events_html,
     gateway_states,

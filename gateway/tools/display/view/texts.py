@@ -11,6 +11,7 @@ import numpy as np
 from gateway.messages.source_report import Level, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.runtime.losses import counts_text
+from gateway.runtime.quantities import age_text, counted, rate_text
 from gateway.runtime.safe_text import safe_text
 from gateway.session.status import FRAME_REJECTED, NOT_SENT, SKIPPED
 from gateway.tools.display.live import DisplayedSource, LiveComponent, LiveData
@@ -37,16 +38,9 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number of things, such as "1 source" or "12,345 sources"."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
-
-
-def rate_text(rate_hz: float | None) -> str:
-    """Return a rate in Hz with a precision that suits it: "2000", "199.9", "0.5"."""
-    if rate_hz is None or not math.isfinite(rate_hz):
-        return NONE
-    return f"{rate_hz:.0f}" if rate_hz >= 999.95 else f"{rate_hz:.1f}"
+def known_rate_text(rate_hz: float | None) -> str:
+    """Return a rate in Hz; NONE if it is not known."""
+    return NONE if rate_hz is None or not math.isfinite(rate_hz) else rate_text(rate_hz)
 
 
 def milliseconds_text(value_ms: float) -> str:
@@ -67,19 +61,6 @@ def percentiles_text(percentiles: Percentiles | None) -> str:
 def share_text(share: float) -> str:
     """Return a share from 0 to 1 in %. Only a share of exactly 0 or 1 is "0 %" or "100 %"."""
     return f"{visible_percent(share):.{0 if share in {0, 1} else 1}f} %"
-
-
-def age_text(age_s: float) -> str:
-    """Return how long something takes or is ago: "0.3 s", "12 s", "3 min 5 s", "2 h 14 min", "3 days"."""
-    if age_s < 9.95:
-        return f"{max(age_s, 0.0):.1f} s"
-    seconds = int(age_s)
-    minutes, hours = seconds // 60, seconds // 3600
-    if seconds < 60:
-        return f"{seconds} s"
-    if minutes < 60:
-        return f"{minutes} min {seconds % 60} s"
-    return f"{hours} h {minutes % 60} min" if hours < 48 else f"{hours // 24} days"
 
 
 def clock_text(time_s: float) -> str:
@@ -176,12 +157,12 @@ def _rate(component: LiveComponent, *, is_take: bool, is_paused: bool) -> str:
     if is_paused:
         return "paused"
     announced_hz = component.announced_rate_hz
-    text = rate_text(component.rate_hz)
+    text = known_rate_text(component.rate_hz)
     if announced_hz is None:
         return text
     if component.is_slow and not is_take:
         text = f"<span class=waiting>{text}</span>"
-    return f"{text} <span class=dim>of {rate_text(announced_hz)}</span>"
+    return f"{text} <span class=dim>of {known_rate_text(announced_hz)}</span>"
 
 
 def _clock_warning(components: Mapping[str, LiveComponent]) -> str:

@@ -13,7 +13,7 @@ from gateway.errors import TakeError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.takes.files.description import SourceDescription
 from gateway.tools.cli.main import app
-from gateway.tools.cli.take_report import ListedTake, size_text, write_list
+from gateway.tools.cli.take_report import ListedTake, write_list
 from tests.support.errors import names
 from tests.support.takes import START_UTIME, description, markers, parameters, write_take
 
@@ -65,12 +65,6 @@ def test_no_takes_are_no_table_and_a_list_with_a_limit_says_so() -> None:
 )
 def test_what_another_gateway_sends_is_shown_as_far_as_possible(content: Any) -> None:
     assert "\x1b[2J" not in written(**content)
-
-
-def test_durations_and_sizes() -> None:
-    durations = [ListedTake({"seconds": seconds}).duration_text for seconds in (0, 59.96, 3600.04, 7384.5)]
-    assert durations == ["0.0 s", "1 min 0.0 s", "1 h 0 min 0.0 s", "2 h 3 min 4.5 s"]
-    assert [size_text(each) for each in (0, 999, 1000, 2.5e9)] == ["0 bytes", "999 bytes", "1.0 kB", "2.5 GB"]
 
 
 PARAMETERS = Parameters(markers=Parameters3D(100.0, "mm", (Marker("1", "head[red]"), Marker("2", "foot"))))

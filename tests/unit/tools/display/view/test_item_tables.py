@@ -46,7 +46,7 @@ def test_rows_are_bounded(lab: Lab) -> None:
     lab.send_markers(*[number > 10 for number in range(10_000)])
     html = items_html(lab.source)
     assert html.count("<tr>") == MAX_ROWS + 1
-    assert "9,960 more markers, always visible" in html
+    assert "9960 more markers, always visible" in html
     assert len(html) < 30_000
 
 

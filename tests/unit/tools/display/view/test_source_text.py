@@ -30,11 +30,11 @@ def test_state_server_rates_and_latency_by_stage(lab: Lab) -> None:
     lab.source.components["3d"].latency.shown_ms.extend((16.0, 16.0))
     text = shown_text(lab)
     assert "|lab|streaming 200.0 Hz|server 192.0.2.9:3020 · gateway 1.2.3 on gatewaypc|" in text
-    assert "|3d|2|0.0|of 200.0|1|" in text
+    assert "|3d|2|0|of 200|1|" in text
     assert re.search(r"captured → gateway.*3d\|2.00 / 2.00\|\d[^|]* / \d[^|]*\|16.0 / 16.0\|", text)
     assert "nothing lost, dropped or skipped" in text
     assert "clock" not in text
-    assert "<span class=waiting>0.0</span>" in source_html(lab.source, is_take=False)
+    assert "<span class=waiting>0</span>" in source_html(lab.source, is_take=False)
     assert "waiting" not in source_html(lab.source, is_take=True)
 
 
