@@ -213,7 +213,8 @@ def _change_text(before: Parameters | None, after: Parameters) -> str:
     return "; ".join(text for text in texts if text) or "the same"
 
 
-_MAX_SOURCES: Final = 256
+MAX_SOURCES: Final = 256
+"""How many sources of a recording are looked at: what was recorded came from a network."""
 
 
 @dataclass
@@ -282,7 +283,7 @@ def take_statistics(path: Path, progress: Callable[[int, int], object] | None = 
             statistics.start_utime = min(statistics.start_utime, *batch.utimes)
             statistics.end_utime = max(statistics.end_utime, *batch.utimes)
             name = batch.source
-            if name in statistics.sources or len(statistics.sources) < _MAX_SOURCES:
+            if name in statistics.sources or len(statistics.sources) < MAX_SOURCES:
                 statistics.sources.setdefault(name, SourceStatistics(name)).add(batch.key, batch.messages)
         if progress is not None:
             progress(reader.read_bytes, statistics.num_bytes)

@@ -19,10 +19,11 @@ from gateway.rtc3d.components import WIRE_ORDER
 from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.reader import TakeReader
+from gateway.takes.files.statistics import MAX_SOURCES
 from gateway.tools.display.terminal import keys
 from gateway.tools.replay.play_list import Selection, take_length_us
 from gateway.tools.replay.player import Player
-from gateway.tools.replay.publication import MAX_SOURCES, MAX_TOPICS, Publication
+from gateway.tools.replay.publication import MAX_TOPICS, Publication
 from gateway.tools.replay.replay import Destination, open_publication, playing
 from gateway.tools.replay.timeline import Jump, time_text
 

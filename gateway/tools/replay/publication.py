@@ -30,6 +30,7 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.session.replies import XmlThread
 from gateway.takes.files.parameters_history import recorded_parameters
+from gateway.takes.files.statistics import MAX_SOURCES
 
 _PARAMETERS_S: Final = 1.0
 """How long messages wait at most until the outputs have sent the parameters that describe them."""
@@ -38,8 +39,7 @@ _DECLARED_S: Final = 1.0
 """How long the first message of a key waits at most until the outputs can send it."""
 
 MAX_TOPICS: Final = 4096
-MAX_SOURCES: Final = 256
-"""Further keys and sources are left out: a gateway has at most 261 keys per source."""
+"""Further keys are left out: a gateway has at most 261 per source."""
 
 MAX_NAME_LENGTH: Final = 24
 _NOT_IN_NAMES: Final = re.compile("[^A-Za-z0-9_-]+")
