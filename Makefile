@@ -387,7 +387,7 @@ opensim: .venv/installed
 	$(BIN)/pip install --quiet opensim
 	$(BIN)/python -m tests.opensim
 
-# Mutation tests: about 200 changes of meaning, each of which some test should notice. PACKAGES="stream publish"
+# Mutation tests: about 200 changes of meaning, each of which some test should notice. PACKAGES="session publish"
 # selects packages. Not part of the check.
 PACKAGES ?=
 

@@ -25,8 +25,11 @@ Everything else that gateways answer::
 - A subscriber sorts what arrives by source and key, for a ``reception``, which keeps it in bounds, and counts
   it, and what is missing. ``queued_reception`` keeps messages until they are decoded, for displays and for
   ``live``, whose beginning is ``live_stream``: ``live_frames`` decodes, ``live_join`` joins components.
-- With ``complete``, each series has a ``completion``, which puts its messages in order and decides what to
-  request; the threads of ``refill`` request it, on LCM with ``lcm_refill``.
+- With ``complete``, each series has a ``completion``, which decides what to request and when
+  (``request_timing``). ``delivery`` hands messages on in their order, and fills gaps with what the history
+  has. ``restart_check`` finds out whether the gateway has restarted; ``arrived_run`` is what waits meanwhile,
+  and ``publisher_watch`` notices a second gateway. The threads of ``refill`` make the requests
+  (``history_requests``), on LCM with ``lcm_refill`` and ``lcm_requester``.
 - ``recorder`` records what is received as takes.
 """
 

@@ -14,7 +14,7 @@ that the server left out (``missing_frames``), skips late ones if the configurat
 Around it, from the outside to the inside:
 
 - ``streams``: which streams a source has, as configured or as ``plan`` derives them from the server's
-  parameters.
+  parameters. ``plan`` also decides when frames are so late that a lower rate is requested.
 - ``supervisor``: one stream, kept running. It opens a connection (``tcp``), runs a session, waits
   (``Backoff``) and tries again.
 - ``session``: one TCP connection, used once. It reads when other sources had their turn and no ``backlog``

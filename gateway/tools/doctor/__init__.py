@@ -8,5 +8,5 @@
   some seconds: ``observation`` collects what arrives, ``frame_checks`` judges it.
 - ``exposure``: every port of a configuration, by what the outputs say of their ports and ``reach`` of who can
   reach them.
-- The checks of an output are in its own package (``checks``).
+- The checks of an output are in its own package (``checks``, or ``output``).
 """

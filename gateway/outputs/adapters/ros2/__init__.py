@@ -7,6 +7,6 @@ Start with ``output``: one node, on the Zenoh router that ROS uses. It opens its
   which knows the topics of the source, and which messages a frame becomes.
 - ``topic``: a topic as rmw_zenoh has it: its key with the type's hash, its liveliness token, the attachment
   of each message with the publisher's id and number.
-- ``messages``: the messages in CDR; ``diagnostics``: the status of a source as ROS 2 shows it.
+- ``diagnostics``: the status of a source as ROS 2 shows it. The messages in CDR are in ``messages.ros2``.
 - ``checks``: what the doctor checks.
 """
