@@ -88,6 +88,7 @@ class ZenohPublisher:
         )
         if self.json is not None:
             self.json.declare(session)
+        self.check_subscribers()  # on a busy computer, the first notification may come after short events
         if self._is_closed:  # by another thread
             self._undeclare()
 
