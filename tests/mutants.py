@@ -28,6 +28,7 @@ ROOT: Final = Path(__file__).parents[1]
 LEAST_PERCENT: Final = 85
 
 TESTS: Final[dict[str, tuple[str, ...]]] = {
+    "rtc3d": ("unit/rtc3d/test_* property/*_packets_* property/*_components_*",),
     "session": ("unit/session/test_* unit/daemon/test_*source* property/*_clock_*",),
     "session/server": ("unit/session/server/test_*",),
     "session/c3d_files": ("unit/session/c3d_files/test_*",),

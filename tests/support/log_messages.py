@@ -47,7 +47,7 @@ _KEYWORDS: Final = {"limitation", "not_open", "cannot_open", "no_router"}
 _PROBLEMS: Final = {"problem", "disk_problem", "file_problem", "thread_problem", "take_lock"}
 """Functions that return, and attributes that have, a text that is logged as WARNING if it is news."""
 
-_PRINTING_PACKAGES: Final = {"cli", "client", "doctor", "foxglove_schemas"}
+_PRINTING_FOLDERS: Final = tuple(map(Path, ("client", "messages/foxglove", "tools/cli", "tools/doctor")))
 """Commands that print their errors instead of logging them, and what raises them."""
 
 _PRINTING_MODULES: Final = {
@@ -75,7 +75,7 @@ def messages(package: Path) -> list[Message]:
     modules = {path: _parsed(path) for path in sorted(package.rglob("*.py"))}
     sources = Sources(list(modules.values()))
     for path, module in modules.items():
-        if path.relative_to(package).parts[0].removesuffix(".py") in _PRINTING_PACKAGES:
+        if any(path.is_relative_to(package / folder) for folder in _PRINTING_FOLDERS):
             continue
         if path.name in _PRINTING_MODULES:
             continue
