@@ -30,7 +30,7 @@ Everything else that gateways answer::
   has. ``restart_check`` finds out whether the gateway has restarted; ``arrived_run`` is what waits meanwhile,
   and ``publisher_watch`` notices a second gateway. The threads of ``refill`` make the requests
   (``history_requests``), on LCM with ``lcm_refill`` and ``lcm_requester``.
-- ``recorder`` records what is received as takes.
+- ``live_arguments`` checks what ``live`` is given. ``recorder`` records what is received as takes.
 """
 
 from typing import TYPE_CHECKING, Any

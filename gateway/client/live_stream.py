@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from gateway.client.client import GatewayAddress, GatewayClient
+from gateway.client.live_arguments import check_arguments
 from gateway.client.live_frames import Frame, LiveReception, decode_frames
 from gateway.client.live_join import Join
 from gateway.client.queued_reception import QueuedMessage, QueuedSeries
 from gateway.client.transport import GatewaySubscriber, close_in_time, silence_text
-from gateway.errors import SelectionError
 from gateway.messages.encode import VERSION_OFFSET
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.parameters import Parameters
@@ -84,14 +84,14 @@ def live(  # noqa: PLR0913 - each is an option of its own, by name
     Gateways on Zenoh are found by multicast, or at an endpoint (``connect``), such as tcp/192.0.2.5:7447, or
     as a configuration file of Zenoh says. With ``lcm`` or ``url``, they are received on LCM. ``prefix`` is
     what keys or channels begin with, if it is not the default. Raises SelectionError if there is no such
-    component, or a source is not a name.
+    component, or if something cannot be the name of a source, a number of seconds, or a prefix.
     """
-    if not all(isinstance(source, str) for source in sources):
-        raise SelectionError("name each source as an argument of its own: live('lab', 'stage')")
+    is_lcm = lcm or url is not None
+    check_arguments(sources, last_s, prefix, is_lcm=is_lcm)
     components = [components] if isinstance(components, str) else components
     check_components(components or ())
     config = None if zenoh_config is None else Path(zenoh_config)
-    address = GatewayAddress(lcm or url is not None, connect, config, url, prefix)
+    address = GatewayAddress(is_lcm, connect, config, url, prefix)
     return Live(address, sources, components, join=join, complete=complete, last_s=last_s)
 
 

@@ -472,10 +472,29 @@ def test_a_misspelt_component_names_the_similar_one() -> None:
         live("lab").latest("3D")
 
 
-def test_a_list_of_sources_is_refused_before_anything_is_opened() -> None:
-    names: Any = ["lab", "stage"]
+@pytest.mark.parametrize(
+    ("sources", "options"),
+    [
+        ([["lab", "stage"]], {}),
+        ([""], {}),
+        (["lab*"], {}),
+        ([], {"last_s": -1}),
+        ([], {"last_s": float("nan")}),
+        ([], {"prefix": "a b*"}),
+        ([], {"prefix": "mocap/x", "lcm": True}),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_opened(
+    sources: list[Any], options: dict[str, Any]
+) -> None:
+    """Otherwise, a program would wait for ever, or get an error of Zenoh that names no argument."""
     with pytest.raises(SelectionError):
-        live(names)
+        live(*sources, **options)
+
+
+def test_other_prefixes_and_an_empty_past_are_accepted() -> None:
+    live("lab", "stage_2", prefix="site/mocap", last_s=0)
+    live(prefix="MOCAP2", lcm=True)
 
 
 def test_values_are_numpy_arrays_without_a_copy() -> None:

@@ -1,0 +1,34 @@
+"""Checks of the arguments of ``live``: a wrong name would wait for ever for data that never come."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from gateway.config.values import ChannelPrefix, SourceName
+from gateway.errors import SelectionError
+from gateway.outputs.zenoh.settings import KeyPrefix
+
+
+def check_arguments(
+    sources: Sequence[object], last_s: float | None, prefix: str | None, *, is_lcm: bool
+) -> None:
+    """Check names, seconds and a prefix. Raises SelectionError, which says what is expected."""
+    if not all(isinstance(source, str) for source in sources):
+        raise SelectionError("name each source as an argument of its own: live('lab', 'stage')")
+    for source in sources:
+        _check(SourceName, source, "no source is called")
+    if prefix is not None:
+        kind = "channel begins with" if is_lcm else "key begins with"
+        _check(ChannelPrefix if is_lcm else KeyPrefix, prefix, f"no {kind}")
+    if last_s is not None and not 0 <= last_s < math.inf:
+        raise SelectionError(f"last_s is {last_s!r}; expected seconds, such as last_s=5")
+
+
+def _check(kind: Any, value: object, problem: str) -> None:
+    try:
+        TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        expected = error.errors(include_url=False)[0]["msg"]
+        raise SelectionError(f"{problem} {value!r}: {expected}") from None
