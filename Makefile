@@ -65,8 +65,8 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/runtime/test_failu
     $(filter-out %/test_config_properties.py %_environment_properties.py %_parameters_properties.py %_vrpn_properties.py, \
         $(wildcard tests/property/test_*.py)) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
-    $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d stream) \
-    $(addprefix tests/unit/,takes/files takes/test_recorder.py) tests/integration/test_streams.py tests/unit/daemon/test_gateway.py
+    $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d session) \
+    $(addprefix tests/unit/,takes/files client/test_recorder.py) tests/integration/test_streams.py tests/unit/daemon/test_gateway.py
 
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py $(AGAIN) --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))

@@ -202,12 +202,12 @@ def _report(results: dict[Mutant, Result], broken: Sequence[str]) -> int:
     outcomes = Counter((each.package, result.outcome) for each, result in results.items())
     outcomes.update(("all", result.outcome) for result in results.values())
     percent = 0.0
-    print(f"\n{'package':<14} mutants  killed  hung  survived  error      %")
+    print(f"\n{'package':<26} mutants  killed  hung  survived  error      %")
     for package in (*TESTS, "all"):
         counts = [outcomes[package, each] for each in ("killed", "hung", "SURVIVED", "error")]
         if any(counts):
             percent = 100 * sum(counts[:2]) / sum(counts)  # a mutant that hangs would be noticed, too
-            print("{:<14}{:8}{:8}{:6}{:10}{:7}{:7.1f}".format(package, sum(counts), *counts, percent))
+            print("{:<26}{:8}{:8}{:6}{:10}{:7}{:7.1f}".format(package, sum(counts), *counts, percent))
     for mutant, result in results.items():
         if result.outcome not in {"killed", "hung"}:
             print(f"\n{mutant}: {result.outcome}\n{mutant.changes}\n- {mutant.old}\n+ {mutant.new}")

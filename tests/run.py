@@ -68,8 +68,9 @@ def _run_and_again(num_workers: int, arguments: list[str]) -> int:
         status = _run_pytest(num_workers, arguments)
         if status != pytest.ExitCode.TESTS_FAILED:
             return status
-        failed = [*json.loads(Path(cache, "v/cache/lastfailed").read_text())]
-        if len(failed) <= MAX_AGAIN:
+        lastfailed = Path(cache, "v/cache/lastfailed")
+        failed = [*json.loads(lastfailed.read_text())] if lastfailed.exists() else []
+        if 0 < len(failed) <= MAX_AGAIN:
             status = _run_pytest(1, ["--last-failed", *arguments])
             if status == pytest.ExitCode.OK:
                 print("FAILED ONCE, passed alone; find the cause:", *failed, sep="\n    ", flush=True)

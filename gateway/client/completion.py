@@ -356,7 +356,10 @@ class Completion:
 
     @property
     def _lacks_what_arrived(self) -> bool:
-        """Whether a history without messages is of yet another run: of this one, some have arrived."""
+        """Whether a history without messages is of yet another run: of this one, some have arrived.
+
+        Of a key with few messages, all may have expired: then one restart too many is reported.
+        """
         delivery = self._delivery
         return (
             self._state is CompletionState.FILLING

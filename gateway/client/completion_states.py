@@ -35,7 +35,7 @@ class CompletionState(enum.Enum):
 
 
 class End(enum.Enum):
-    """How far the end of a recording is. It can come in any State: a restart is checked then, too."""
+    """How far the end of a recording is. It can come in any state: a restart is checked then, too."""
 
     OPEN = enum.auto()
     """It has not come: take what arrives."""

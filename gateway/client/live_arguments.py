@@ -11,18 +11,15 @@ from gateway.errors import SelectionError
 from gateway.outputs.zenoh.settings import KeyPrefix
 
 
-def check_arguments(
-    sources: Sequence[object], last_s: float | None, prefix: str | None, *, is_lcm: bool
-) -> None:
+def check_arguments(sources: Sequence[object], last_s: object, prefix: str | None, *, is_lcm: bool) -> None:
     """Check names, seconds and a prefix. Raises SelectionError, which says what is expected."""
     if not all(isinstance(source, str) for source in sources):
         raise SelectionError("name each source as an argument of its own: live('lab', 'stage')")
     for source in sources:
-        _check(SourceName, source, "no source is called")
-    if prefix is not None:
-        kind = "channel begins with" if is_lcm else "key begins with"
-        _check(ChannelPrefix if is_lcm else KeyPrefix, prefix, f"no {kind}")
-    if last_s is not None and not 0 <= last_s < math.inf:
+        _check(SourceName, source, "no source can be called so")
+    if prefix:  # "" is the default
+        _check(ChannelPrefix if is_lcm else KeyPrefix, prefix, "the prefix cannot be used")
+    if last_s is not None and not (isinstance(last_s, int | float) and 0 <= last_s < math.inf):
         raise SelectionError(f"last_s is {last_s!r}; expected seconds, such as last_s=5")
 
 
@@ -30,5 +27,4 @@ def _check(kind: Any, value: object, problem: str) -> None:
     try:
         TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
-        expected = error.errors(include_url=False)[0]["msg"]
-        raise SelectionError(f"{problem} {value!r}: {expected}") from None
+        raise SelectionError(f"{problem}: {error.errors(include_url=False)[0]['msg']}") from None

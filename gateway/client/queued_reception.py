@@ -49,7 +49,7 @@ class QueuedSeries(ReceivedSeries):
 
     @property
     def is_past(self) -> bool:
-        """Whether what is taken now ``is_past``; see Arrival."""
+        """Whether what is taken now ``is_past``; see QueuedMessage."""
         return self.completion is not None and self.completion.is_past
 
     def new_losses(self) -> int:

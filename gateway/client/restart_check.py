@@ -148,6 +148,8 @@ class RestartCheck:
             # Larger numbers than those that have arrived may be of the new run, too: nobody knows how many
             # the former one had.
             former.until = min(former.until, max([former.newest, *former.held]))
+        elif delivery.reached is None:
+            new = ArrivedRun(self._held_bytes)  # all that has arrived is of the run that has ended
         else:
             known_utime = delivery.known[1]
             new = former.split(lambda utime: utime < known_utime)

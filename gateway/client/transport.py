@@ -304,10 +304,10 @@ class GatewaySubscriber(ABC):
 
     @abstractmethod
     def query_takes(self, source: ReceivedSource) -> None:
-        """Query which take the gateway of a source records; see Source.running_take."""
+        """Query which take the gateway of a source records; see ReceivedSource.running_take."""
 
     def query_routers(self) -> None:  # noqa: B027 - there are none on LCM
-        """Query now and then which routers are between gateways and here: Source.routers. Call it often."""
+        """Query now and then which routers are between gateways and here. Call it often."""
 
     @abstractmethod
     def silence(self) -> str:

@@ -120,7 +120,7 @@ def _visibility(items: Sequence[Any], units: Sequence[str]) -> str:
 
 def _is_visible(item: Any) -> bool:
     """``rtc3d.components.is_visible`` for one item of a decoded message."""
-    return not any(math.isnan(getattr(item, name, 0.0)) for name in POSE_FIELDS)
+    return all(math.isfinite(getattr(item, name, 0.0)) for name in POSE_FIELDS)
 
 
 def _first(

@@ -26,18 +26,19 @@ MISSING_MARKER: Final = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
 """The values of a missing marker."""
 
 POSE_FIELDS: Final = ("q0", "qx", "qy", "qz", "x", "y", "z")
-"""The fields of a marker or a tool of which none is NaN if it is visible. Its reliability or error may be."""
+"""The fields of markers and tools that are finite numbers if one is visible."""
 
 
 def is_visible(items: Items) -> Items:
     """Return for each marker or tool whether it is visible, bool, in the shape of ``items``.
 
-    One with a NaN in its position or its orientation is missing (§7.3, field note 7).
+    One with a NaN in its position or its orientation is missing (§7.3, field note 7); so is an infinite one,
+    which no display can show. Reliability and error do not count.
     """
     visible = np.ones(items.shape, np.bool_)
     for name in POSE_FIELDS:
         if name in (items.dtype.names or ()):
-            visible &= ~np.isnan(items[name])
+            visible &= np.isfinite(items[name])
     return visible
 
 

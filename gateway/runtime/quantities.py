@@ -9,14 +9,14 @@ def counted(number: int, noun: str) -> str:
 def size_text(num_bytes: float) -> str:
     """Return a size, such as "300 bytes" or "3.4 MB"."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if num_bytes >= factor:
+        if num_bytes >= 0.99995 * factor:  # otherwise, it could be "1000.0 kB"
             return f"{num_bytes / factor:.1f} {unit}"
     return f"{num_bytes:.0f} bytes"
 
 
 def duration_text(seconds: float) -> str:
     """Return a duration, such as "0.125 s", "12.3 s", "4 min 12.3 s" or "1 h 2 min 3.4 s"."""
-    if 0 < seconds < 1:
+    if 0 < seconds < 0.9995:
         return f"{seconds:.3f} s"
     minutes, rest = divmod(round(seconds, 1), 60)
     hours, minutes = divmod(int(minutes), 60)

@@ -10,9 +10,9 @@ In ``files``:
   built on these.
 - Reading: ``event_log`` reads events one after the other and goes on behind damage. ``reader`` adds what each
   of them is: the source, the component or kind of message.
-- Arrays: ``take`` and ``series`` decode a take into numpy arrays; ``component_rows`` does so for many
-  messages at once, and ``parameters_history`` says which parameters describe them. ``joined`` makes one
-  series of several, ``resampling`` changes the rate, and ``tables`` makes tables for pandas and xarray.
+- Arrays: ``take``, ``series`` and ``series_data`` decode a take into numpy arrays; ``component_rows`` does so
+  for many messages at once, and ``parameters_history`` says which parameters describe them. ``joined`` makes
+  one series of several, ``resampling`` changes the rate, and ``tables`` makes tables for pandas and xarray.
 - Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
   with what interrupts it.
 

@@ -13,7 +13,7 @@ PAGE = (
     "| `no answer from <server>; is it on?` | WARNING | Switch it on. |\n"
     "| `<file> is lost`; `<file> is not stored` | ERROR | Save it by hand. |\n"
 )
-NO_ANSWER = Message("no answer from <server>; is it on?", "WARNING", "stream/tcp.py:12")
+NO_ANSWER = Message("no answer from <server>; is it on?", "WARNING", "session/tcp.py:12")
 LOST = Message("<file> is lost", "ERROR", "spool.py:4")
 NOT_STORED = Message("<file> is not stored", "ERROR", "spool.py:9")
 
@@ -31,7 +31,7 @@ def test_a_page_that_is_up_to_date_stays_as_it_is() -> None:
 
 def test_a_sentence_that_changes_keeps_its_advice_and_its_row() -> None:
     """To better a sentence is one edit in the source code and ``make messages``."""
-    better = Message("no answer from <server> within <timeout> s; is it on?", "WARNING", "stream/tcp.py:12")
+    better = Message("no answer from <server> within <timeout> s; is it on?", "WARNING", "session/tcp.py:12")
     result = update(PAGE, [better, LOST, NOT_STORED])
     assert result.page == PAGE.replace(NO_ANSWER.text, better.text)
     assert result.without_advice == []
@@ -47,10 +47,10 @@ def test_a_message_that_is_gone_leaves_its_row_and_an_empty_row_is_removed() -> 
 
 
 def test_a_new_message_gets_a_row_beside_those_of_its_module_and_is_named() -> None:
-    new = Message("<host> has another address", "WARNING", "stream/tcp.py:40")
+    new = Message("<host> has another address", "WARNING", "session/tcp.py:40")
     result = update(PAGE, [NO_ANSWER, new, LOST, NOT_STORED])
     assert result.page.splitlines()[5] == "| `<host> has another address` | WARNING |  |"
-    assert result.without_advice == ["stream/tcp.py:40: <host> has another address"]
+    assert result.without_advice == ["session/tcp.py:40: <host> has another address"]
     assert update(result.page, [NO_ANSWER, new, LOST, NOT_STORED]).without_advice == result.without_advice
 
 

@@ -54,7 +54,6 @@ _PRINTING_MODULES: Final = {
     "checks.py",
     "tls_checks.py",
     "subscriber.py",
-    "recorder.py",
     "status_messages.py",
 }
 """Modules that only commands use, and those whose texts are in messages to peers."""

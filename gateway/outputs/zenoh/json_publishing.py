@@ -185,6 +185,8 @@ class JsonPublisher:
             encoding=JSON,
             congestion_control=zenoh.CongestionControl.DROP,
         )
+        if has_subscribers(self._publisher):  # as ZenohPublisher does
+            self._set_wanted(True)
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""

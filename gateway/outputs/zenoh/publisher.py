@@ -88,7 +88,9 @@ class ZenohPublisher:
         )
         if self.json is not None:
             self.json.declare(session)
-        self.check_subscribers()  # on a busy computer, the first notification may come after short events
+        # On a busy computer, the first notification may come after short events.
+        if has_subscribers(self._publisher):
+            self._on_matching(True)
         if self._is_closed:  # by another thread
             self._undeclare()
 

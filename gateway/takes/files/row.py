@@ -110,6 +110,7 @@ class ItemValues(ABC):
     @property
     def is_visible(self) -> Array:
         """Whether each marker or tool is visible, bool, shape (…, items)."""
+        self._field("x")  # other components have none
         return is_visible(self.items)
 
     def _field(self, name: str) -> int:

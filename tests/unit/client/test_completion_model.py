@@ -237,6 +237,9 @@ def schedules(*events: str) -> st.SearchStrategy[list[str]]:
 @example(
     ["full", "restart", *["arrives"] * 4], 3, 10**9
 )  # the first messages of the new run are held nowhere
+@example(
+    [*["arrives"] * 2, "restart", "lost", *["arrives"] * 2, "ask", "ask", "restart", "ask"], 10**9, 10**9
+)  # a run ends whose first message never came
 def test_nothing_comes_twice_and_what_is_called_complete_is(
     events: list[str], window: int, limit: int
 ) -> None:

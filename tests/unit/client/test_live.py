@@ -480,6 +480,7 @@ def test_a_misspelt_component_names_the_similar_one() -> None:
         (["lab*"], {}),
         ([], {"last_s": -1}),
         ([], {"last_s": float("nan")}),
+        ([], {"last_s": "5"}),
         ([], {"prefix": "a b*"}),
         ([], {"prefix": "mocap/x", "lcm": True}),
     ],
@@ -495,6 +496,7 @@ def test_what_cannot_be_is_refused_before_anything_is_opened(
 def test_other_prefixes_and_an_empty_past_are_accepted() -> None:
     live("lab", "stage_2", prefix="site/mocap", last_s=0)
     live(prefix="MOCAP2", lcm=True)
+    live(prefix="")
 
 
 def test_values_are_numpy_arrays_without_a_copy() -> None:

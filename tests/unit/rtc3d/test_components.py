@@ -20,8 +20,13 @@ def with_nan(item: tuple[float, ...], field: int) -> tuple[float, ...]:
     [
         (
             ComponentType.MARKERS,
-            [MARKER, MISSING_MARKER, *(with_nan(MARKER, field) for field in range(4))],
-            [True, False, False, False, False, True],
+            [
+                MARKER,
+                MISSING_MARKER,
+                (1.0, math.inf, 3.0, 0.5),
+                *(with_nan(MARKER, field) for field in range(4)),
+            ],
+            [True, False, False, False, False, False, True],
         ),
         (
             ComponentType.TOOLS,

@@ -143,7 +143,7 @@ async def _make(call: Callable[[], None]) -> None:
 
 
 class FoxglovePublisher:
-    """The FramePublisher of one source: whether viewers want it, and the calls of its LiveSource.
+    """The FramePublisher of one source: whether viewers want it, and the calls of its SourceChannels.
 
     ``call`` has the thread make a call. ``call_in_time`` does so if not too many wait, and returns whether it
     does; it takes the call and the number of bytes that it holds.

@@ -224,7 +224,7 @@ def _losses_html(source: DisplayedSource, components: Mapping[str, LiveComponent
 
 
 def _figure(number: int) -> str:
-    return f"<span class=bad>{number:,}</span>" if number else "0"
+    return f"<span class=bad>{number}</span>" if number else "0"
 
 
 def _dropped(report: SourceReport | None, key: str, *causes: str) -> int:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -195,6 +196,7 @@ def test_a_real_router_confirms_what_it_reads_and_not_what_it_does_not() -> None
                 publisher.publish(b"read")
             wait_until(is_confirmed)
             router.send_signal(signal.SIGSTOP)
+            os.waitpid(router.pid, os.WUNTRACED)  # until all its threads have stopped
             for _ in range(20):
                 publisher.publish(b"not read")
             output.maintain()

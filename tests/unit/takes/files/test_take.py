@@ -100,6 +100,9 @@ def test_each_component_has_its_values_labels_unit_and_rate(tmp_path: Path) -> N
     assert found.positions[0].tolist()[0] == [1, 2, 3]
     assert np.isnan(found.positions[:, 1]).all()
     assert found.is_visible.tolist() == [[True, False]] * 3
+    for other in (analog, forces, events):
+        with pytest.raises(TakeError):
+            assert other.is_visible
     assert found.items["reliability"][0].tolist() == [0.5, 999]
     assert found.seconds.tolist() == [-0.002, 0.008, 0.018]
     assert found.sequence.tolist() == found.frame_number.tolist() == [0, 1, 2]
