@@ -13,7 +13,8 @@ mkdir -m 700 "$1"
 cd "$1"
 shift
 openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -noenc -days 3650 \
-    -subj "/CN=lab CA" -addext basicConstraints=critical,CA:TRUE -keyout ca.key -out ca.crt
+    -subj "/CN=lab CA" -addext basicConstraints=critical,CA:TRUE -addext keyUsage=critical,keyCertSign,cRLSign \
+    -keyout ca.key -out ca.crt
 
 for certificate; do
     name=${certificate%%=*}

@@ -162,6 +162,7 @@ def as_json(value):
 
 def print_vectors() -> None:
     """Read lines TYPE HEX, and print the values of each message, or what is wrong, as a line of JSON."""
+    sys.stdin.reconfigure(errors="replace")  # or bytes that are no text would end the program
     for line in sys.stdin:
         type_name, _, digits = line.strip().partition(" ")
         try:

@@ -94,7 +94,8 @@ def problems_of(package: Distribution) -> Iterator[str]:
 def section(package: Distribution) -> str:
     """Return the name, licence, address and licence texts of a package."""
     urls = package.metadata.get_all("Project-URL") or []
-    address = package.metadata["Home-page"] or (urls[0].partition(", ")[2] if urls else "")
+    pages = package.metadata.get_all("Home-page") or [url.partition(", ")[2] for url in urls]
+    address = pages[0] if pages else ""
     note = " (its runtime is a part of the compiled modules)" if package.name == "mypy" else ""
     texts = [
         f"\n--- {file.name} ---\n\n{Path(str(file.locate())).read_text(encoding='utf-8', errors='replace')}"
