@@ -239,7 +239,8 @@ def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Pu
             nonlocal shown
             if select.select([reading], [], [], 0)[0]:
                 shown += os.read(reading, 65536).decode()
-            return re.search(r"\r.*\d:\d\d  \d+ kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown)
+            line = r"\r.*\d:\d\d  [\d.]+ \w+  .* messages/s  .*/s  2 lost  0 bytes to be written"
+            return re.search(line, shown)
 
         publish_until(publisher, has_shown_the_loss)
         (tmp_path / "walk.lcmlog").unlink()
