@@ -64,17 +64,17 @@ SURROUNDINGS: Final = {
         python=13,
     ),
     "user": Surroundings(
-        "up for 400 days, America/St_Johns, LC_ALL=C, no IPv6, the user `Läufer Ä` in a folder of that name, "
-        "Python 3.11 of the system, random order",
+        "up for 400 days, America/St_Johns, de_DE.UTF-8, no IPv6, the user `Läufer Ä` in a folder of that "
+        "name, Python 3.11 of the system, random order",
         uptime_s=400 * _DAY_S,
         time_zone="America/St_Johns",
-        locale="C",
+        locale="de_DE.UTF-8",  # with C, javac and Python's site module cannot read the name of the folder
         has_ipv6=False,
         order="2",
         user="Läufer Ä",
         python=11,
     ),
-    "core": Surroundings("one core, de_DE.UTF-8", locale="de_DE.UTF-8", cores=1),
+    "core": Surroundings("one core, LC_ALL=C", locale="C", cores=1),
 }
 
 
@@ -119,6 +119,7 @@ def _run(target: str, surroundings: Surroundings) -> tuple[int, str]:
         if surroundings.user:
             environment |= {
                 "HOME": str(folder.parent),
+                "XDG_CACHE_HOME": str(folder.parent / ".cache"),
                 "USER": surroundings.user,
                 "LOGNAME": surroundings.user,
             }

@@ -124,13 +124,15 @@ def run_nginx(folder: Path, servers: Servers, *changes: Change) -> Iterator[Prox
     )
     (folder / "rtc3d-gateway.conf").write_text(text)
     (folder / "nginx.conf").write_text(f"""
-        user root; daemon off; worker_processes 1; pid {folder}/pid; error_log {folder}/error.log info;
+        user root; daemon off; worker_processes 1; pid "{folder}/pid";
+        error_log "{folder}/error.log" info;
         events {{ }}
         http {{
-            access_log {folder}/access.log;
-            client_body_temp_path {folder}/body; proxy_temp_path {folder}/proxy;
-            fastcgi_temp_path {folder}/fastcgi; scgi_temp_path {folder}/scgi; uwsgi_temp_path {folder}/uwsgi;
-            include {folder}/rtc3d-gateway.conf;
+            access_log "{folder}/access.log";
+            client_body_temp_path "{folder}/body"; proxy_temp_path "{folder}/proxy";
+            fastcgi_temp_path "{folder}/fastcgi"; scgi_temp_path "{folder}/scgi";
+            uwsgi_temp_path "{folder}/uwsgi";
+            include "{folder}/rtc3d-gateway.conf";
         }}""")
     with subprocess.Popen(["nginx", "-p", folder, "-e", "error.log", "-c", "nginx.conf"]) as nginx:
         try:

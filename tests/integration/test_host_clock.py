@@ -4,6 +4,7 @@ import struct
 import subprocess
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from tests.support.gateway_process import GatewayProcess, gaps, gateway_process, simulator
@@ -43,7 +44,7 @@ int clock_gettime(clockid_t clock, struct timespec *time) {
 
 
 class WallClock:
-    """The wall clock that a process with ``environ`` sees."""
+    """The wall clock that a process with ``environ`` sees. LD_PRELOAD allows no space in ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         need_programs("gcc", packages="gcc and libc6-dev")
@@ -79,7 +80,7 @@ def test_a_step_changes_time_stamps_and_nothing_else(tmp_path: Path) -> None:
         for number, offset_s in enumerate((5.0, -5.0, 200 * 86_400.0)):
             folder = tmp_path / str(number)
             folder.mkdir()
-            clock = WallClock(folder)
+            clock = WallClock(Path(stack.enter_context(TemporaryDirectory())))
             # Frames that are late on a busy machine must not be skipped; a step is larger than this.
             process = gateway_process(folder, port, clock.environ, streams=[stream], max_lag_ms=4000)
             runs.append((stack.enter_context(process), clock, offset_s))

@@ -24,7 +24,7 @@ def make(clone: Path, target: str, pip: str) -> subprocess.CompletedProcess[str]
         "printf '#!/bin/sh\\n' >.venv/bin/python\nchmod +x .venv/bin/*"
     )
     python.chmod(0o755)
-    command = ["make", "-C", str(clone), "--no-print-directory", target, f"PYTHON={python}"]
+    command = ["make", "-C", str(clone), "--no-print-directory", target, "PYTHON=./python"]
     return subprocess.run(command, text=True, capture_output=True, check=False)
 
 

@@ -39,15 +39,15 @@ class Purge:
     def run(self, setup: str) -> tuple[str, list[str]]:
         """Purge; return what is printed, and the files and folders that are left."""
         log = self.folder / "calls"
-        self._program("getent", f'[ ! -e {self.folder}/deleted ] && echo "{self.user}"')
-        self._program("userdel", "exit 8" if self.is_user_busy else f"touch {self.folder}/deleted")
-        self._program("groupdel", f"echo groupdel >>{log}")
+        self._program("getent", f"[ ! -e '{self.folder}/deleted' ] && echo '{self.user}'")
+        self._program("userdel", "exit 8" if self.is_user_busy else f"touch '{self.folder}/deleted'")
+        self._program("groupdel", f"echo groupdel >>'{log}'")
         self._program("systemctl", "true")
         self._program("deb-systemd-helper", "true")
         found = self.folder / "found"
         script = (
-            f"{_SETUP}{setup}\nsh {ROOT}/release/deb/postrm purge 2>&1\n"
-            f"find {STATE} /etc/rtc3d-gateway /var/lib/big 2>/dev/null >{found} || true\n"
+            f"{_SETUP}{setup}\nsh '{ROOT}/release/deb/postrm' purge 2>&1\n"
+            f"find {STATE} /etc/rtc3d-gateway /var/lib/big 2>/dev/null >'{found}' || true\n"
         )
         done = subprocess.run(
             ["unshare", "--mount", "sh", "-c", script],

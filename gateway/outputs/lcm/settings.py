@@ -29,7 +29,9 @@ _HOST: Final[TypeAdapter[str]] = TypeAdapter(Host)
 
 def _lcm_url(text: str) -> str:
     scheme, separator, rest = text.partition("://")
-    if scheme not in LCM_SCHEMES or not separator or not text.isprintable() or " " in text:
+    if scheme not in LCM_SCHEMES or not separator or not text.isprintable():
+        raise ValueError
+    if " " in text and scheme != "file":  # folders have spaces, addresses do not
         raise ValueError
     if len(text) > 1000:
         raise ValueError

@@ -238,8 +238,8 @@ def test_the_command_plays_the_folder_of_a_saved_take(take: Path) -> None:
     (folder := take.parent / "saved").mkdir()
     for number in (1, 2):
         (folder / f"saved-00{number}.lcmlog").write_bytes(take.read_bytes())
-    options = f"--take {folder} --source lab --from 0.1 --to 0.4 --once --seconds 0.1"
-    command = [sys.executable, "-m", "gateway", "simulate", "--port", "0", *options.split()]
+    options = ("--source", "lab", "--from", "0.1", "--to", "0.4", "--once", "--seconds", "0.1")
+    command = [sys.executable, "-m", "gateway", "simulate", "--port", "0", "--take", str(folder), *options]
     assert "127.0.0.1:" in subprocess.check_output(command, text=True, timeout=30)
 
 
@@ -254,7 +254,7 @@ def test_the_command_plays_the_folder_of_a_saved_take(take: Path) -> None:
     ],
 )
 def test_the_command_says_why_a_take_cannot_be_played(take: Path, options: str, problem: str) -> None:
-    arguments = options.replace("TAKE", str(take)).split()
+    arguments = [str(take) if each == "TAKE" else each for each in options.split()]
     ended = run_in_process("simulate", "--port", "0", *arguments)
     assert ended.returncode != 0
     assert problem in " ".join(ended.stderr.replace("│", " ").split())
