@@ -91,7 +91,11 @@ class ArrivedRun:
         )
 
     def goes_back_before(self, number: int, utime: int) -> bool:
-        """Whether it has a smaller number than this one, but a later time: then it is another run."""
+        """Whether it has a smaller number than this one, but a later time: then it is another run.
+
+        A message with a false number can look the same: then one restart too many is reported. That is the
+        better mistake, because nothing would say what is missing between two runs.
+        """
         return self.smallest is not None and self.smallest[0] <= number and self.smallest[1] > utime
 
     def let_go_between(self, number: int, utime: float) -> None:
