@@ -4,10 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
+from gateway.config.section import validated
 from gateway.config.values import ChannelPrefix, SourceName
-from gateway.errors import SelectionError
+from gateway.errors import ConfigError, SelectionError
 from gateway.outputs.zenoh.settings import KeyPrefix
 
 
@@ -25,6 +24,6 @@ def check_arguments(sources: Sequence[object], last_s: object, prefix: str | Non
 
 def _check(kind: Any, value: object, problem: str) -> None:
     try:
-        TypeAdapter(kind).validate_python(value)
-    except ValidationError as error:
-        raise SelectionError(f"{problem}: {error.errors(include_url=False)[0]['msg']}") from None
+        validated(kind, value)
+    except ConfigError as error:
+        raise SelectionError(f"{problem}: {error}") from None

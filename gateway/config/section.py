@@ -9,6 +9,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     ModelWrapValidatorHandler,
+    TypeAdapter,
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
@@ -17,6 +18,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from gateway.config.words import describe, spelling_hint
+from gateway.errors import ConfigError
 
 UNKNOWN_KEY: Final = "unknown_key"
 """The error type of a key that does not exist; all other errors are about a value or its absence."""
@@ -64,6 +66,14 @@ class Section(BaseModel):
                     text = "missing; this key is required"
                 mistakes.append(_line_error(text, location, kind))
             raise ValidationError.from_exception_data(cls.__name__, mistakes) from None
+
+
+def validated(kind: Any, value: object) -> Any:
+    """Return a value as this type of the configuration has it. Raises ConfigError with what is expected."""
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        raise ConfigError(error.errors(include_url=False)[0]["msg"]) from None
 
 
 def validation_error(text: str, *location: str | int) -> ValidationError:

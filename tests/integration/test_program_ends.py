@@ -383,12 +383,12 @@ def test_a_program_that_catches_ctrl_c_ends_although_it_joined_a_thread_that_rec
     """
     text = """
         def interrupt():
-            time.sleep(0.1)
+            time.sleep(0.1)  # until the main thread waits
             os.kill(os.getpid(), signal.SIGINT)
             while not is_caught.wait(5.0):  # it may have come just before Python waits
                 os.kill(os.getpid(), signal.SIGINT)
             while sys.version_info >= (3, 13):
-                time.sleep(5.0)
+                time.sleep(5.0)  # until Python waits for the thread that receives
                 os.kill(os.getpid(), signal.SIGINT)
         import signal
         is_caught = threading.Event()

@@ -22,6 +22,7 @@ from gateway.takes.files.row import ItemValues
 from gateway.takes.files.spool import pieces
 
 COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
+"""The columns of a series, which the head of each message has."""
 
 _NEIGHBOURS: Final = 20
 """How many rows beside two tell whether something starts again between them; some may have no time stamp."""

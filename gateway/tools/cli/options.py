@@ -21,7 +21,7 @@ import typer
 from gateway.config.document import VARIABLE_PREFIX, apply_overrides, read_yaml
 from gateway.config.files import DEFAULT_CONFIG, read_file
 from gateway.config.words import describe, join_or
-from gateway.errors import QueryError
+from gateway.errors import ConfigError, QueryError
 from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.runtime.log_format import LogFormat, LogLevel
@@ -85,12 +85,12 @@ def _checked(module: str, name: str) -> _Callback:
     """Return a callback for an option whose value must be valid as this type of the configuration."""
 
     def check(text: str) -> str:
-        from pydantic import TypeAdapter, ValidationError
+        from gateway.config.section import validated
 
         try:
-            return str(TypeAdapter(getattr(import_module(module), name)).validate_python(text))
-        except ValidationError as error:
-            raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
+            return str(validated(getattr(import_module(module), name), text))
+        except ConfigError as error:
+            raise typer.BadParameter(str(error)) from None
 
     return _on_each(check)
 

@@ -59,7 +59,7 @@ def _advertised_topics(settings: FoxgloveSettings) -> list[str] | None:
     from websockets.sync.client import connect  # noqa: PLC0415
     from websockets.typing import Subprotocol  # noqa: PLC0415
 
-    from gateway.outputs.adapters.foxglove.connections import SUBPROTOCOLS  # noqa: PLC0415
+    from gateway.outputs.adapters.foxglove.connections import SUBPROTOCOLS  # noqa: PLC0415 - it needs them, too
 
     host = host_in_url(from_this_computer(settings.host))
     names = [Subprotocol(name) for name in SUBPROTOCOLS]
