@@ -195,6 +195,7 @@ def test_a_real_router_confirms_what_it_reads_and_not_what_it_does_not() -> None
             for _ in range(10):
                 publisher.publish(b"read")
             wait_until(is_confirmed)
+            wait_until(lambda: len(samples) == 10)  # the router has read them before it hands them on
             router.send_signal(signal.SIGSTOP)
             os.waitpid(router.pid, os.WUNTRACED)  # until all its threads have stopped
             for _ in range(20):
