@@ -28,7 +28,7 @@ SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-install test-anywhere test-compiled check bytecode lint types contracts generated messages docs site lcm-types examples \
     samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
-    check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-files uninstall \
+    check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-program install-files uninstall \
     clone-url clean
 
 demo: .venv/runtime
@@ -186,21 +186,25 @@ build/compiled/complete: .venv/installed $(shell find $(SOURCES) -type f ! -path
 	$(BIN)/pip install --quiet --no-deps --target build/compiled build/compiled/wheel/*.whl
 	touch $@
 
-# Run as root. The service's user cannot read home directories, so its Python must not be in one.
+# Run as root. The service's user cannot read home directories, so its Python must not be in one; and it must be able to
+# read what root installs, whatever root's umask is.
 install:
 	@[ ! -e /usr/lib/systemd/system/rtc3d-gateway.service ] || { \
 	    echo 'The Debian package is installed, with its files in the same place: apt remove rtc3d-gateway' >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; home = sys.base_prefix.startswith(("/home/", "/root/")); \
 	    sys.exit(f"the service cannot read {sys.base_prefix}, which is in a home directory; run make with PYTHON=/usr/bin/python3" if home else 0)'
-	$(PYTHON) -m venv $(PREFIX)/venv
-	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
-	@set -e; dist=$$(mktemp -d); trap 'rm -rf "$$dist"' EXIT; $(PYTHON) -B -m release.build --dist "$$dist" wheel; \
-	    $(PREFIX)/venv/bin/pip install --quiet --force-reinstall --no-deps "$$dist"/*.whl
-	$(MAKE) --no-print-directory install-files PYTHON=$(PREFIX)/venv/bin/python
+	umask 022; $(MAKE) --no-print-directory install-program
+	umask 022; $(MAKE) --no-print-directory install-files PYTHON=$(PREFIX)/venv/bin/python
 	systemd-sysusers rtc3d-gateway.conf
 	systemd-tmpfiles --create rtc3d-gateway.conf
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 	@echo 'Enter your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
+
+install-program:
+	$(PYTHON) -m venv $(PREFIX)/venv
+	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
+	@set -e; dist=$$(mktemp -d); trap 'rm -rf "$$dist"' EXIT; $(PYTHON) -B -m release.build --dist "$$dist" wheel; \
+	    $(PREFIX)/venv/bin/pip install --quiet --force-reinstall --no-deps "$$dist"/*.whl
 
 # What an installation from source and the Debian package have in common, apart from the program itself. PYTHON must
 # have the gateway.
@@ -213,9 +217,9 @@ install-files:
 	install -m 644 systemd/tmpfiles.conf $(DESTDIR)$(USR)/lib/tmpfiles.d/rtc3d-gateway.conf
 	[ -e $(DESTDIR)$(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(DESTDIR)$(CONFIG)/gateway.yaml
 	install -m 644 config/gateway.schema.json $(DESTDIR)$(CONFIG)/gateway.schema.json
-	umask 022; $(PYTHON) -P -m gateway.tools.cli.man_page >$(DESTDIR)$(MAN_PAGE)
-	umask 022; _RTC3D_GATEWAY_COMPLETE=source_bash $(PYTHON) -P -m gateway >$(DESTDIR)$(BASH_COMPLETION)
-	umask 022; _RTC3D_GATEWAY_COMPLETE=source_fish $(PYTHON) -P -m gateway >$(DESTDIR)$(FISH_COMPLETION)
+	$(PYTHON) -P -m gateway.tools.cli.man_page >$(DESTDIR)$(MAN_PAGE)
+	_RTC3D_GATEWAY_COMPLETE=source_bash $(PYTHON) -P -m gateway >$(DESTDIR)$(BASH_COMPLETION)
+	_RTC3D_GATEWAY_COMPLETE=source_fish $(PYTHON) -P -m gateway >$(DESTDIR)$(FISH_COMPLETION)
 	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway $(DESTDIR)$(USR)/bin/rtc3d-gateway
 
 # Run as root. This keeps the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that

@@ -58,6 +58,7 @@ def build_package(folder: Path, kind: str, version: str = __version__, repositor
 
 def main() -> None:
     """Run the program."""
+    os.umask(0o022)  # debootstrap makes folders that all users of the system must be able to enter
     subprocess.run(["apt-get", "update", "--quiet=2"], check=True)
     _COMPLETE.unlink(missing_ok=True)
     _FOLDER.mkdir(parents=True, exist_ok=True)

@@ -61,6 +61,11 @@ class Machine:
         """Return the path outside the machine of a file in it."""
         return self._files / path.removeprefix("/")
 
+    def write(self, path: str, text: str) -> None:
+        """Write a file that all users of the machine can read."""
+        self.path(path).write_text(text)
+        self.path(path).chmod(0o644)
+
     async def run(
         self, *command: str, check: bool = True, environment: Mapping[str, str] | None = None
     ) -> Outcome:
@@ -161,7 +166,7 @@ class Service:
             "lcm": {"enabled": False},
             "metrics": {"enabled": False},
         }
-        self.machine.path(CONFIG).write_text(yaml.safe_dump(configuration | sections))
+        self.machine.write(CONFIG, yaml.safe_dump(configuration | sections))
 
     async def drop_in(self, *lines: str) -> None:
         """Add lines to the section [Service] of the unit, as ``systemctl edit`` does."""

@@ -132,7 +132,7 @@ async def test_a_secret_reaches_the_gateway_only(service: Service) -> None:
 
 async def test_upgrading_and_removing_keep_the_configuration(machine: Machine) -> None:
     mine = "sources: [{name: mine, host: 192.0.2.20}]\n"
-    machine.path(CONFIG).write_text(mine)
+    machine.write(CONFIG, mine)
     await machine.run("tar", "--create", "--absolute-names", "--file", KEPT, *INSTALLED)
     await machine.run_shell(WITHOUT_COMPILER + commands("Upgrade"))
     assert "compiled" not in (await machine.run(PROGRAM, "--version")).text

@@ -145,7 +145,7 @@ async def test_a_bad_configuration_is_refused_and_the_old_one_stays_in_use(servi
 
 
 async def test_a_start_with_a_bad_configuration_fails_once_and_logs_why(service: Service) -> None:
-    service.machine.path(CONFIG).write_text("sources: []\n")
+    service.machine.write(CONFIG, "sources: []\n")
     started = await service.machine.run("systemctl", "start", UNIT, check=False)
     assert started.status != 0
     assert await service.machine.show("ActiveState") == "failed"
