@@ -20,9 +20,6 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 RELEASE_TOOLS := build/release-venv/complete
 RELEASE_PYTHON := build/release-venv/bin/python
 
-# A bare Debian 12, in which tests install the Debian package.
-BARE := build/bare-debian-12/complete
-
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
@@ -42,21 +39,20 @@ AGAIN :=
 test: .venv/installed
 	MAKEFLAGS= exec $(BIN)/python tests/run.py $(AGAIN) $(ARGS)
 
-# What is slow by nature: attacks, outages, browsers, installation, systemd, the examples in other languages, and the
-# commands in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging release hostile outages docs languages benchmarks view site bids)
+# What is slow by nature: attacks, outages, browsers, installing from source, systemd, the examples in other languages,
+# and the commands in the documents.
+SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view bids)
 
-test-slow: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE) build/compiled/complete
+test-slow: .venv/installed build/wheelhouse/complete build/compiled/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(AGAIN) --dist loadgroup \
-	    -m 'not installation' $(or $(ARGS),$(SLOW_TESTS))
+	    $(or $(ARGS),$(SLOW_TESTS))
 
-# The whole test of installing: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a
-# second build; the wheels and the sdist on a Debian without a compiler; the container image. It takes a quarter of an
-# hour, and is not part of the check.
-test-install: .venv/installed build/wheelhouse/complete $(RELEASE_TOOLS)
-	$(BIN)/python -B -m tests.support.bare_debian --python
-	MAKEFLAGS= FULL_INSTALLATION=1 exec $(BIN)/python tests/run.py --dist loadgroup tests/systemd tests/release tests/site \
-	    tests/systemd/full_package.py tests/systemd/full_wheels.py tests/release/full_image.py
+# What is released: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a second build;
+# the wheels and the sdist on a Debian without a compiler; the container image; bills, licences; the site. It takes a
+# quarter of an hour, and is not part of the check.
+test-install: .venv/installed build/wheelhouse/complete build/compiled/complete $(RELEASE_TOOLS)
+	$(BIN)/python -B -m tests.support.bare_debian
+	MAKEFLAGS= exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),tests/systemd tests/release tests/site)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -278,13 +274,7 @@ build/bin/actionlint:
 	else echo 'The workflows are not checked: go is missing (Debian: golang-go)'; fi
 
 # Download the packages that an installation needs: its tests have no network.
-wheelhouse: build/wheelhouse/complete $(RELEASE_TOOLS) $(BARE)
-
-# Debian may have replaced a package of $(DEB_LOCK) since the last `make deb-lock`: the tests then use the newer one.
-$(BARE): $(DEB_LOCK) tests/support/bare_debian.py | .venv/installed
-	@if command -v debootstrap apt-get >/dev/null && [ "$$(id -u)" = 0 ]; then \
-	    echo 'Making a bare Debian 12 for tests (about 30 s) …'; $(BIN)/python -B -m tests.support.bare_debian; \
-	else echo 'The Debian package is not tested: that needs root, apt-get and debootstrap'; fi
+wheelhouse: build/wheelhouse/complete
 
 build/wheelhouse/complete: pyproject.toml requirements-view.txt release/build-requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv

@@ -41,8 +41,8 @@ settings.load_profile("gateway")  # the option --hypothesis-profile loads anothe
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
 _GROUPS: Final = {
-    "machine": ("tests/systemd/test_installing.py", "tests/systemd/test_service.py"),
-    "package": ("tests/systemd/",),
+    "machine": ("tests/systemd/",),
+    "package": ("tests/release/test_debian_package.py", "tests/release/test_package_build.py"),
     "release": ("tests/release/",),
     "outages": ("tests/outages/",),
     "sites": ("tests/hostile/test_sites.py",),

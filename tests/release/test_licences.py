@@ -24,7 +24,6 @@ def environment_with(folder: Path, name: str, *metadata: str) -> Path:
 
 @pytest.mark.wheelhouse
 @pytest.mark.timeout(600)
-@pytest.mark.installation
 def test_the_file_has_the_licence_of_each_package(python: Path, tmp_path: Path) -> None:
     result = release("-m", "release.licences", python, tmp_path / "THIRD_PARTY.txt")
     assert result.returncode == 0, result.stderr

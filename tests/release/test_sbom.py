@@ -17,7 +17,7 @@ from tests.packaging.test_requirements import locked_in
 from tests.support.builds import Built, release
 from tests.support.fresh_clones import skip_without_compiler
 
-pytestmark = [pytest.mark.installation, pytest.mark.wheelhouse, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
 
 Bill = dict[str, Any]
 

@@ -120,7 +120,6 @@ def test_the_program_prints_its_version_and_that_it_is_compiled(program: Path, t
     assert run(program, tmp_path, "--version") == f"rtc3d-gateway {__version__} (compiled)\n"
 
 
-@pytest.mark.installation
 def test_pip_installs_the_sdist_without_a_compiler(python: Path, tmp_path: Path) -> None:
     program = python.with_name("rtc3d-gateway")
     assert run(program, tmp_path, "--version") == f"rtc3d-gateway {__version__} (pure Python)\n"

@@ -88,7 +88,6 @@ def test_the_button_copies_a_block_as_it_is_in_the_source(site: Path, new_page: 
     assert copied.count("\n") > 10
 
 
-@pytest.mark.installation
 def test_a_web_server_shows_all_versions_the_newest_first(tmp_path: Path, new_page: NewPage) -> None:
     clone = tmp_path / "clone"
     run(["git", "init", "--quiet", str(clone)], check=True)

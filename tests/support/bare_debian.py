@@ -1,6 +1,6 @@
 """A bare Debian 12, and the Debian package of this repository, for tests of the package and of the image.
 
-``make wheelhouse`` runs this program, because the tests have no network: it makes the bare system, and
+``make test-install`` runs this program, because the tests have no network: it makes the bare systems, and
 downloads the packages of Debian that are in the package.
 """
 
@@ -24,14 +24,14 @@ _COMPLETE: Final = _FOLDER / "complete"
 _PACKAGES: Final = _FOLDER / "packages.txt"
 
 PYTHON_ROOT: Final = _FOLDER / "python-root"
-"""The root folder of a Debian 12 that also has Python, for the wheels; `make test-install` makes it."""
+"""The root folder of a Debian 12 that also has Python, for the wheels."""
 
 
 def bare_root() -> Path:
     """Return the root folder of a bare Debian 12 with systemd: no compiler, no Python. It must not change."""
     need(
         _COMPLETE.exists(),
-        "needs a bare Debian 12: run `make wheelhouse` as root, with debootstrap installed",
+        "needs a bare Debian 12: run `make test-install` as root, with debootstrap installed",
     )
     return _ROOT_FILES
 
@@ -71,8 +71,7 @@ def main() -> None:
     command = (sys.executable, "-B", "-c", "from tests.support.bare_debian import fetch; fetch()")
     subprocess.run(command, cwd=ROOT, env={**os.environ, "DEB_PACKAGES": str(_PACKAGES)}, check=True)
     _make_root(_ROOT_FILES, "systemd-sysv")
-    if "--python" in sys.argv[1:]:
-        _make_root(PYTHON_ROOT, "systemd-sysv,python3-venv,libglib2.0-0")
+    _make_root(PYTHON_ROOT, "systemd-sysv,python3-venv,libglib2.0-0")
     _COMPLETE.touch()
 
 

@@ -46,7 +46,7 @@ def build(clone: Path, command: Sequence[str | Path], umask: int = 0o022, **envi
 
 def release(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run Python with the tools of a release; ``-m release.sbom`` is one of its programs."""
-    need((_RELEASE_TOOLS / "complete").exists(), "needs the tools of a release: run make wheelhouse first")
+    need((_RELEASE_TOOLS / "complete").exists(), "needs the tools of a release: run make test-install")
     command = [_RELEASE_TOOLS / "bin/python", "-B", *arguments]
     environment = {"PATH": SYSTEM_PATH, **environment}
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)

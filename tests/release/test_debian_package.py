@@ -1,7 +1,6 @@
-"""The Debian package, on a bare Debian 12: systemd, no compiler, no Python, no network.
+"""The Debian package of `make deb`, on a bare Debian 12: systemd, no compiler, no Python, no network.
 
-With FULL_INSTALLATION=1 (`make test-install`), the package is that of `make deb`, and the upgrade begins with
-the package of the previous commit.
+The upgrade begins with the package of the previous commit.
 """
 
 import os
@@ -14,7 +13,7 @@ from typing import Final
 import pytest
 
 from gateway import __version__
-from tests.support.bare_debian import bare_root, build_package, quick_package
+from tests.support.bare_debian import bare_root, build_package
 from tests.support.fresh_clones import ROOT, pip_environment
 from tests.systemd.machine import CLONE, CONFIG, UNIT, Machine, booted, commands
 
@@ -25,7 +24,6 @@ pytestmark = [
     pytest.mark.timeout(1800),
 ]
 
-FULL: Final = bool(os.environ.get("FULL_INSTALLATION"))
 INSTANCE: Final = "rtc3d-gateway@hall-2.service"
 TAKE: Final = "/var/lib/rtc3d-gateway/takes/walk.lcmlog"
 MINE: Final = "sources: [{name: mine, host: 192.0.2.20}]\n"
@@ -38,8 +36,6 @@ OF_OTHERS: Final = ("/var/cache/apt", "/var/lib/apt", "/var/lib/systemd", "/var/
 @pytest.fixture(scope="module")
 def package() -> Path:
     """Return the package of this repository."""
-    if not FULL:
-        return quick_package()
     environment = {**os.environ, **pip_environment(), "MAKEFLAGS": ""}  # tests have no network
     subprocess.run(["make", "--silent", "deb"], cwd=ROOT, check=True, env=environment)
     return ROOT / f"dist/rtc3d-gateway_{__version__}_amd64.deb"
@@ -103,7 +99,6 @@ async def test_a_bare_machine_runs_the_service_at_once(bare_machine: Machine, pa
     assert (await run("bash", "-c", f"{source}; {completion}")).text == "doctor\n"
 
 
-@pytest.mark.installation
 async def test_an_upgrade_keeps_configuration_and_takes(
     bare_machine: Machine, package: Path, tmp_path: Path
 ) -> None:
@@ -162,7 +157,6 @@ async def test_removing_keeps_what_is_yours_and_purging_leaves_nothing(
     assert now == users
 
 
-@pytest.mark.installation
 async def test_the_package_refuses_to_replace_an_installation_from_source(
     bare_machine: Machine, package: Path
 ) -> None:
@@ -187,9 +181,7 @@ def with_version(package: Path, version: str, folder: Path) -> Path:
 
 
 def previous_package(folder: Path) -> Path | None:
-    """Return the package of the previous commit; None without FULL, or if that commit cannot build one."""
-    if not FULL:
-        return None
+    """Return the package of the previous commit; None if that commit cannot build one."""
     previous, output = folder / "previous", folder / "built"
     git = ("git", "-c", "safe.directory=*", "-C", str(ROOT))
     subprocess.run([*git, "worktree", "add", "--detach", previous, "HEAD~1"], check=True)

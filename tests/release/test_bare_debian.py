@@ -1,4 +1,4 @@
-"""The wheels and the sdist on a Debian 12 with Python, without compiler and network (`make test-install`)."""
+"""The wheels and the sdist on a Debian 12 with Python, without compiler and network."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""What `make test-install` checks of the Debian package besides test_debian_package.py."""
+"""The Debian package as a file: lintian finds no error, and a second build gives the same bytes."""
 
 import hashlib
 import os
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.release.test_debian_package import package
 from tests.support.fresh_clones import ROOT, pip_environment
 from tests.support.needs import need_programs
-from tests.systemd.test_debian_package import package
 
 __all__ = ["package"]  # a fixture
 
