@@ -38,7 +38,7 @@ class Effective(NamedTuple):
 class Section(BaseModel):
     """A mapping in the configuration: frozen, and without unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     @property
     def effective(self) -> dict[str, Effective]:

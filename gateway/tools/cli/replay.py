@@ -1,16 +1,14 @@
 """``rtc3d-gateway replay``: publish a take again."""
 
-import gc
 import re
-import sys
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
 from gateway.runtime.log_format import LogLevel, set_up_log
+from gateway.runtime.process_start import keep_event_loop_responsive
 from gateway.tools.cli import options
-from gateway.tools.cli.run import SWITCH_INTERVAL_S
 from gateway.tools.replay.timeline import MAX_GAP_S
 
 _MAX_RATE: Final = 1000.0
@@ -85,8 +83,7 @@ def replay(
     from gateway.tools.replay.replay import lcm_destination, zenoh_destination
 
     set_up_log(LogLevel.WARNING)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    gc.freeze()  # or a full garbage collection looks through all modules, which takes 20 ms
+    keep_event_loop_responsive()
     destinations = []
     if not lcm:
         destinations.append(zenoh_destination(prefix, connect, listen, zenoh_config))

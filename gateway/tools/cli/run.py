@@ -1,24 +1,23 @@
 """``rtc3d-gateway run``, ``simulate`` and ``demo``: the gateway, a simulated server, or both together."""
 
-import gc
 import logging
 import os
 import select
 import signal
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 from gateway.runtime.log_format import LogLevel, set_up_log
 from gateway.runtime.process_end import end_at_once
+from gateway.runtime.process_start import keep_event_loop_responsive
 from gateway.tools.cli import options
 
 if TYPE_CHECKING:
@@ -28,11 +27,6 @@ if TYPE_CHECKING:
 
 
 logger = logging.getLogger(__name__)
-
-SWITCH_INTERVAL_S: Final = 0.0005
-"""How long a thread that runs Python keeps another one, such as the event loop, waiting for its lock. Every
-message to an output releases that lock once, so that the default of 5 ms would add up to more than the time
-between two frames."""
 
 
 @options.with_options
@@ -51,10 +45,7 @@ def run(
 
     limit = LogLimit()
     set_up_log(level, log.log_format, limit)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    # The objects of all modules stay until the end. Without this, each full garbage collection looks through
-    # them and stops the event loop for some 20 ms; many tiny packets cause one every second.
-    gc.freeze()
+    keep_event_loop_responsive()
     file = chosen_file(config, server)
     if file is not None and config is None:
         logger.info("the configuration is %s, because none was given", file)
@@ -215,9 +206,7 @@ def simulate(
         scene = C3dScene(synthetic.c3d)
     else:
         scene = extended.scene.build()
-    # A take is read by a thread, while frames are sent.
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    gc.freeze()
+    keep_event_loop_responsive()
 
     async def play() -> None:
         stop = _stop_event()

@@ -12,7 +12,7 @@ from hypothesis import settings as hypothesis_settings
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
-from gateway.config.loading import schema_text
+from gateway.config.loading import key_descriptions, schema_text
 from gateway.config.section import Section
 from gateway.config.settings import (
     HistorySettings,
@@ -89,8 +89,9 @@ def accepted_by(section: type[Section], key: str) -> str:
 
 def table(section: type[Section]) -> str:
     lines = ["| key | default | accepted | what |", "|---|---|---|---|"]
-    for key, field in section.model_fields.items():
-        description = " ".join(str(field.description).split())
+    descriptions = key_descriptions(section)
+    for key in section.model_fields:
+        description = " ".join(descriptions[key].split())
         lines.append(
             f"| `{key}` | {default_of(section, key)} | {accepted_by(section, key)} | {description} |"
         )
