@@ -3,14 +3,10 @@
 Every mistake is reported with its position.
 """
 
-import ast
-import inspect
 import json
 import math
 import os
-import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -29,7 +25,7 @@ from gateway.config.document import (
     variable_name,
 )
 from gateway.config.files import read_file
-from gateway.config.section import UNKNOWN_KEY, Section
+from gateway.config.section import UNKNOWN_KEY, Section, key_descriptions
 from gateway.config.settings import OutputSettings, Settings
 from gateway.config.words import find_secrets, replace_item
 from gateway.errors import ConfigError
@@ -286,27 +282,6 @@ class _SchemaGenerator(GenerateJsonSchema):
 
     def field_title_should_be_set(self, schema: Any) -> bool:  # noqa: ARG002 - no key has one
         return False
-
-
-def key_descriptions(section: type[Section]) -> dict[str, str]:
-    """Return the docstrings below the keys of a section.
-
-    pydantic can do this, too, but would read the source text of all sections at each start, in 0.06 s.
-    """
-    texts: dict[str, str] = {}
-    for model in reversed(section.__mro__):
-        if not issubclass(model, Section):
-            continue
-        try:
-            module = ast.parse(textwrap.dedent(inspect.getsource(model)))
-        except (OSError, TypeError):  # a package without its source code
-            continue
-        for key, text in pairwise(getattr(module.body[0], "body", ())):
-            match key, text:
-                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(docstring))):
-                    if name in section.model_fields:
-                        texts[name] = inspect.cleandoc(docstring)
-    return texts
 
 
 def schema_text(model: type[Settings]) -> str:

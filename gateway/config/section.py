@@ -1,8 +1,12 @@
 """The base class of all parts of the configuration: frozen, and with the gateway's error texts."""
 
+import ast
+import inspect
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
+from itertools import pairwise
 from typing import Any, Final, NamedTuple, Self
 
 from pydantic import (
@@ -66,6 +70,27 @@ class Section(BaseModel):
                     text = "missing; this key is required"
                 mistakes.append(_line_error(text, location, kind))
             raise ValidationError.from_exception_data(cls.__name__, mistakes) from None
+
+
+def key_descriptions(section: type[Section]) -> dict[str, str]:
+    """Return the docstrings below the keys of a section.
+
+    pydantic can do this, too, but would read the source text of all sections at each start, in 0.06 s.
+    """
+    texts: dict[str, str] = {}
+    for model in reversed(section.__mro__):
+        if not issubclass(model, Section):
+            continue
+        try:
+            module = ast.parse(textwrap.dedent(inspect.getsource(model)))
+        except (OSError, TypeError):  # a package without its source code
+            continue
+        for key, text in pairwise(getattr(module.body[0], "body", ())):
+            match key, text:
+                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(docstring))):
+                    if name in section.model_fields:
+                        texts[name] = inspect.cleandoc(docstring)
+    return texts
 
 
 def validated(kind: Any, value: object) -> Any:

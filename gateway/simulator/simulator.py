@@ -13,7 +13,7 @@ import yaml
 from pydantic import BaseModel, PlainValidator, SerializeAsAny, ValidationError
 
 from gateway.config.loading import load_as
-from gateway.config.section import Section, expects, validation_error
+from gateway.config.section import Section, expects, key_descriptions, validation_error
 from gateway.config.words import describe, spelling_hint
 from gateway.errors import ConfigError, GatewayError
 from gateway.session.server.client_connection import ClientConnection
@@ -349,11 +349,12 @@ def validate_fault(value: object) -> Fault:
 
 def parameters_of(kind: type[Fault]) -> Iterator[tuple[str, str, str]]:
     """Yield name, default ("" for none) and description of each parameter except the common ones."""
+    descriptions = key_descriptions(kind)
     for name, field in kind.model_fields.items():
         if name not in COMMON_PARAMETERS:
             default = field.get_default()
             has_text = not field.is_required() and not isinstance(default, BaseModel)
-            yield name, parameter_text(default) if has_text else "", field.description or ""
+            yield name, parameter_text(default) if has_text else "", descriptions.get(name, "")
 
 
 def describe_kinds() -> str:

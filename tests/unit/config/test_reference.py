@@ -12,8 +12,8 @@ from hypothesis import settings as hypothesis_settings
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
-from gateway.config.loading import key_descriptions, schema_text
-from gateway.config.section import Section
+from gateway.config.loading import schema_text
+from gateway.config.section import Section, key_descriptions
 from gateway.config.settings import (
     HistorySettings,
     MetricsSettings,
