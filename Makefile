@@ -65,7 +65,7 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/runtime/test_failu
     $(addprefix tests/unit/,takes/files client/test_recorder.py) tests/integration/test_streams.py tests/unit/daemon/test_gateway.py
 
 test-compiled: build/compiled/complete
-	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py $(AGAIN) --workers 2 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
+	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py $(AGAIN) --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
 # The tests in other surroundings: a machine that has just booted or has been up for 400 days, other time zones, locales,
 # users, host names and Pythons, one core, random order. It needs root, and takes an hour; SURROUNDINGS="fresh user"
@@ -80,7 +80,8 @@ test-anywhere: .venv/installed
 check: .venv/installed
 	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
 	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types wheelhouse
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=2 test-slow test-compiled
+	$(MAKE) --no-print-directory test-slow
+	$(MAKE) --no-print-directory test-compiled
 
 # Write the bytecode of the tests: workers that start together would each compile all of them, in 10 s.
 bytecode: .venv/installed
