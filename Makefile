@@ -43,7 +43,7 @@ test: .venv/installed
 # and the commands in the documents.
 SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view bids)
 
-test-slow: .venv/installed build/wheelhouse/complete build/compiled/complete
+test-slow: .venv/installed build/wheelhouse/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(AGAIN) --dist loadgroup \
 	    $(or $(ARGS),$(SLOW_TESTS))
 
@@ -76,12 +76,12 @@ SLOW ?= --slow
 test-anywhere: .venv/installed
 	$(BIN)/python -B -m tests.anywhere $(SLOW) $(SURROUNDINGS)
 
-# The tests use both cores, and wait often enough for the compiler, mypy and downloads to run beside them.
+# What to run before each commit. mypy and downloads run beside tests that wait. After changes to compiled modules, run
+# `make test-compiled`, too, as CI does.
 check: .venv/installed
 	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
-	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types wheelhouse
+	$(MAKE) --keep-going --no-print-directory --jobs=3 test types wheelhouse
 	$(MAKE) --no-print-directory test-slow
-	$(MAKE) --no-print-directory test-compiled
 
 # Write the bytecode of the tests: workers that start together would each compile all of them, in 10 s.
 bytecode: .venv/installed

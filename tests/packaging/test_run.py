@@ -51,7 +51,7 @@ def run_tests(
 ) -> subprocess.CompletedProcess[str]:
     (folder / "test_one.py").write_text(content)
     return subprocess.run(
-        [sys.executable, "tests/run.py", "--workers", "3", *arguments, *PLUGINS, str(folder)],
+        [sys.executable, "tests/run.py", "--workers", "1", *arguments, *PLUGINS, str(folder)],
         cwd=ROOT,
         env={**os.environ, **environment},
         capture_output=True,
