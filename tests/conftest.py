@@ -26,6 +26,10 @@ from tests.support.needs import is_root, need
 # that finds a Zenoh session there waits for threads that the child does not have; the parent waits for it.
 os.register_at_fork(before=gc.disable, after_in_parent=gc.enable)
 
+# Thousands of tests are many objects that stay: looking through them for garbage would take a fifth of the CPU
+# time of a run. See also pytest_collection_finish.
+gc.set_threshold(20_000)
+
 # A deadline would fail on a busy machine. The same examples in each run: `make fuzz` looks for new ones.
 settings.register_profile("gateway", deadline=None, derandomize=True, database=None)
 settings.register_profile(
@@ -88,6 +92,11 @@ def pytest_configure(config: pytest.Config) -> None:
             null = os.open(os.devnull, os.O_RDWR)
             for file in (connection.infile, connection.outfile):
                 os.register_at_fork(after_in_child=partial(os.dup2, null, file.fileno()))
+
+
+def pytest_collection_finish() -> None:
+    """Leave what pytest has collected out of further garbage collections."""
+    gc.freeze()
 
 
 def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:

@@ -1,5 +1,6 @@
 """``doctor --exposure`` against the kernel: a gateway with every output opens the listed ports only."""
 
+import contextlib
 import ipaddress
 import json
 import sys
@@ -46,11 +47,11 @@ def _address_text(words: str) -> str:
 
 def children(pid: int) -> list[int]:
     """Return the processes that any thread of a process has started."""
-    return [
-        int(child)
-        for task in Path(f"/proc/{pid}/task").iterdir()
-        for child in (task / "children").read_text().split()
-    ]
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # the thread has ended meanwhile
+            found += map(int, (task / "children").read_text().split())
+    return found
 
 
 def listed_ports(config: Path) -> list[dict[str, Any]]:
