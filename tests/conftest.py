@@ -26,8 +26,8 @@ from tests.support.needs import is_root, need
 # that finds a Zenoh session there waits for threads that the child does not have; the parent waits for it.
 os.register_at_fork(before=gc.disable, after_in_parent=gc.enable)
 
-# Thousands of tests are many objects that stay: looking through them for garbage would take a fifth of the CPU
-# time of a run. See also pytest_collection_finish.
+# Thousands of tests are many objects that stay: looking through them for garbage would take a fifth of the
+# CPU time of a run. See also pytest_collection_finish.
 gc.set_threshold(20_000)
 
 # A deadline would fail on a busy machine. The same examples in each run: `make fuzz` looks for new ones.
