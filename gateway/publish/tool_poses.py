@@ -23,7 +23,7 @@ _MAX_TOOLS: Final = 256
 """How many tools can have topics of their own. The server determines the number of tools in a frame."""
 
 
-class _Tool:
+class _ToolRoutes:
     """One tool's topic: its name, and its route to each output."""
 
     def __init__(self, name: str) -> None:
@@ -54,7 +54,7 @@ class ToolPoses:
         self._labels: tuple[str, ...] = ()
         self._parameters = Parameters()
         self._frame = CoordinateFrame("")
-        self._tools: list[_Tool] = []
+        self._tools: list[_ToolRoutes] = []
         self._sequences: dict[str, int] = {}  # by the tools' names, also former ones
 
     @property
@@ -145,7 +145,7 @@ class ToolPoses:
             if name not in self._sequences:
                 self._history.forget(_key(name))
             self._sequences[name] = self._sequences.pop(name, 0)  # the newest names are at the end
-            tool = _Tool(name)
+            tool = _ToolRoutes(name)
             tool.set_routes(self._output_routes)
             self._tools.append(tool)
         for name in list(self._sequences)[:-_MAX_REMEMBERED_NAMES]:

@@ -98,7 +98,7 @@ class MonitoringServer:
         await self._pages.close()
 
 
-class _Route(NamedTuple):
+class _PlaceOfLoss(NamedTuple):
     """What was lost of a source: in one stream, before any output, or on one output."""
 
     source: str
@@ -179,13 +179,13 @@ def _outputs(gateway: Gateway) -> list[dict[str, str]]:
     ]
 
 
-def _routes(gateway: Gateway) -> Iterator[_Route]:
+def _routes(gateway: Gateway) -> Iterator[_PlaceOfLoss]:
     """Yield what each stream lost before any output, and what each source lost on each output."""
     for source in gateway.sources:
         for status in source.statuses:
-            yield _Route(source.name, status.components, None, status.losses.report())
+            yield _PlaceOfLoss(source.name, status.components, None, status.losses.report())
         for output, output_status in source.fan_out.outputs:
-            yield _Route(source.name, None, output.name, output_status.losses)
+            yield _PlaceOfLoss(source.name, None, output.name, output_status.losses)
 
 
 def _stream_problem(

@@ -40,7 +40,7 @@ class SentMessages:
         """How many were in connections that were lost, and are not yet counted as loss."""
 
 
-class _Question:
+class _RouterQuestion:
     """A question to the router, with the number of messages of each source that it waits behind."""
 
     def __init__(self, counts: dict[SentMessages, int], asked_s: float) -> None:
@@ -61,7 +61,7 @@ class RouterConfirmation:
         self._monotonic = monotonic
         self._lock = threading.Lock()  # of everything below
         self._sent: dict[str, SentMessages] = {}
-        self._question: _Question | None = None
+        self._question: _RouterQuestion | None = None
 
     def of(self, source: str) -> SentMessages:
         """Return the count of a source's messages."""
@@ -91,7 +91,7 @@ class RouterConfirmation:
             if question is not None and question.has_failed:
                 asked_s = question.asked_s  # the router is silent since then
             counts = {sent: sent.count for sent in self._sent.values()}
-            self._question = question = _Question(counts, asked_s)
+            self._question = question = _RouterQuestion(counts, asked_s)
         asked = question
 
         def on_reply(reply: zenoh.Reply) -> None:

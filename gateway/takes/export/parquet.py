@@ -27,13 +27,13 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 def export_parquet(job: ExportJob) -> None:
     """Write the tables of a take, each in row groups of some MB."""
-    files: dict[Table, _File] = {}
+    files: dict[Table, _TableFile] = {}
     with ExitStack() as open_files:
         for table, part in table_parts(job):
             batch = _record_batch(table, part)
             if table not in files:
                 writer = pq.ParquetWriter(job.files.create(table.path), batch.schema, use_dictionary=False)
-                files[table] = _File(open_files.enter_context(writer))
+                files[table] = _TableFile(open_files.enter_context(writer))
             files[table].add(batch)
             job.written[table.source.name, table.key] += batch.num_rows
             if sum(file.waiting_bytes for file in files.values()) > _MAX_WAITING_BYTES:
@@ -42,7 +42,7 @@ def export_parquet(job: ExportJob) -> None:
             file.write_row_group()
 
 
-class _File:
+class _TableFile:
     """A file that is being written, and the rows that wait for its next row group."""
 
     def __init__(self, writer: pq.ParquetWriter) -> None:
