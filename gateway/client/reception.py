@@ -15,12 +15,11 @@ from gateway.client.refill import SILENT_S, Ask, FindSeries, Refill
 from gateway.client.sources import FIELDS, ReceivedSeries, ReceivedSource
 from gateway.messages.encode import FINGERPRINT_BYTES, VERSION_OFFSET
 from gateway.messages.host_time import now_utime
-from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
+from gateway.messages.topics import MAX_CHANNEL_LENGTH, MAX_SOURCES, unique_name
 from gateway.outputs.contract import ServerParameters, encode_parameters
 
-MAX_SOURCES: Final = 128
 MAX_SERIES: Final = 4096
-"""The most sources, and keys of all sources together: 20 gateways with 5 sources each fit.
+"""The most keys of all sources together: 20 gateways with 5 sources each fit.
 
 Names come from the network.
 """

@@ -18,8 +18,8 @@ from gateway.messages.source_report import SourceReport, source_report
 from gateway.outputs.kind import DISCOVERY_S
 from gateway.runtime.safe_text import safe_text
 
-MAX_SOURCES: Final = 1000
-"""How many sources are kept. Anybody on the network can send some."""
+MAX_LISTED_SOURCES: Final = 1000
+"""How many sources are listed, with their status only. Anybody on the network can send some."""
 
 MAX_STATUS_BYTES: Final = 256 * 1024
 _MAX_TOTAL_BYTES: Final = 4 * 1024 * 1024
@@ -29,13 +29,13 @@ NO_ANSWER: Final = "its gateway does not answer"
 
 
 class FoundSources:
-    """Collects the sources that are found, up to MAX_SOURCES, each with its newest status."""
+    """Collects the sources that are found, up to MAX_LISTED_SOURCES, each with its newest status."""
 
     def __init__(self) -> None:
         self._sources: dict[tuple[str, ...], SourceReport] = {}
         self._num_bytes = 0
         self.heard: set[str] = set()
-        """The names of all sources that were heard, wanted or not, up to MAX_SOURCES."""
+        """The names of all sources that were heard, wanted or not, up to MAX_LISTED_SOURCES."""
         self.num_left_out = 0
         """How many sources or statuses were left out, because there are too many."""
         self.absence = ""
@@ -67,7 +67,7 @@ class FoundSources:
 
     def hear(self, name: str) -> None:
         """Note the name of a source, wanted or not."""
-        if len(self.heard) < MAX_SOURCES:
+        if len(self.heard) < MAX_LISTED_SOURCES:
             self.heard.add(safe_text(name))
 
     def add_silent(self, names: Iterable[str]) -> None:
@@ -85,7 +85,7 @@ class FoundSources:
         """Add a source, or replace what an earlier status said about it."""
         where = (source.gateway,) if source.gateway else (source.server, source.host)
         identity = (source.name, *where)
-        if identity in self._sources or len(self._sources) < MAX_SOURCES:
+        if identity in self._sources or len(self._sources) < MAX_LISTED_SOURCES:
             self._sources[identity] = source
         else:
             self.num_left_out += 1

@@ -7,6 +7,9 @@ from urllib.parse import quote
 
 DEFAULT_LCM_PREFIX: Final = "MOCAP"
 
+MAX_SOURCES: Final = 256
+"""How many sources a program receives, records or finds in a take: anybody on a network can send some."""
+
 MAX_CHANNEL_LENGTH = 63
 """LCM's ``publish`` refuses longer names."""
 

@@ -11,6 +11,7 @@ from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.descriptions.labels import describe, event_labels
 from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
+from gateway.messages.topics import MAX_SOURCES
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters, changed_sections, describe_renames, sections_of
 from gateway.takes.files.component_rows import decode_rows
@@ -211,10 +212,6 @@ def _change_text(before: Parameters | None, after: Parameters) -> str:
         return "the server gives no parameters now"
     texts = [describe_renames(before, after), ", ".join(changed_sections(before, after))]
     return "; ".join(text for text in texts if text) or "the same"
-
-
-MAX_SOURCES: Final = 256
-"""How many sources of a recording are looked at: what was recorded came from a network."""
 
 
 @dataclass

@@ -11,13 +11,13 @@ from typing import Final, TextIO
 
 from typing_extensions import override
 
-from gateway.client.reception import MAX_SERIES, MAX_SOURCES, Reception
+from gateway.client.reception import MAX_SERIES, Reception
 from gateway.client.refill import END_S, Refill
 from gateway.client.sources import POSE, ReceivedSeries, ReceivedSource
 from gateway.client.transport import GatewaySubscriber, close_in_time
 from gateway.messages.decode import decode
 from gateway.messages.texts import xml_bytes
-from gateway.messages.topics import escape_key_chunk, lcm_channel
+from gateway.messages.topics import MAX_SOURCES, escape_key_chunk, lcm_channel
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.runtime.safe_text import safe_text
 from gateway.tools.cli.echo_output import MAX_WAITING, json_line, text_line, too_fast_text

@@ -13,10 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.client.completion_states import Unknown
-from gateway.client.reception import MAX_SERIES, MAX_SOURCES
+from gateway.client.reception import MAX_SERIES
 from gateway.client.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording
 from gateway.client.sources import POSE, ReceivedSeries
 from gateway.client.transport import GatewaySubscriber
+from gateway.messages.topics import MAX_SOURCES
 from gateway.runtime.quantities import size_text
 from gateway.runtime.safe_text import safe_text
 

@@ -15,11 +15,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from gateway.messages.topics import MAX_SOURCES
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.reader import TakeReader
-from gateway.takes.files.statistics import MAX_SOURCES
 from gateway.tools.display.terminal import keys
 from gateway.tools.replay.play_list import Selection, take_length_us
 from gateway.tools.replay.player import Player

@@ -13,7 +13,7 @@ from gateway.errors import OutputError, ParametersError, ProtocolError, QueryErr
 from gateway.messages.decode import JSON, XML, decode, message_type, prefix_of
 from gateway.messages.encode import CONTENT_OFFSET, lcm_type_name
 from gateway.messages.texts import xml_bytes
-from gateway.messages.topics import Topic, lcm_channel, unique_name
+from gateway.messages.topics import MAX_SOURCES, Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Answer, KeyPath, Output, ServerParameters
 from gateway.queries.answers import NewestJson, ServerAnswer, message_answer, schema_answer, unreadable
 from gateway.queries.questions import (
@@ -30,7 +30,6 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.session.replies import XmlThread
 from gateway.takes.files.parameters_history import recorded_parameters
-from gateway.takes.files.statistics import MAX_SOURCES
 
 _PARAMETERS_S: Final = 1.0
 """How long messages wait at most until the outputs have sent the parameters that describe them."""

@@ -205,7 +205,7 @@ def test_gaps_two_gateways_and_hostile_publishers_are_reported(tmp_path: Path, p
     assert (len(recorded["MOCAP_LAB_3D"]), len(recorded["MOCAP_TWICE_3D"])) == (212, 80)
     for text in (
         "two gateways publish the source twice",
-        "messages were not recorded: there are more than 128 sources",
+        "messages were not recorded: there are more than 256 sources",
         "messages on these keys or channels were not recorded",
     ):
         assert text in ended.stdout

@@ -8,10 +8,10 @@ import pytest
 import rtc3d
 
 from gateway.client.client import GatewayAddress, GatewayClient
-from gateway.client.reception import MAX_SOURCES
 from gateway.client.recorder import FileWriter, TakeRecording, Target
 from gateway.client.sources import FINGERPRINTS
 from gateway.messages.encode import PREFIX
+from gateway.messages.topics import MAX_SOURCES
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber

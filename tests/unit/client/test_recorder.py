@@ -9,7 +9,6 @@ import rtc3d
 
 from gateway.client import reception, recorder
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
-from gateway.client.reception import MAX_SOURCES
 from gateway.client.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording, Target
 from gateway.client.request_timing import GRACE_S
 from gateway.client.sources import FINGERPRINTS
@@ -17,6 +16,7 @@ from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
 from gateway.messages.history import sequence_of
+from gateway.messages.topics import MAX_SOURCES
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.files.description import NO_DETAILS, TakeDetails, decoded_details
 from gateway.takes.files.event_log import EventLogReader
@@ -314,7 +314,7 @@ def test_what_is_no_message_of_the_series_is_left_out_and_counted(recorded: Reco
 def test_sources_and_keys_are_bounded(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names come from the network and must not fill the memory."""
     monkeypatch.setattr(reception, "MAX_SERIES", 50)
-    found = [recorded.recording.source(f"s{number}", f"S{number}", is_known=True) for number in range(200)]
+    found = [recorded.recording.source(f"s{number}", f"S{number}", is_known=True) for number in range(300)]
     sources = [source for source in found if source is not None]
     assert len(sources) == len(recorded.recording.sources) == MAX_SOURCES
     keys = [(source, f"6d/{number}") for source in sources[:2] for number in range(40)]

@@ -85,7 +85,7 @@ STYLE: Final = (
 )
 
 
-MAX_SOURCES: Final = 16
+MAX_SHOWN_SOURCES: Final = 16
 """How many sources the panel shows."""
 
 _MAX_CHARACTERS: Final = 160
@@ -100,9 +100,9 @@ def banner_html(
     """
     lines = [f"<p class=waiting>{'The take begins.' if is_take else 'No source is heard yet.'}</p>"]
     if sources:
-        lines = [_banner_line(each, now_s, is_take, is_paused) for each in sources[:MAX_SOURCES]]
-    if len(sources) > MAX_SOURCES:
-        lines.append(f"<p class=dim>and {counted(len(sources) - MAX_SOURCES, 'more source')}</p>")
+        lines = [_banner_line(each, now_s, is_take, is_paused) for each in sources[:MAX_SHOWN_SOURCES]]
+    if len(sources) > MAX_SHOWN_SOURCES:
+        lines.append(f"<p class=dim>and {counted(len(sources) - MAX_SHOWN_SOURCES, 'more source')}</p>")
     # The second changes as long as this program runs; otherwise, the page itself says so (_SCRIPT).
     return f"<section data-second={int(now_s)}>{''.join(lines)}</section>"
 
@@ -251,12 +251,12 @@ class Panel:
             _Turn(
                 _TEXT_INTERVAL_S,
                 now_s + 0.15,
-                lambda sources: _show(self._items, map(items_html, sources[:MAX_SOURCES])),
+                lambda sources: _show(self._items, map(items_html, sources[:MAX_SHOWN_SOURCES])),
             ),
             _Turn(
                 _TEXT_INTERVAL_S,
                 now_s + 0.35,
-                lambda sources: _show(self._events, map(events_html, sources[:MAX_SOURCES])),
+                lambda sources: _show(self._events, map(events_html, sources[:MAX_SHOWN_SOURCES])),
             ),
             _Turn(_TEXT_INTERVAL_S, now_s + 0.45, self._plots.offer),
             _Turn(_PLOT_INTERVAL_S, now_s, lambda _: self._plots.show()),
@@ -296,7 +296,7 @@ class Panel:
         _show(self._banner, [banner])
 
     def _show_sources(self, sources: Sequence[DisplayedSource]) -> None:
-        shown = sources[:MAX_SOURCES]
+        shown = sources[:MAX_SHOWN_SOURCES]
         texts = [source_html(each, is_take=self._is_take, is_paused=self._is_paused) for each in shown]
         _show(self._sources, [*texts, ignored_html(self._live)])
 

@@ -9,7 +9,7 @@ import rtc3d
 from rich.cells import cell_len
 from rich.console import Console
 
-from gateway.client.transport import MAX_SOURCES, MAX_STATUS_BYTES, FoundSources
+from gateway.client.transport import MAX_LISTED_SOURCES, MAX_STATUS_BYTES, FoundSources
 from gateway.messages.decode import decode
 from gateway.tools.cli.list_gateways import found_json, notes, write_sources
 from tests.support.errors import names
@@ -165,8 +165,8 @@ def test_hostile_texts_do_not_reach_the_terminal() -> None:
 
 
 def test_thousands_of_sources_are_bounded_and_said() -> None:
-    found = found_of(*(status(source=f"lab-{number}") for number in range(MAX_SOURCES + 7)))
-    assert len(found.sources) == MAX_SOURCES
+    found = found_of(*(status(source=f"lab-{number}") for number in range(MAX_LISTED_SOURCES + 7)))
+    assert len(found.sources) == MAX_LISTED_SOURCES
     [note] = notes(found)
     assert names(note, 7)
 

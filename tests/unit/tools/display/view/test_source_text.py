@@ -11,7 +11,7 @@ from gateway.messages.host_time import now_utime
 from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
 from gateway.tools.display.live import DisplayedSource, LiveComponent
-from gateway.tools.display.view.panel import MAX_SOURCES, banner_html
+from gateway.tools.display.view.panel import MAX_SHOWN_SOURCES, banner_html
 from gateway.tools.display.view.texts import clock_text, data_state, gateway_states, ignored_html, source_html
 from tests.support.statuses import loss, output, stream
 from tests.unit.tools.display.live_lab import Lab, text_of, wait
@@ -286,6 +286,6 @@ def test_many_sources_with_hostile_names() -> None:
     sources = [DisplayedSource("<img src=x>" + "y" * 1000, "MOCAP_X") for _ in range(64)]
     html = banner_html(sources, time.time())
     assert "<img" not in html
-    assert html.count("&lt;img") == MAX_SOURCES
+    assert html.count("&lt;img") == MAX_SHOWN_SOURCES
     assert "and 48 more sources" in html
     assert len(html) < 10_000
