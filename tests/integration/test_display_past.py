@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.tools.display.live import DisplayedSource, LiveData
+from gateway.tools.display.view.watched import LINGER_S, WatchedSubscriber
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import run_gateway
 from tests.support.waiting import wait_until, wait_until_async
@@ -68,6 +70,38 @@ async def test_what_a_silent_source_sent_in_the_last_seconds_is_shown(
     assert source.events
     assert source.series_by_key["3d"].num_messages > 100
     assert not any(series.check.num_lost for series in source.series)
+
+
+async def test_a_page_that_opens_after_a_while_without_one_begins_with_the_last_seconds(
+    where: tuple[dict[str, Any], GatewayAddress],
+) -> None:
+    """Meanwhile the view has received nothing, and the server has ended: only the history has markers."""
+    options, address = where
+    pages, now_s, live = [1], [0.0], LiveData()
+    subscribe = partial(GatewayClient(address).subscribe, (), None, live, last_s=60, patience_s=30)
+
+    def update() -> int:
+        watched.tick()
+        series = [source.series_by_key["3d"] for source in live.update() if "3d" in source.components]
+        return sum(each.num_messages for each in series)
+
+    async with contextlib.AsyncExitStack() as stack:
+        simulator = await stack.enter_async_context(Simulator(SyntheticScene(markers=3, rate_hz=100.0)))
+        gateway = await stack.enter_async_context(run_gateway(simulator.port, **options))
+        await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
+        watched = await asyncio.to_thread(
+            WatchedSubscriber, live, subscribe, lambda: pages, monotonic=lambda: now_s[0]
+        )
+        await asyncio.to_thread(wait_until, update)
+        pages.clear()
+        now_s[0] = 2 * LINGER_S
+        await asyncio.to_thread(watched.tick)
+        assert watched.subscriber is None
+        await wait_until_async(lambda: gateway.sources[0].statuses[0].frames_in > 100)
+        await simulator.close()
+        pages.append(1)
+        await asyncio.to_thread(wait_until, lambda: update() > 100)
+        watched.close()
 
 
 def test_a_history_that_does_not_answer_does_not_keep_live_data_from_a_display() -> None:

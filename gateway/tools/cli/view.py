@@ -5,8 +5,8 @@ import shlex
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -75,28 +75,32 @@ def view(
         stack.callback(server.stop)
 
         from gateway.client.client import GatewayClient
-        from gateway.client.transport import close_in_time
         from gateway.tools.display.live import LiveData
-        from gateway.tools.display.view.viewer import Playback, RunningTakes, Viewer
+        from gateway.tools.display.view.viewer import Playback, Viewer
+        from gateway.tools.display.view.watched import WatchedSubscriber
 
         live = LiveData()
-        ticks: list[Callable[[], object]] = []
         if take is None:
-            subscriber = GatewayClient(where.address(lcm=lcm)).subscribe(
-                *(source or (), None, live), complete=complete, last_s=_PAST_S, patience_s=_PATIENCE_S
+            client = GatewayClient(where.address(lcm=lcm))
+            subscribe = partial(
+                client.subscribe,
+                *(source or (), None, live),
+                complete=complete,
+                last_s=_PAST_S,
+                patience_s=_PATIENCE_S,
             )
-            stack.callback(close_in_time, subscriber)
-            ticks += [subscriber.tick, RunningTakes(live, subscriber, server.get_clients).tick]
-            silence = threading.Timer(_SILENCE_S, _explain_silence, (live, subscriber))
+            watched = WatchedSubscriber(live, subscribe, server.get_clients)
+            stack.callback(watched.close)
+            silence = threading.Timer(_SILENCE_S, _explain_silence, (live, watched.subscriber))
             silence.daemon = True
             silence.start()
-            viewer = Viewer(server, live)
+            viewer, tick = Viewer(server, live), watched.tick
         else:
             playback = Playback(take, source or (), live)
             stack.callback(playback.close)
-            viewer = Viewer(server, live, playback)
+            viewer, tick = Viewer(server, live, playback), None
         _announce(host, server.get_port(), opens_browser=not no_browser)
-        viewer.run(stop.wait, lambda: [tick() for tick in ticks])
+        viewer.run(stop.wait, tick)
 
 
 def _open_server(host: str, port: int) -> "ViewServer":

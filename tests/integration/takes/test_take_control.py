@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import TakeReader
 from gateway.tools.display.live import LiveData
-from gateway.tools.display.view.viewer import RunningTakes
+from gateway.tools.display.view.watched import WatchedSubscriber
 from tests.support.errors import names
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
@@ -104,12 +105,14 @@ async def test_the_view_learns_which_take_is_running_while_a_page_is_open(tmp_pa
     async with lab(tmp_path / "takes") as at:
         live, pages = LiveData(), [1]
         client = GatewayClient(GatewayAddress(side == "lcm", connect=at.endpoint, url=at.url))
-        subscriber = await asyncio.to_thread(client.subscribe, (), None, live)
-        takes = RunningTakes(live, subscriber, lambda: pages, period_s=0.05)
+        subscribe = partial(client.subscribe, (), None, live)
+        watched = await asyncio.to_thread(
+            WatchedSubscriber, live, subscribe, lambda: pages, takes_period_s=0.05
+        )
 
         def shown() -> str | None:
             live.update()
-            takes.tick()
+            watched.tick()
             return live.sources_now[0].running_take if live.sources_now else None
 
         await wait_until_async(lambda: shown() == "")
@@ -117,7 +120,7 @@ async def test_the_view_learns_which_take_is_running_while_a_page_is_open(tmp_pa
         await wait_until_async(lambda: shown() == NAME)
         await asyncio.to_thread(client.stop_take, source="lab")
         await wait_until_async(lambda: shown() == "")
-        subscriber.close()
+        watched.close()
 
 
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])

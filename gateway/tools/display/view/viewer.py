@@ -18,7 +18,6 @@ import websockets.asyncio.server
 from viser.infra import Message
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 
-from gateway.client.transport import GatewaySubscriber
 from gateway.errors import GatewayError, SelectionError, ViewError
 from gateway.outputs.listen_address import foreign_request
 from gateway.runtime.safe_text import quoted, safe_text
@@ -235,38 +234,8 @@ class Playback:
         self._player.is_repeated = is_repeated
 
 
-_TAKES_PERIOD_S: Final = 2.0
-
-
-class RunningTakes:
-    """Queries the gateways that have the output takes; ``is_watched`` says whether a page is open."""
-
-    def __init__(
-        self,
-        live: LiveData,
-        subscriber: GatewaySubscriber,
-        is_watched: Callable[[], object],
-        period_s: float = _TAKES_PERIOD_S,
-    ) -> None:
-        self._live = live
-        self._subscriber = subscriber
-        self._is_watched = is_watched
-        self._period_s = period_s
-        self._due_s = 0.0
-
-    def tick(self) -> None:
-        """Query if it is time. Call it often."""
-        now_s = time.monotonic()
-        if now_s < self._due_s or not self._is_watched():
-            return
-        self._due_s = now_s + self._period_s
-        for source in self._live.sources_now:
-            outputs = source.report.outputs if source.report else ()
-            if any(output.output == "takes" for output in outputs):
-                self._subscriber.query_takes(source)
-
-
 PERIOD_S: Final = 1 / 30
+_PERIOD_WITHOUT_PAGE_S: Final = 0.1
 
 
 class Viewer:
@@ -284,7 +253,7 @@ class Viewer:
         self.num_defects = 0
         """How many pictures were not complete, because of a defect in this program."""
 
-    def run(self, stops_within: Callable[[float], bool], tick: Callable[[], object]) -> None:
+    def run(self, stops_within: Callable[[float], bool], tick: Callable[[], object] | None = None) -> None:
         """Show what arrives until ``stops_within``, which waits for some seconds, returns True.
 
         ``tick`` is called before each picture. The schedule is absolute, and pictures that are late are
@@ -293,7 +262,8 @@ class Viewer:
         """
         next_s = time.monotonic()
         while not stops_within(max(0.0, next_s - time.monotonic())):
-            tick()
+            if tick is not None:
+                tick()
             try:
                 self.update()
             except GatewayError:
@@ -304,7 +274,8 @@ class Viewer:
                     print(safe_text(text), file=sys.stderr, flush=True)
                 self.num_defects += 1
             now_s = time.monotonic()
-            next_s += PERIOD_S * max(1, -(-(now_s - next_s) // PERIOD_S))
+            period_s = PERIOD_S if self._server.get_clients() else _PERIOD_WITHOUT_PAGE_S
+            next_s += period_s * max(1, -(-(now_s - next_s) // period_s))
 
     def update(self) -> None:
         """Decode what has arrived, and show it. Raises what ended the playback of a take."""
