@@ -12,7 +12,7 @@ from gateway.messages.descriptions.labels import Description, describe
 from gateway.messages.host_time import STEP_US, clock_difference_us, now_steady_us, now_utime
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from gateway.takes.files.component_rows import HEAD, Array, Rows, decode_rows
+from gateway.takes.files.component_rows import HEAD, Array, Rows, decode_row, decode_rows
 from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.row import Row
 from gateway.takes.files.series import Series, SeriesBuilder
@@ -304,6 +304,8 @@ def _merged(frames: Sequence[Frame]) -> Frame:
 
 def decode_frames(arrivals: Sequence[QueuedMessage], start_utime: int) -> Iterator[Frame]:
     """Yield the frames in messages, in their order. Messages that cannot be read are left out."""
+    if not arrivals:
+        return
     messages: dict[QueuedSeries, list[bytes]] = {}
     for series, message, *_ in arrivals:
         messages.setdefault(series, []).append(message)
@@ -328,13 +330,14 @@ def decode_frames(arrivals: Sequence[QueuedMessage], start_utime: int) -> Iterat
 
 def _rows(series: QueuedSeries, messages: list[bytes]) -> Iterator[tuple[tuple[int, ...], Array] | None]:
     """Yield the fields of HEAD and the items, shape (1, items), of each message; None if it is malformed."""
-    rows = decode_rows(COMPONENTS_BY_KEY[series.key], messages)
-    if rows.malformed and len(messages) > 1:
-        for message in messages:
-            yield from _rows(series, [message])
+    component = COMPONENTS_BY_KEY[series.key]
+    if len(messages) == 1:  # as usual, if the program keeps up
+        yield decode_row(component, messages[0])
         return
+    rows = decode_rows(component, messages)
     if rows.malformed:
-        yield None
+        yield from (decode_row(component, message) for message in messages)
+        return
     num_taken = dict.fromkeys(rows.items, 0)
     for head in rows.heads.tolist():
         first = num_taken[head[-1]]

@@ -308,6 +308,8 @@ class Live:
         Returns how long to wait for the next call unless something arrives.
         """
         self._check_process()
+        if self._join is None and not (self._pending or self._reception.has_waiting):
+            return _MAX_WAIT_S  # as before each wait of a program that keeps up
         with self._taking:
             now_s = self._decoded_s = time.monotonic()
             arrivals, wait_s = self._described(now_s)

@@ -192,6 +192,11 @@ class QueuedReception(Reception[SourceT, QueuedSeries]):
         function()
 
     @property
+    def has_waiting(self) -> bool:
+        """Whether ``take_waiting`` would return anything."""
+        return bool(self._waiting)
+
+    @property
     def has_room(self) -> bool:
         """Whether more messages can be taken now without leaving out older ones."""
         return len(self._waiting) < MAX_WAITING // 2 and self._waiting_bytes < MAX_WAITING_BYTES // 2

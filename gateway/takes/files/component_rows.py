@@ -1,6 +1,7 @@
 """Decoding many messages of one component at once with numpy, and finding where their numbers start again."""
 
 import math
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, TypeAlias
@@ -34,6 +35,11 @@ NATIVE_ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
 }
 """ITEM_DTYPES in the byte order of this computer."""
 
+_unpack_head: Final = struct.Struct(">Qqqqiiiqi").unpack_from
+"""Reads the fields of HEAD."""
+
+_WORD: Final = np.dtype(">u4")
+
 Array: TypeAlias = npt.NDArray[Any]
 
 
@@ -61,6 +67,25 @@ def decode_rows(component: ComponentType, messages: Sequence[bytes]) -> Rows:
         if sizes[0] == ITEMS_OFFSET + num_items * item_bytes and (heads["num_items"] == num_items).all():
             return Rows(heads, {num_items: _items(component, table[:, ITEMS_OFFSET:], num_items)}, 0)
     return _decode_different(component, messages, sizes)
+
+
+def decode_row(component: ComponentType, message: bytes) -> tuple[tuple[int, ...], Array] | None:
+    """Return the fields of HEAD and the items, shape (1, items), of one message; None if it is malformed.
+
+    Of one message, this is several times faster than ``decode_rows``.
+    """
+    if len(message) < ITEMS_OFFSET:
+        return None
+    head = _unpack_head(message)
+    num_items = head[-1]
+    dtype, native = ITEM_DTYPES[component], NATIVE_ITEM_DTYPES[component]
+    if len(message) != ITEMS_OFFSET + num_items * dtype.itemsize:
+        return None
+    if component is ComponentType.EVENT:
+        items: Array = np.frombuffer(message, dtype, num_items, ITEMS_OFFSET).astype(native)
+    else:
+        items = np.frombuffer(message, _WORD, -1, ITEMS_OFFSET).astype(np.uint32).view(native)
+    return head, items.reshape(1, num_items)
 
 
 def _decode_different(component: ComponentType, messages: Sequence[bytes], sizes: Array) -> Rows:
