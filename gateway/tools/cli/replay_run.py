@@ -63,7 +63,7 @@ class Progress:
         self._console = console
         self._quiet = quiet
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._before = time.monotonic(), player.position_us, 0, 0  # when the line was shown last
+        self._before = time.monotonic(), player.control.position_us, 0, 0  # when the line was shown last
         if console.is_terminal and not quiet:
             self._live.start()
 
@@ -82,7 +82,7 @@ class Progress:
 
     def _text(self) -> str:
         player = self._player
-        now_s, position_us, num_messages = time.monotonic(), player.position_us, player.num_messages
+        now_s, position_us, num_messages = time.monotonic(), player.control.position_us, player.num_messages
         before_s, before_us, before_messages, before_passes = self._before
         self._before = now_s, position_us, num_messages, player.num_passes
         passed_s = max(now_s - before_s, 1e-6)
@@ -91,14 +91,14 @@ class Progress:
             parts[0] += f" of {time_text(self._length_us)}"
         if player.num_passes:
             parts.append(f"repetition {player.num_passes}")
-        if player.is_paused:
+        if player.control.is_paused:
             parts.append("paused")
         else:
             if position_us >= before_us and player.num_passes == before_passes:
                 parts.append(f"{(position_us - before_us) / 1e6 / passed_s:,.2f}×")
             parts.append(f"{(num_messages - before_messages) / passed_s:,.0f} messages/s")
-            if player.lateness.num_messages:
-                parts.append(f"late by {1e3 * player.lateness.quantile_s(0.99):.1f} ms (p99)")
+            if player.pace is not None and player.pace.lateness.num_messages:
+                parts.append(f"late by {1e3 * player.pace.lateness.quantile_s(0.99):.1f} ms (p99)")
         if self._hints:
             parts.append(self._hints)
         return "  ".join(parts)
@@ -123,8 +123,8 @@ def print_report(
     console.print(table)
     total, seconds = publication.num_messages.total(), player.seconds
     text = f"{total:,} messages in {seconds:.1f} s ({total / max(seconds, 1e-6):,.0f} messages/s)"
-    late = player.lateness
-    if late.num_messages:
+    if player.pace is not None and player.pace.lateness.num_messages:
+        late = player.pace.lateness
         p50, p99 = late.quantile_s(0.5), late.quantile_s(0.99)
         text += (
             f"; late by {1e3 * p50:.1f} ms (p50), {1e3 * p99:.1f} ms (p99), {1e3 * late.max_s:.1f} ms at most"
@@ -137,10 +137,10 @@ def print_report(
 def _notes(player: Player, publication: Publication, reader: TakeReader) -> Iterator[str]:
     for refusal, count in publication.refusals.items():
         yield f"{refusal.output} did not take {count:,} messages of {refusal.key} ({refusal.cause})"
-    if player.stalled_s:
+    if player.pace is not None and player.pace.stalled_s:
         yield (
-            f"the replay stood still for {player.stalled_s:.1f} s, because the process was stopped, or the "
-            "disk or an output did not respond; it did not catch up"
+            f"the replay stood still for {player.pace.stalled_s:.1f} s, because the process was stopped, or "
+            "the disk or an output did not respond; it did not catch up"
         )
     for source in sorted(publication.without_parameters):
         yield f"the take has no parameters of {safe_text(source)} at the beginning, so no labels and units"
@@ -231,15 +231,17 @@ async def run_replay(
 async def _play(
     player: Player, publication: Publication, stop: asyncio.Event, progress_with: Callable[[str], Progress]
 ) -> None:
+    control = player.control
+
     def toggle_pause() -> None:
-        player.pause(not player.is_paused)
-        publication.show_streaming(not player.is_paused)
+        control.pause(not control.is_paused)
+        publication.show_streaming(not control.is_paused)
 
     actions = {
         "space": toggle_pause,
         "q": stop.set,
-        "left": lambda: player.seek(-_SEEK_US),
-        "right": lambda: player.seek(_SEEK_US),
+        "left": lambda: control.seek(-_SEEK_US),
+        "right": lambda: control.seek(_SEEK_US),
     }
     with keys(actions) as has_keys:
         hints = "space: pause, ←/→: 10 s, q: quit" if has_keys else ""

@@ -1,15 +1,15 @@
 """Which messages of a take are replayed, when, and from which place in the file."""
 
 from bisect import bisect_right
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from gateway.errors import TakeError
+from gateway.errors import SelectionError, TakeError
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.reader import DESCRIPTIONS, FIRST_PLACE, Place, TakeReader
-from gateway.tools.replay.timeline import ReplayTimeline
+from gateway.tools.replay.timeline import Jump, ReplayTimeline
 
 STEP_US: Final = 2_000_000
 """How far apart places are; a seek reads at most this much of the take before its target."""
@@ -93,6 +93,49 @@ class Selection:
         if key in DESCRIPTIONS or (self.sources is not None and source not in self.sources):
             return False
         return self.components is None or key == _PARAMETERS or key.partition("/")[0] in self.components
+
+
+class TakePasses:
+    """What a replay publishes of a take, each time that it goes through it or begins at another place.
+
+    Gaps that are longer than ``max_gap_s`` are skipped. ``on_jump`` is called where the time jumps. With an
+    ``index``, a pass begins to read near its start, and not each pass finds all damage.
+    """
+
+    def __init__(
+        self,
+        reader: TakeReader,
+        selection: Selection,
+        *,
+        max_gap_s: float,
+        on_jump: Callable[[Jump], None],
+        index: SeekIndex | None,
+    ) -> None:
+        self._reader = reader
+        self._selection = selection
+        self._max_gap_s = max_gap_s
+        self._on_jump = on_jump
+        self._index = index
+
+    def entries(self, start_us: int, *, reports_jumps: bool) -> Generator[Entry]:
+        """Yield the selected messages from ``start_us`` on, and report the jumps after it if that is wanted.
+
+        Raises TakeError if the take cannot be read.
+        """
+
+        def report(jump: Jump) -> None:
+            if reports_jumps and jump.position_us >= start_us:
+                self._on_jump(jump)
+
+        timeline = ReplayTimeline(self._max_gap_s, report)
+        return play_list(self._reader, self._selection, timeline, start_us, self._index)
+
+    def nothing_selected(self) -> SelectionError:
+        """Return the error for a pass without messages."""
+        return SelectionError(
+            f"{self._reader.path} has no messages to replay with these options; "
+            f"check --source ({', '.join(self._reader.source_names)}), --component, --from and --to"
+        )
 
 
 def play_list(

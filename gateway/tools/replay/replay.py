@@ -177,7 +177,7 @@ async def playing(player: Player) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        player.stop()
+        player.control.stop()
         # The thread may be waiting for the event loop.
         await WorkerThread("join replay").run(lambda: player.join(_STOP_S))
     if player.error is not None:

@@ -169,7 +169,7 @@ class Playback:
     @property
     def is_paused(self) -> bool:
         """Whether the picture stands still on purpose: in a pause, or at the end."""
-        return self._player.is_paused or self._player.is_at_end
+        return self._player.control.is_paused or self._player.control.is_at_end
 
     def add_controls(self, gui: viser.GuiApi) -> None:
         """Add the controls to the panel, in the container that is open."""
@@ -180,7 +180,7 @@ class Playback:
         self._slider = gui.add_slider("Time (s)", 0.0, length_s, _STEP_S, 0.0)
         self._slider.on_update(self._seek)
         self._rate = gui.add_dropdown("Speed", [*RATES], initial_value="1 ×")
-        self._rate.on_update(lambda _event: self._player.set_rate(RATES[self._rate.value]))
+        self._rate.on_update(lambda _event: self._player.control.set_rate(RATES[self._rate.value]))
         self._loop = gui.add_checkbox("Repeat", False)
         self._loop.on_update(lambda _event: self._repeat(self._loop.value))
 
@@ -198,28 +198,29 @@ class Playback:
         if now_s - self._shown_s < _SHOW_S:
             return
         self._shown_s = now_s
-        player, name = self._player, safe_text(self._reader.path.name).replace("`", "'")
-        state = "at the end" if player.is_at_end else "paused" if player.is_paused else "playing"
-        position, length = time_text(player.position_us), time_text(self._length_us)
+        control, name = self._player.control, safe_text(self._reader.path.name).replace("`", "'")
+        state = "at the end" if control.is_at_end else "paused" if control.is_paused else "playing"
+        position, length = time_text(control.position_us), time_text(self._length_us)
         self._state.content = f"`{name}`  \n**{position}** of {length}, {state}"
         self._button.label = "Play" if self.is_paused else "Pause"
         if now_s - self._moved_s > _HOLD_S:
-            self._slider.value = min(self._player.position_us / 1e6, self._slider.max)  # type: ignore[misc]
+            self._slider.value = min(control.position_us / 1e6, self._slider.max)  # type: ignore[misc]
 
     def close(self) -> None:
         """Stop playing."""
         if self._has_begun:
-            self._player.stop()
+            self._player.control.stop()
             self._player.join(_STOP_S)
 
     # In the threads of viser.
 
     def _toggle(self, _event: Any) -> None:
-        if self._player.is_at_end:
+        control = self._player.control
+        if control.is_at_end:
             self._go_to(0)
-            self._player.pause(False)
+            control.pause(False)
         else:
-            self._player.pause(not self._player.is_paused)
+            control.pause(not control.is_paused)
 
     def _seek(self, event: Any) -> None:
         if event.client_id is not None:  # moved by a user, and not by `update`
@@ -228,7 +229,7 @@ class Playback:
 
     def _go_to(self, position_us: int) -> None:
         self._live.begin_again()
-        self._player.seek_to(position_us)
+        self._player.control.seek_to(position_us)
 
     def _repeat(self, is_repeated: bool) -> None:
         self._player.is_repeated = is_repeated

@@ -116,7 +116,7 @@ async def test_messages_keep_their_bytes_and_their_order(replayed: Replayed) -> 
     messages = some_messages()
     assert await replayed.play(messages) == keyed(messages)
     assert replayed.publication.num_messages == {"parameters": 1, "3d": 20, "analog": 20}
-    assert replayed.player.lateness.num_messages == 0
+    assert replayed.player.pace is None
 
 
 async def test_from_the_middle_the_valid_parameters_come_first(replayed: Replayed) -> None:

@@ -9,8 +9,9 @@ import pytest
 import rtc3d
 
 from gateway.takes.files.reader import TakeReader
+from gateway.tools.replay.pace import STALL_S, Pace, PlayerClock
 from gateway.tools.replay.play_list import Selection
-from gateway.tools.replay.player import STALL_S, Player, PlayerClock
+from gateway.tools.replay.player import Player
 from gateway.tools.replay.timeline import Jump
 from tests.support.takes import START_UTIME, description, markers, parameters, write_take
 
@@ -67,6 +68,12 @@ class Replay:
         self.player = Player(TakeReader(self.path), selection or Selection(), self, **options)
         return self.player
 
+    @property
+    def pace(self) -> Pace:
+        """The player's pace; it has one unless ``rate`` is None."""
+        assert self.player.pace is not None
+        return self.player.pace
+
     def run(self) -> list[tuple[int, float]]:
         """Play until the end; return the frames with their times."""
         self.player.start()
@@ -90,7 +97,7 @@ def test_each_message_is_published_when_it_is_due(replay: Replay, rate: float, b
     assert [number for number, _ in found] == [number for number, _ in expected]
     for (_, time_s), (_, due_s) in zip(found, expected, strict=True):
         assert time_s == pytest.approx(due_s, abs=1e-5)
-    assert replay.player.lateness.max_s < 1e-5
+    assert replay.pace.lateness.max_s < 1e-5
     assert replay.player.seconds == pytest.approx((999 - begin) * TICK_S / rate)
 
 
@@ -100,15 +107,15 @@ def test_a_pause_moves_all_that_follows_by_its_length(replay: Replay) -> None:
 
     def go_on() -> None:
         replay.clock.time_s += 3600.0
-        player.pause(False)
+        player.control.pause(False)
 
-    replay.steps[100] = lambda: player.pause(True)
+    replay.steps[100] = lambda: player.control.pause(True)
     replay.clock.on_pause = [go_on]
     found = replay.run()
     assert found[99] == (99, 0.99)
     assert found[100][1] == pytest.approx(3601.0, abs=0.011)
     assert found[-1][1] - found[100][1] == pytest.approx(8.99)
-    assert player.stalled_s == 0.0
+    assert replay.pace.stalled_s == 0.0
 
 
 @pytest.mark.parametrize(("stall_s", "is_made_up"), [(0.9 * STALL_S, True), (60.0, False)])
@@ -118,12 +125,12 @@ def test_only_what_a_short_stall_delays_is_made_up(replay: Replay, stall_s: floa
     def stall() -> None:
         replay.clock.time_s += stall_s
 
-    player = replay.prepare()
+    replay.prepare()
     replay.steps[100] = stall
     found = replay.run()
     end_s = 9.99 if is_made_up else 9.99 + stall_s
     assert found[-1][1] == pytest.approx(end_s, abs=0.011)
-    assert player.stalled_s == pytest.approx(0.0 if is_made_up else stall_s, abs=0.011)
+    assert replay.pace.stalled_s == pytest.approx(0.0 if is_made_up else stall_s, abs=0.011)
 
 
 def test_seeks_add_up_and_the_schedule_begins_there(replay: Replay) -> None:
@@ -131,12 +138,12 @@ def test_seeks_add_up_and_the_schedule_begins_there(replay: Replay) -> None:
     player = replay.prepare()
 
     def seek_twice() -> None:
-        player.seek(2_000_000)
-        player.seek(1_000_000)
+        player.control.seek(2_000_000)
+        player.control.seek(1_000_000)
 
     replay.steps[100] = seek_twice
-    replay.steps[200] = lambda: player.seek(-100_000_000)
-    replay.steps[300] = lambda: player.seek_to(9_990_000)
+    replay.steps[200] = lambda: player.control.seek(-100_000_000)
+    replay.steps[300] = lambda: player.control.seek_to(9_990_000)
     found = replay.run()
     assert [number for number, _ in found[:100]] == [*range(100)]
     assert [number for number, _ in found[100:200]] == [*range(398, 498)]
@@ -150,8 +157,8 @@ def test_seeks_add_up_and_the_schedule_begins_there(replay: Replay) -> None:
 def test_the_rate_changes_from_the_present_place_on(replay: Replay) -> None:
     """The part that was played is not played faster afterwards."""
     player = replay.prepare()
-    replay.steps[100] = lambda: player.set_rate(10.0)
-    replay.steps[200] = lambda: player.set_rate(0.1)
+    replay.steps[100] = lambda: player.control.set_rate(10.0)
+    replay.steps[200] = lambda: player.control.set_rate(0.1)
     found = replay.run()
     assert found[199][1] == pytest.approx(0.99 + 0.1)
     assert found[-1][1] == pytest.approx(0.99 + 0.1 + 80.0)
@@ -160,11 +167,11 @@ def test_the_rate_changes_from_the_present_place_on(replay: Replay) -> None:
 def test_only_a_paused_viewer_gets_a_preview(replay: Replay) -> None:
     """0.1 s at once shows the moment of a seek; while it plays, the pace holds."""
     player = replay.prepare(is_watched=True)
-    replay.steps[50] = lambda: player.pause(True)
+    replay.steps[50] = lambda: player.control.pause(True)
     replay.clock.on_pause = [
-        lambda: player.seek_to(5_000_000),
-        lambda: player.pause(False),
-        player.stop,  # at the end
+        lambda: player.control.seek_to(5_000_000),
+        lambda: player.control.pause(False),
+        player.control.stop,  # at the end
     ]
     found = replay.run()
     assert [number for number, _ in found] == [*range(50), *range(500, 1000)]
@@ -180,13 +187,13 @@ def test_a_viewer_can_go_back_from_the_end(replay: Replay) -> None:
     states: list[bool] = []
 
     def go_back() -> None:
-        states.append(player.is_at_end)
-        player.seek_to(9_950_000)
+        states.append(player.control.is_at_end)
+        player.control.seek_to(9_950_000)
 
-    replay.clock.on_pause = [go_back, player.stop]
+    replay.clock.on_pause = [go_back, player.control.stop]
     found = replay.run()
     assert [number for number, _ in found[1000:]] == [*range(995, 1000)]
-    assert (states, player.is_at_end, player.num_passes) == ([True], False, 2)
+    assert (states, player.control.is_at_end, player.num_passes) == ([True], False, 2)
 
 
 def test_a_long_gap_is_skipped_and_reported_in_the_first_pass_only(tmp_path: Path) -> None:
@@ -196,7 +203,7 @@ def test_a_long_gap_is_skipped_and_reported_in_the_first_pass_only(tmp_path: Pat
     late = [markers(1, number, utime=START_UTIME + hour_us + number * 10_000) for number in range(10, 20)]
     write_take(replay.path, [*(markers(1, number) for number in range(10)), *late])
     player = replay.prepare(is_repeated=True)
-    replay.steps[45] = player.stop
+    replay.steps[45] = player.control.stop
     found = replay.run()
     assert [(jump.jump_us, jump.is_skipped) for jump in replay.jumps] == [(hour_us + 10_000, True)]
     assert [number for number, _ in found] == [*range(20), *range(20), *range(5)]

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from gateway.takes.files.reader import FIRST_PLACE, TakeReader
+from gateway.tools.replay.pace import Lateness, Pace
 from gateway.tools.replay.play_list import STEP_US, SeekIndex, SeekPoint, Selection, play_list
-from gateway.tools.replay.player import Lateness, Pace
 from gateway.tools.replay.timeline import Jump, ReplayTimeline, time_text
 from tests.support.takes import markers, parameters, write_take
 

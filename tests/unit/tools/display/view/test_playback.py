@@ -81,7 +81,7 @@ def test_a_take_begins_when_the_first_page_is_open(
     monkeypatch.setattr(viewer.scene, "update", lambda *_: None)
     pages[1] = None
     viewer.update()
-    wait_until(lambda: playback._player.is_at_end)
+    wait_until(lambda: playback._player.control.is_at_end)
     viewer.update()
     playback.close()
 
@@ -100,7 +100,7 @@ def test_a_pause_stands_still_and_shows_where_the_slider_goes(played: Played) ->
 
 def test_the_end_waits_for_play(played: Played) -> None:
     played.drag_to(29.8)
-    wait_until(lambda: played.playback._player.is_at_end)
+    wait_until(lambda: played.playback._player.control.is_at_end)
     assert played.playback.is_paused
     played.playback._toggle(USER)
     wait_until(lambda: 0 <= played.newest < 2000)
@@ -108,7 +108,7 @@ def test_the_end_waits_for_play(played: Played) -> None:
 
 def test_the_speed_can_be_chosen(played: Played) -> None:
     played.playback._rate.value = "10 ×"  # type: ignore[misc]
-    wait_until(lambda: played.playback._player.is_at_end)
+    wait_until(lambda: played.playback._player.control.is_at_end)
     assert played.newest == 2999
 
 
