@@ -1,12 +1,13 @@
 """What is known about a source, from what its gateway publishes: values without numpy, for tables and JSON.
 
-The names of the fields are those of ``top --json``. What the status says is in ``source.report``.
+``source_facts`` returns all of it with the names of ``top --json``. What the status says is in
+``source.report``.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from gateway.client.sources import POSE, ReceivedSeries
 from gateway.messages.descriptions.labels import describe
@@ -14,31 +15,39 @@ from gateway.messages.source_report import Level, SourceReport, State
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.runtime.safe_text import safe_text
 from gateway.tools.display.live import DisplayedSource, LiveComponent
+from gateway.tools.display.statistics import Percentiles
 
 _MAX_LABEL: Final = 64
 """How much is shown of a marker's or tool's label, and of its unit."""
 
 
-@dataclass(frozen=True, slots=True)
-class ComponentFacts:
-    """One component. What has not come so far has ``num_messages`` 0. Tool poses are together: 6d/*.
+class SequenceFacts(NamedTuple):
+    """What the numbers of the messages show, of one key or of several together.
 
     ``num_refilled`` is None unless gaps are filled; then, ``num_lost`` counts what could not be.
     """
 
-    component: str
-    rate_hz: float | None
-    announced_rate_hz: float | None
     num_messages: int
     num_lost: int
     num_gaps: int
     num_restarts: int
     has_two_gateways: bool
     num_refilled: int | None
-    capture_to_gateway_p50_ms: float | None = None
-    capture_to_gateway_p99_ms: float | None = None
-    gateway_to_here_p50_ms: float | None = None
-    gateway_to_here_p99_ms: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentFacts:
+    """One component. What has not come so far has no messages in ``sequence``. Tool poses are together: 6d/*.
+
+    ``to_gateway`` is the latency from the capture to the gateway, ``to_here`` the one from there to here.
+    """
+
+    component: str
+    rate_hz: float | None
+    announced_rate_hz: float | None
+    sequence: SequenceFacts
+    to_gateway: Percentiles | None = None
+    to_here: Percentiles | None = None
     num_items: int | None = None
     num_visible: int | None = None
     age_s: float | None = None
@@ -102,7 +111,7 @@ def components(source: DisplayedSource) -> list[ComponentFacts]:
     found = [_component(source, each) for each in WIRE_ORDER if each.key in wanted]
     poses = [series for series in source.series if series.key.startswith(POSE)]
     if poses:
-        found.append(ComponentFacts(f"{POSE}*", None, None, *_message_counts(poses), num_items=len(poses)))
+        found.append(ComponentFacts(f"{POSE}*", None, None, _sequence_facts(poses), num_items=len(poses)))
     return found
 
 
@@ -111,15 +120,14 @@ def _component(source: DisplayedSource, kind: ComponentType) -> ComponentFacts:
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
     announced_hz = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
-    to_gateway_p50_ms, to_gateway_p99_ms = component.latency.to_gateway or (None, None)
-    to_here_p50_ms, to_here_p99_ms = component.latency.to_here or (None, None)
     can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
     return ComponentFacts(
         kind.key,
         0.0 if component.is_stopped else component.rate_hz,
         announced_hz if announced_hz is not None and math.isfinite(announced_hz) else None,
-        *_message_counts([] if series is None else [series]),
-        *(to_gateway_p50_ms, to_gateway_p99_ms, to_here_p50_ms, to_here_p99_ms),
+        _sequence_facts([] if series is None else [series]),
+        to_gateway=component.latency.to_gateway,
+        to_here=component.latency.to_here,
         num_items=len(component.newest_items) if has_come else None,
         num_visible=int(component.is_visible.sum()) if can_be_seen else None,
         age_s=component.age_s,
@@ -129,20 +137,16 @@ def _component(source: DisplayedSource, kind: ComponentType) -> ComponentFacts:
     )
 
 
-def _message_counts(series: Sequence[ReceivedSeries]) -> tuple[int, int, int, int, bool, int | None]:
-    """Return how many messages came, were lost, in how many gaps; restarts; whether two gateways publish.
-
-    The last one is how many were refilled; None if gaps are not filled.
-    """
+def _sequence_facts(series: Sequence[ReceivedSeries]) -> SequenceFacts:
     checks = [each.check for each in series]
     refilled = [each.completion.num_refilled for each in series if each.completion is not None]
-    return (
-        sum(each.num_messages for each in series),
-        sum(check.num_lost for check in checks),
-        sum(check.num_gaps for check in checks),
-        max((check.num_restarts for check in checks), default=0),
-        any(check.has_two_publishers for check in checks),
-        sum(refilled) if refilled else None,
+    return SequenceFacts(
+        num_messages=sum(each.num_messages for each in series),
+        num_lost=sum(check.num_lost for check in checks),
+        num_gaps=sum(check.num_gaps for check in checks),
+        num_restarts=max((check.num_restarts for check in checks), default=0),
+        has_two_gateways=any(check.has_two_publishers for check in checks),
+        num_refilled=sum(refilled) if refilled else None,
     )
 
 
@@ -208,6 +212,7 @@ def events(source: DisplayedSource) -> list[EventFacts]:
     ]
 
 
+_COMPONENT_FIELDS: Final = ("num_items", "num_visible", "age_s", "is_stopped", "num_skipped", "num_malformed")
 _STREAM_FIELDS: Final = (
     *("components", "state", "problem", "session", "byte_order", "rate", "frame_rate_hz", "lag_ms"),
     *("num_reconnects", "num_restarts", "has_clock", "clock_drift_ppm", "clock_uncertainty_us"),
@@ -234,13 +239,27 @@ def source_facts(source: DisplayedSource) -> dict[str, Any]:
         "has_two_gateways": has_two_gateways(source),
         "refill_problems": refill_problems(source),
         "parameters_version": source.parameters_version,
-        "components": components(source),
+        "components": [_component_fields(each) for each in components(source)],
         "markers": items(source, ComponentType.MARKERS),
         "tools": items(source, ComponentType.TOOLS),
         "streams": [_fields(stream, _STREAM_FIELDS) for stream in report.streams],
         "losses": losses(source),
         "outputs": [_fields(output, _OUTPUT_FIELDS) for output in report.outputs],
         "events": events(source),
+    }
+
+
+def _component_fields(facts: ComponentFacts) -> dict[str, Any]:
+    to_gateway_p50_ms, to_gateway_p99_ms = facts.to_gateway or (None, None)
+    to_here_p50_ms, to_here_p99_ms = facts.to_here or (None, None)
+    return {
+        **_fields(facts, ("component", "rate_hz", "announced_rate_hz")),
+        **facts.sequence._asdict(),
+        "capture_to_gateway_p50_ms": to_gateway_p50_ms,
+        "capture_to_gateway_p99_ms": to_gateway_p99_ms,
+        "gateway_to_here_p50_ms": to_here_p50_ms,
+        "gateway_to_here_p99_ms": to_here_p99_ms,
+        **_fields(facts, _COMPONENT_FIELDS),
     }
 
 

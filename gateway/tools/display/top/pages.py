@@ -9,7 +9,7 @@ from gateway.messages.source_report import Level, OutputReport
 from gateway.rtc3d.components import ComponentType
 from gateway.runtime.safe_text import safe_text
 from gateway.tools.display.live import SLOW_SHARE, DisplayedSource
-from gateway.tools.display.statistics import visible_percent
+from gateway.tools.display.statistics import Percentiles, visible_percent
 from gateway.tools.display.terminal import Style
 from gateway.tools.display.top import facts
 from gateway.tools.display.top.table import (
@@ -74,32 +74,33 @@ def overview(sources: Sequence[DisplayedSource]) -> TopTable:
 
 
 def _component_row(component: facts.ComponentFacts, *, is_complete: bool) -> Row:
+    sequence = component.sequence
     note, style = "", Style.PLAIN
     if component.is_stopped:
         note, style = "stopped", Style.BAD
-    elif component.has_two_gateways:
+    elif sequence.has_two_gateways:
         note, style = "two gateways", Style.BAD
     elif component.num_malformed:
         note, style = f"{component.num_malformed} malformed", Style.WARNING
     elif component.num_skipped:
         note, style = f"{component.num_skipped} not decoded here", Style.WARNING
-    elif not component.num_messages:
+    elif not sequence.num_messages:
         note, style = "none so far", Style.FAINT
     rate_hz, announced_hz = component.rate_hz, component.announced_rate_hz
-    has_rates = rate_hz is not None and announced_hz is not None and component.num_messages > 0
+    has_rates = rate_hz is not None and announced_hz is not None and sequence.num_messages > 0
     is_slow = has_rates and (rate_hz or 0.0) < SLOW_SHARE * (announced_hz or 0.0)
     is_missing = component.num_visible is not None and component.num_visible < (component.num_items or 0)
-    lost_style = Style.BAD if component.num_lost else Style.PLAIN
+    lost_style = Style.BAD if sequence.num_lost else Style.PLAIN
     return (
         text_cell(component.component),
         number_cell(rate_hz, 1, style if style is Style.BAD else _warning_if(is_slow)),
         number_cell(announced_hz, 1),
-        number_cell(component.num_lost, 0, lost_style),
-        *([number_cell(component.num_refilled)] if is_complete else []),
-        number_cell(component.num_gaps, 0, lost_style),
-        number_cell(component.num_restarts, 0, _warning_if(component.num_restarts > 0)),
-        _latency_cell(component.capture_to_gateway_p50_ms, component.capture_to_gateway_p99_ms),
-        _latency_cell(component.gateway_to_here_p50_ms, component.gateway_to_here_p99_ms),
+        number_cell(sequence.num_lost, 0, lost_style),
+        *([number_cell(sequence.num_refilled)] if is_complete else []),
+        number_cell(sequence.num_gaps, 0, lost_style),
+        number_cell(sequence.num_restarts, 0, _warning_if(sequence.num_restarts > 0)),
+        _latency_cell(component.to_gateway),
+        _latency_cell(component.to_here),
         number_cell(component.num_items),
         number_cell(component.num_visible, 0, _warning_if(is_missing)),
         number_cell(component.age_s, 1, style if style is Style.BAD else Style.PLAIN),
@@ -107,10 +108,11 @@ def _component_row(component: facts.ComponentFacts, *, is_complete: bool) -> Row
     )
 
 
-def _latency_cell(p50_ms: float | None, p99_ms: float | None) -> Cell:
-    if p50_ms is None or p99_ms is None:
+def _latency_cell(latency: Percentiles | None) -> Cell:
+    if latency is None:
         return Cell("")
-    return Cell(f"{number_cell(p50_ms, 1).text}/{number_cell(p99_ms, 1).text}", Style.PLAIN, p99_ms)
+    text = f"{number_cell(latency.p50_ms, 1).text}/{number_cell(latency.p99_ms, 1).text}"
+    return Cell(text, Style.PLAIN, latency.p99_ms)
 
 
 def items(sources: Sequence[DisplayedSource], kind: ComponentType, noun: str) -> TopTable:

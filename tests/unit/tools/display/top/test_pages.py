@@ -161,11 +161,12 @@ def test_components_have_rates_losses_and_what_is_visible() -> None:
         lab.send_ones("3d", sequence, 2, missing=(1,))
     markers, tools = facts.components(lab.source)
     assert (markers.component, markers.announced_rate_hz) == ("3d", 200)
-    assert (markers.num_lost, markers.num_gaps, markers.num_restarts) == (2, 1, 0)
-    assert (markers.num_items, markers.num_visible, markers.num_messages) == (2, 1, 3)
-    assert markers.capture_to_gateway_p50_ms == 2.0
-    assert markers.gateway_to_here_p99_ms is not None
-    assert (tools.component, tools.num_messages, tools.age_s) == ("6d", 0, None)
+    assert markers.sequence == facts.SequenceFacts(3, 2, 1, 0, has_two_gateways=False, num_refilled=None)
+    assert (markers.num_items, markers.num_visible) == (2, 1)
+    assert markers.to_gateway is not None
+    assert markers.to_gateway.p50_ms == 2.0
+    assert markers.to_here is not None
+    assert (tools.component, tools.sequence.num_messages, tools.age_s) == ("6d", 0, None)
 
 
 def test_data_that_stop_are_stopped_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,6 +243,15 @@ def test_texts_from_networks_are_cut_and_escaped() -> None:
     assert len(text) < 20_000
 
 
+COMPONENT_FIELDS = [
+    *("component", "rate_hz", "announced_rate_hz", "num_messages", "num_lost", "num_gaps", "num_restarts"),
+    *("has_two_gateways", "num_refilled", "capture_to_gateway_p50_ms", "capture_to_gateway_p99_ms"),
+    *("gateway_to_here_p50_ms", "gateway_to_here_p99_ms", "num_items", "num_visible", "age_s", "is_stopped"),
+    *("num_skipped", "num_malformed"),
+]
+"""What docs/reference/commands.md promises, in this order."""
+
+
 def test_everything_about_a_source_is_json() -> None:
     lab = Lab("stage")
     lab.send_status(stream("3d event", lag_ms=float("nan")), outputs=(output(),))
@@ -250,7 +260,11 @@ def test_everything_about_a_source_is_json() -> None:
     found = json.loads(json_text(facts.source_facts(lab.source)))
     assert (found["source"], found["server"], found["host"]) == ("stage", "192.0.2.9:3020", "gatewaypc")
     assert (found["state"], found["level"]) == ("streaming 200.0 Hz", "ok")
-    assert found["components"][0]["num_visible"] == 2
+    markers, events = found["components"]
+    assert [*markers] == [*events] == COMPONENT_FIELDS
+    assert (markers["num_messages"], markers["num_lost"], markers["num_visible"]) == (1, 0, 2)
+    assert markers["capture_to_gateway_p50_ms"] == markers["capture_to_gateway_p99_ms"] == 2.0
+    assert markers["gateway_to_here_p50_ms"] == markers["gateway_to_here_p99_ms"]
     assert found["markers"][1] == {
         "label": "marker 2",
         "visible_share": 0,
