@@ -27,15 +27,9 @@ from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType, is_visible
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import NATIVE_ITEM_DTYPES, Array, decode_rows
-from gateway.tools.display.statistics import WINDOW_S, Latency, Visibility
+from gateway.tools.display.statistics import WINDOW_S, ArrivalRate, HeldClock, Latency, Visibility
 
 logger = logging.getLogger(__name__)
-
-_RATE_WINDOW_S: Final = 2.0
-
-_STOPPED_S: Final = 0.5
-"""Data that do not come for this long, and for STOPPED_FRAMES frames, have stopped."""
-_STOPPED_FRAMES: Final = 4
 
 SLOW_SHARE: Final = 0.95
 """A rate below this share of the announced one is slow."""
@@ -60,23 +54,14 @@ class LiveComponent:
         self.description: Description = describe(component, None, 0)
         """The labels, units and announced rate of the newest items."""
         self._visibility = Visibility()
-        self._counts: deque[tuple[float, int]] = deque()  # time and number of messages so far
-        self._rate_before_stop_hz = 0.0
-        self._paused_s = 0.0  # how long it was held so far
-        self._updated_s = self._now_s
-        self._has_past = False  # whether messages of the batch are of the past
-        self._arrived_s: float | None = None
-        self._arrived_utime = 0  # of the newest message, before it waited for ``update``
+        self._clock = HeldClock()
+        self._arrivals = ArrivalRate()
+        self._batch_utime: int | None = None  # when it arrived; None if it is empty, or partly of the past
         self._described: tuple[Parameters | None, int] = (None, 0)
 
     def hold(self) -> None:
         """Count no time since the last ``update``."""
-        self._paused_s += self._now_s - self._updated_s
-
-    @property
-    def _now_s(self) -> float:
-        """The monotonic clock, which stands still in pauses."""
-        return time.monotonic() - self._paused_s
+        self._clock.hold()
 
     def update(
         self, arrived: Sequence[QueuedMessage], parameters: Parameters | None, gateway_utime: int = 0
@@ -85,27 +70,24 @@ class LiveComponent:
 
         ``gateway_utime`` is the time of the newest message of the source: how old those of the past are.
         """
-        now_s = self._updated_s = self._now_s
+        now_s = self._clock.go_on()
         self.batch = rows = decode_rows(self.type, [arrival.message for arrival in arrived])
         self.num_malformed += rows.malformed
-        self._has_past = any(arrival.is_past for arrival in arrived)
+        has_past = any(arrival.is_past for arrival in arrived)
         times_s = np.full(len(rows.heads), now_s)
-        if self._has_past:
+        if has_past:
             ages_us = gateway_utime - rows.heads["utime"].astype(np.float64)
             times_s -= np.clip(ages_us / 1e6, 0, WINDOW_S)
-            self._count_past(times_s)
+            self._arrivals.count_past(times_s)
         else:
-            num_before = self._counts[-1][1] if self._counts else 0
-            self._counts.append((now_s, num_before + len(arrived)))
-        while len(self._counts) > 2 and now_s - self._counts[1][0] >= _RATE_WINDOW_S:
-            self._counts.popleft()
+            self._arrivals.count(now_s, len(arrived))
+        self._batch_utime = None
         if len(rows.heads):
-            self._arrived_s = float(times_s[-1])
-            self._arrived_utime = arrived[-1].arrived_utime
-            self._rate_before_stop_hz = self.rate_hz
+            self._arrivals.note_newest(float(times_s[-1]))
+            self._batch_utime = None if has_past else arrived[-1].arrived_utime
             head = self.newest_head = rows.heads[-1]
             self.newest_items = rows.items[int(head["num_items"])][-1]
-            if not (rows.malformed or self._has_past):
+            if not (rows.malformed or has_past):
                 times = np.array([arrival.arrived_utime for arrival in arrived])
                 self.latency.add(rows.heads["capture_utime"], rows.heads["utime"], times)
             if self.type in {ComponentType.MARKERS, ComponentType.TOOLS}:  # the others are never missing
@@ -116,24 +98,15 @@ class LiveComponent:
             self._described = (parameters, num_items)
             self.description = describe(self.type, parameters, num_items)
 
-    def _count_past(self, times_s: Array) -> None:
-        """Let the rate be that of the times of messages of the past; ``times_s`` are those on this clock."""
-        recent_s = times_s[times_s > times_s[-1:] - _RATE_WINDOW_S].tolist()
-        if recent_s:
-            self._counts = deque([(recent_s[0], 0), (recent_s[-1], len(recent_s) - 1)])
-
     def note_shown(self) -> None:
         """Take note that the newest messages are sent to the browsers now."""
-        if len(self.batch.heads) and not self._has_past:
-            self.latency.shown_ms.append((now_utime() - self._arrived_utime) / 1000)
+        if self._batch_utime is not None:
+            self.latency.shown_ms.append((now_utime() - self._batch_utime) / 1000)
 
     @property
     def rate_hz(self) -> float:
         """How many messages come per second, over two seconds; 0 before the second call of ``update``."""
-        if len(self._counts) < 2:
-            return 0.0
-        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
-        return (last - first) / max(last_s - first_s, 1e-3)
+        return self._arrivals.rate_hz
 
     @property
     def announced_rate_hz(self) -> float | None:
@@ -151,7 +124,7 @@ class LiveComponent:
 
         The shape is (items,); it is (0,) if no frame came in this time.
         """
-        shares = self._visibility.shares(self._now_s)
+        shares = self._visibility.shares(self._clock.now_s)
         return shares if len(shares) == len(self.newest_items) else shares[:0]
 
     @property
@@ -163,16 +136,12 @@ class LiveComponent:
     @property
     def age_s(self) -> float | None:
         """How long ago the newest message arrived; None before the first."""
-        return None if self._arrived_s is None else self._now_s - self._arrived_s
+        return self._arrivals.age_s(self._clock.now_s)
 
     @property
     def is_stopped(self) -> bool:
         """Whether data came before and come no more. Events come at any time, so they never stop."""
-        age_s = self.age_s
-        if self.type is ComponentType.EVENT or age_s is None:
-            return False
-        frames_s = _STOPPED_FRAMES / self._rate_before_stop_hz if self._rate_before_stop_hz else 0.0
-        return age_s > max(_STOPPED_S, frames_s)
+        return self.type is not ComponentType.EVENT and self._arrivals.have_stopped(self._clock.now_s)
 
 
 NUM_EVENTS: Final = 20

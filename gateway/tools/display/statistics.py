@@ -1,11 +1,89 @@
-"""Statistics of what arrives for a display: how often items are visible, and latencies."""
+"""Statistics of what arrives for a display: its rate, how often items are visible, and latencies."""
 
+import time
 from collections import deque
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from gateway.takes.files.component_rows import Array
+
+
+class HeldClock:
+    """The monotonic clock, but while a recording pauses, it stands still."""
+
+    def __init__(self) -> None:
+        self._held_s = 0.0  # how long it was held so far
+        self._continued_s = self.now_s
+
+    @property
+    def now_s(self) -> float:
+        """The time without pauses."""
+        return time.monotonic() - self._held_s
+
+    def go_on(self) -> float:
+        """Return the time, and let it count even if ``hold`` follows."""
+        self._continued_s = self.now_s
+        return self._continued_s
+
+    def hold(self) -> None:
+        """Count no time since the last ``go_on``."""
+        self._held_s += self.now_s - self._continued_s
+
+
+_RATE_WINDOW_S: Final = 2.0
+
+_STOPPED_S: Final = 0.5
+"""Data that do not come for this long, and for _STOPPED_FRAMES frames, have stopped."""
+_STOPPED_FRAMES: Final = 4
+
+
+class ArrivalRate:
+    """How many messages come per second, over two seconds, and whether they have stopped."""
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, int]] = deque()  # time and number of messages so far
+        self._newest_s: float | None = None
+        self._rate_before_stop_hz = 0.0
+
+    def count(self, now_s: float, num_messages: int) -> None:
+        """Take messages that arrive now; also call it when none arrive."""
+        num_before = self._counts[-1][1] if self._counts else 0
+        self._counts.append((now_s, num_before + num_messages))
+        while len(self._counts) > 2 and now_s - self._counts[1][0] >= _RATE_WINDOW_S:
+            self._counts.popleft()
+
+    def count_past(self, times_s: Array) -> None:
+        """Let the rate be that of the times of messages of the past; ``times_s`` are those on this clock."""
+        recent_s = times_s[times_s > times_s[-1:] - _RATE_WINDOW_S].tolist()
+        if recent_s:
+            self._counts = deque([(recent_s[0], 0), (recent_s[-1], len(recent_s) - 1)])
+
+    def note_newest(self, newest_s: float) -> None:
+        """Take the time of the newest message, after it was counted."""
+        self._newest_s = newest_s
+        self._rate_before_stop_hz = self.rate_hz
+
+    @property
+    def rate_hz(self) -> float:
+        """How many messages come per second; 0 before the second call of ``count``."""
+        if len(self._counts) < 2:
+            return 0.0
+        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
+        return (last - first) / max(last_s - first_s, 1e-3)
+
+    def age_s(self, now_s: float) -> float | None:
+        """Return how long ago the newest message came; None before the first."""
+        return None if self._newest_s is None else now_s - self._newest_s
+
+    def have_stopped(self, now_s: float) -> bool:
+        """Return whether messages came before and come no more."""
+        age_s = self.age_s(now_s)
+        if age_s is None:
+            return False
+        frames_s = _STOPPED_FRAMES / self._rate_before_stop_hz if self._rate_before_stop_hz else 0.0
+        return age_s > max(_STOPPED_S, frames_s)
+
 
 WINDOW_S: Final = 10.0
 _STEP_S: Final = 0.5
