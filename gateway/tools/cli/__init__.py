@@ -11,6 +11,6 @@ function; ``options`` has the options that several commands share.
 
 Everything that is asked of running gateways goes through ``gateway.client``.
 
-Modules named after a command (``echo_output``, ``record_output``, ``replay_run``) do its work.
+Modules named after a command (``echo_output``, ``record_progress``, ``replay_run``) do its work.
 The exit statuses are in docs/reference/commands.md.
 """

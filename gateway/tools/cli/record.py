@@ -13,7 +13,7 @@ from gateway.tools.cli.run import StopSignals
 
 if TYPE_CHECKING:
     from gateway.client.recorder import TakeRecording
-    from gateway.tools.cli.record_output import RecordProgress
+    from gateway.tools.cli.record_progress import RecordProgress
 
 _TICK_S: Final = 0.1
 
@@ -51,7 +51,8 @@ def record(
     from gateway.client.lcm_transport import START_S
     from gateway.client.recorder import FileWriter, TakeRecording, Target
     from gateway.client.transport import close_in_time
-    from gateway.tools.cli.record_output import RecordProgress, print_summary
+    from gateway.tools.cli.record_output import print_summary
+    from gateway.tools.cli.record_progress import RecordProgress
 
     def end_at_once(signal_number: int) -> None:
         if sys.stderr.isatty():
