@@ -168,7 +168,7 @@ def _write_motion(job: ExportJob, data_set: DataSet, run: int, recording: _Recor
         job.progress(f"writing {path.name}", stop, grid.num_rows)
     note_grid(job, measurement, path.name)
     note_missing(job, path, measurement, 0, grid.num_rows)
-    job.written[measurement.source.name, series.key] += placed.count(0, grid.num_rows)
+    job.rows.written[measurement.source.name, series.key] += placed.count(0, grid.num_rows)
     channels = _channels(job, measurement, conversions)
     if len(channels) > _MAX_VALIDATED:
         what = f"more than {_MAX_VALIDATED} columns: call the validator with --max-rows -1"
@@ -343,7 +343,7 @@ def _write_events(
             labels.append((text.label, label))
             rows.append((onset, 0, label, int(events.items[row]["id"]), description))
         note_event_labels(job, source.name, *zip(*labels, strict=True))
-        job.written[source.name, "event"] += len(rows)
+        job.rows.written[source.name, "event"] += len(rows)
         columns = ("onset", "duration", *_EVENT_COLUMNS)
         write_table(job, data_set.path(recording.label, number, "events.tsv"), columns, rows)
         described = {name: {"Description": text} for name, text in _EVENT_COLUMNS.items()}

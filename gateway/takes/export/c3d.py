@@ -66,11 +66,11 @@ def export_c3d(job: ExportJob) -> None:
         content = content_of(job, measurement)
         _write(job, content, path)
         source = measurement.source.name
-        job.written[source, "3d"] += content.num_marker_frames
-        job.written[source, "analog"] += content.num_samples(content.analog)
-        job.written[source, "force"] += content.num_samples(content.forces)
+        job.rows.written[source, "3d"] += content.num_marker_frames
+        job.rows.written[source, "analog"] += content.num_samples(content.analog)
+        job.rows.written[source, "force"] += content.num_samples(content.forces)
         is_near = _is_near(content, _event_seconds(content))
-        job.written[source, "event"] += min(int(is_near.sum()), MAX_LIST)
+        job.rows.written[source, "event"] += min(int(is_near.sum()), MAX_LIST)
         belongs[source] = belongs.get(source, False) | is_near
     for source, is_in_file in belongs.items():
         if not is_in_file.all():

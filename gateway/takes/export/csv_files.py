@@ -27,7 +27,7 @@ def export_csv(job: ExportJob) -> None:
             files[table].write(_record([*TIME_COLUMNS, *titles]))
         lines = [*_lines(part)]
         files[table].write(b"\r\n".join([*lines, b""]))
-        job.written[table.source.name, table.key] += len(lines)
+        job.rows.written[table.source.name, table.key] += len(lines)
 
 
 def _title(column: Column) -> str:

@@ -5,7 +5,7 @@ The formats are imported when they are used: the command line lists them, and nu
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -132,6 +132,43 @@ Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 @dataclass(frozen=True)
+class TakePart:
+    """What is exported of a take: ``source`` is the name of one source, None all.
+
+    ``from_s`` and ``to_s`` are in seconds from the first event of the take; None is its beginning or its end.
+    """
+
+    source: str | None = None
+    from_s: float | None = None
+    to_s: float | None = None
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether the time is limited."""
+        return self.from_s is not None or self.to_s is not None
+
+
+class RowCounts:
+    """How many rows are to be written and were written, by the name of the source and the component."""
+
+    def __init__(self) -> None:
+        self.recorded: Counter[tuple[str, str]] = Counter()
+        """How many rows the take has that could be in a file."""
+        self.written: Counter[tuple[str, str]] = Counter()
+        """How many of them are in files."""
+
+    def differences(self) -> Iterator[tuple[str, str]]:
+        """Yield what differs, and how much of it, as in a Note."""
+        for (source, key), num_recorded in self.recorded.items():
+            num_written = self.written[source, key]
+            if num_written < num_recorded:
+                missing = f"{num_recorded - num_written} of {num_recorded}"
+                yield f"rows of {key} of {source} that are in no file", missing
+            elif num_written > num_recorded:
+                yield f"rows of {key} of {source} in several files", str(num_written - num_recorded)
+
+
+@dataclass(frozen=True)
 class OpenSimOptions:
     """How files for OpenSim are made.
 
@@ -168,18 +205,15 @@ class ExportJob:
     """What to export, and where it goes.
 
     ``format`` is a key of CHOSEN_FORMATS; "" means that the extension of ``out`` says the format.
-    ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
-    the take. ``details`` replace those of the take, by name: subject, session, note. ``progress`` is called
-    with what is being done, how much of it is done, and how much there is (0: that is not known). ``notes``
-    say what was changed, rounded or left out.
+    ``details`` replace those of the take, by name: subject, session, note. ``progress`` is called with what
+    is being done, how much of it is done, and how much there is (0: that is not known). ``notes`` say what
+    was changed, rounded or left out.
     """
 
     take: Path
     out: Path
     format: str = ""
-    source: str | None = None
-    from_s: float | None = None
-    to_s: float | None = None
+    part: TakePart = TakePart()
     details: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[str, int, int], None] = lambda *_: None
     notes: list[Note] = field(default_factory=list)
@@ -188,10 +222,7 @@ class ExportJob:
     files: NewFiles = field(default_factory=NewFiles)
     stems: set[str] = field(default_factory=set)
     """The names of files so far, without extensions."""
-    recorded: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """How many rows the take has that could be in a file, by the name of the source and the component."""
-    written: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """How many of them are in files."""
+    rows: RowCounts = field(default_factory=RowCounts)
 
     @property
     def chosen_format(self) -> Format:
@@ -216,10 +247,10 @@ class ExportJob:
 
         take = open_take(
             self.take,
-            sources=None if self.source is None else [self.source],
+            sources=None if self.part.source is None else [self.part.source],
             components=components,
-            from_s=self.from_s,
-            to_s=self.to_s,
+            from_s=self.part.from_s,
+            to_s=self.part.to_s,
             progress=lambda done, total: self.progress(f"reading {self.take.name}", done, total),
             spool_folder=self.out.parent,
         )
@@ -269,17 +300,12 @@ class ExportJob:
     def count_recorded(self, source: str, key: str, num_rows: int) -> None:
         """Count rows of a component that the take has, if the format has the component."""
         if key in self.chosen_format.components:
-            self.recorded[source, key] += num_rows
+            self.rows.recorded[source, key] += num_rows
 
     def note_rows(self) -> None:
         """Report if the files have fewer or more rows than the take, whatever the reason."""
-        for (source, key), num_recorded in self.recorded.items():
-            num_written = self.written[source, key]
-            if num_written < num_recorded:
-                amount = f"{num_recorded - num_written} of {num_recorded}"
-                self.note(f"rows of {key} of {source} that are in no file", amount=amount)
-            elif num_written > num_recorded:
-                self.note(f"rows of {key} of {source} in several files", amount=num_written - num_recorded)
+        for what, amount in self.rows.differences():
+            self.note(what, amount=amount)
 
     def _note_left_out(self, take: "Take") -> None:
         """Report what a take has and the format has no place for."""
@@ -332,11 +358,11 @@ class ExportJob:
 
 def nothing_to_export(job: ExportJob, what: str) -> TakeError:
     """Return the error for a take without data that the format can hold."""
-    part = "" if job.from_s is None and job.to_s is None else " between --from and --to"
-    source = "" if job.source is None else f" of {job.source}"
-    error = SelectionError if part else TakeError
+    limits = " between --from and --to" if job.part.is_limited else ""
+    source = "" if job.part.source is None else f" of {job.part.source}"
+    error = SelectionError if limits else TakeError
     return error(
-        f"{job.take} has no {what}{source}{part}, and {_format_name(job)} holds nothing else; "
+        f"{job.take} has no {what}{source}{limits}, and {_format_name(job)} holds nothing else; "
         "`rtc3d-gateway take info` lists what the take has"
     )
 

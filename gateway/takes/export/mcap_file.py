@@ -92,7 +92,7 @@ def export_to_mcap(
                         file.add(messages)
                         num_messages[messages.topic] += len(messages.messages)
                     # Not every topic has every row: there are tools that are not in view.
-                    job.written[name, key] += max(num_messages.values(), default=0)
+                    job.rows.written[name, key] += max(num_messages.values(), default=0)
             file.write_most()
         for source in take.sources.values():
             file.describe(source)

@@ -234,7 +234,7 @@ def _write_mot(job: ExportJob, path: Path, loads: _PlateLoads, rotation: Array) 
     names = [f"{name}{axis}" for plan in loads.plans for name in _identifiers(plan) for axis in "xyz"]
     num_rows = _write_table(job, path, loads.samples, names, "", blocks())
     if loads.samples.placed.series.key == "force":  # and not the plates' channels
-        job.written[loads.samples.measurement.source.name, "force"] += num_rows
+        job.rows.written[loads.samples.measurement.source.name, "force"] += num_rows
 
 
 def _identifiers(plan: PlatePlan) -> tuple[str, str, str]:
@@ -310,7 +310,7 @@ def _write_sto(job: ExportJob, path: Path, analog: _Samples) -> None:
     units = printable(series.unit or ",".join(series.units))
     labels = opensim_labels(job, path.name, analog.measurement.source.name, series)
     num_rows = _write_table(job, path, analog, labels, f"units={units}\n", blocks())
-    job.written[analog.measurement.source.name, "analog"] += num_rows
+    job.rows.written[analog.measurement.source.name, "analog"] += num_rows
 
 
 _COUNT_WIDTH: Final = 12

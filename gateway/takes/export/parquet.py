@@ -35,7 +35,7 @@ def export_parquet(job: ExportJob) -> None:
                 writer = pq.ParquetWriter(job.files.create(table.path), batch.schema, use_dictionary=False)
                 files[table] = _TableFile(open_files.enter_context(writer))
             files[table].add(batch)
-            job.written[table.source.name, table.key] += batch.num_rows
+            job.rows.written[table.source.name, table.key] += batch.num_rows
             if sum(file.waiting_bytes for file in files.values()) > _MAX_WAITING_BYTES:
                 max(files.values(), key=lambda file: file.waiting_bytes).write_row_group()
         for file in files.values():

@@ -89,7 +89,7 @@ def parts_of(job: ExportJob, take: Take) -> Iterator[list[tuple[str, str, Series
         yield from _parts_in_order(job)
         return
     reader = TakeReader(job.take)
-    first_utime, end_utime = utime_range(take.start_utime, job.from_s, job.to_s)
+    first_utime, end_utime = utime_range(take.start_utime, job.part.from_s, job.part.to_s)
     for batches in reader.batches(end_utime):
         found = []
         for batch in batches:

@@ -67,7 +67,7 @@ def write_trc(
         file.write(b"".join(b"%d\t%.6f\t%b\t\n" % line for line in lines))
         job.progress(f"writing {path.name}", stop, grid.num_rows)
     note_missing(job, path, measurement, 0, grid.num_rows)
-    job.written[measurement.source.name, "3d"] += frames.count(0, grid.num_rows)
+    job.rows.written[measurement.source.name, "3d"] += frames.count(0, grid.num_rows)
 
 
 def _head(job: ExportJob, measurement: ExportedMeasurement, name: str, unit: str) -> str:

@@ -13,7 +13,15 @@ import typer
 from gateway.config.words import join_or
 from gateway.errors import QueryError
 from gateway.runtime.safe_text import safe_text
-from gateway.takes.export.job import FORMATS, Axis, BidsNames, ExportJob, OpenSimOptions, export_take
+from gateway.takes.export.job import (
+    FORMATS,
+    Axis,
+    BidsNames,
+    ExportJob,
+    OpenSimOptions,
+    TakePart,
+    export_take,
+)
 from gateway.tools.cli import options
 from gateway.tools.cli.main import exit_with, print_json
 
@@ -313,9 +321,7 @@ def export(
         file,
         out,
         chosen_format,
-        source=source,
-        from_s=from_s,
-        to_s=to_s,
+        part=TakePart(source, from_s, to_s),
         details=details.given(),
         opensim=OpenSimOptions(up, forward, min_force, bodies_of_plates),
         bids=names,

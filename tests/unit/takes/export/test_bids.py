@@ -20,7 +20,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.job import BidsNames, ExportJob
+from gateway.takes.export.job import BidsNames, ExportJob, TakePart
 from gateway.takes.files.new_file import NewFiles
 from tests.support.errors import names, one_names, raises
 from tests.support.takes import (
@@ -334,7 +334,7 @@ def test_sources_with_different_subjects_need_a_choice(tmp_path: Path) -> None:
     messages += [markers(1, source=name) for name in ("a", "b")]
     with pytest.raises(SelectionError, match="have different subjects, a and b; choose by --subject"):
         export(tmp_path, messages, subject="")
-    export(tmp_path, messages, subject="", source="b")
+    export(tmp_path, messages, subject="", part=TakePart("b"))
     assert (tmp_path / "study/sub-b").is_dir()
 
 

@@ -24,7 +24,15 @@ from gateway.rtc3d.parameters import (
     Tool,
 )
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob, Format, export_take
+from gateway.takes.export.job import (
+    CHOSEN_FORMATS,
+    FORMATS,
+    BidsNames,
+    ExportJob,
+    Format,
+    TakePart,
+    export_take,
+)
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -147,7 +155,7 @@ def test_sources_have_their_own_rates_and_the_times_of_this_computer(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_one_source_alone_is_exported_without_its_name(take: Path, tmp_path: Path, name: str) -> None:
-    paths = export_take(job_for(name, take, tmp_path, source="right"))
+    paths = export_take(job_for(name, take, tmp_path, part=TakePart("right")))
     assert not any("left" in str(path.relative_to(tmp_path)) for path in paths)
     if name != "bids":  # its tracking systems always have the name of the source
         assert not any("right" in path.name for path in paths)
@@ -253,7 +261,9 @@ def long_take(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", NAMES)
 def test_progress_grows_up_to_the_end_of_each_step(long_take: Path, tmp_path: Path, name: str) -> None:
     calls: list[Call] = []
-    job = job_for(name, long_take, tmp_path, progress=lambda *call: calls.append(call), to_s=5.5)
+    job = job_for(
+        name, long_take, tmp_path, progress=lambda *call: calls.append(call), part=TakePart(to_s=5.5)
+    )
     export_take(job)
     steps = stages(calls)
     names = [what for what, _ in steps]
@@ -273,7 +283,9 @@ def test_what_is_written_while_it_is_read_is_read_to_the_end_of_the_range(
 ) -> None:
     """The first seconds of an hour take seconds, not minutes."""
     calls: list[Call] = []
-    export_take(job_for(name, long_take, tmp_path, progress=lambda *call: calls.append(call), to_s=5.5))
+    export_take(
+        job_for(name, long_take, tmp_path, progress=lambda *call: calls.append(call), part=TakePart(to_s=5.5))
+    )
     [done] = ([each for _, each, _ in found] for what, found in stages(calls) if what.startswith("writing"))
     assert done[-2] < done[-1]
 

@@ -12,6 +12,7 @@ import pytest
 
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ComponentType
+from gateway.takes.export.job import TakePart
 from gateway.takes.files import component_rows, spool
 from tests.support.errors import raises
 from tests.support.takes import (
@@ -31,29 +32,29 @@ EVENT = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
 
 
 @pytest.mark.parametrize(
-    ("extension", "messages", "options", "problem"),
+    ("extension", "messages", "part", "problem"),
     [
-        (".c3d", [EVENT], {}, r"no markers, analog channels or forces, .*\.c3d"),
-        (".trc", [ANALOG], {}, r"take\.lcmlog .*no markers, .*\.trc"),
-        (".trc", [markers(1)], {"from_s": 5.0}, "no markers .*--from"),
-        (".csv", [description(), labelled("a")], {}, "has no frames"),
-        (".csv", [markers(1)], {"from_s": math.inf}, "no frames .*--from"),
-        (".sto", [frame(ComponentType.ANALOG, [])], {}, "has no analog channels"),
+        (".c3d", [EVENT], TakePart(), r"no markers, analog channels or forces, .*\.c3d"),
+        (".trc", [ANALOG], TakePart(), r"take\.lcmlog .*no markers, .*\.trc"),
+        (".trc", [markers(1)], TakePart(from_s=5.0), "no markers .*--from"),
+        (".csv", [description(), labelled("a")], TakePart(), "has no frames"),
+        (".csv", [markers(1)], TakePart(from_s=math.inf), "no frames .*--from"),
+        (".sto", [frame(ComponentType.ANALOG, [])], TakePart(), "has no analog channels"),
         (
             ".csv",
             [description(), markers(1)],
-            {"source": "studio"},
+            TakePart("studio"),
             "no source 'studio'; its sources are: lab",
         ),
-        (".mcap", [description(), labelled("a")], {}, "has no frames"),
-        (".mcap", [description(), labelled("a")], {"from_s": 0.0, "to_s": 1.0}, "has no frames"),
+        (".mcap", [description(), labelled("a")], TakePart(), "has no frames"),
+        (".mcap", [description(), labelled("a")], TakePart(None, 0.0, 1.0), "has no frames"),
     ],
 )
 def test_a_take_without_anything_to_export_is_an_error(
-    tmp_path: Path, extension: str, messages: list[tuple[str, bytes]], options: dict[str, float], problem: str
+    tmp_path: Path, extension: str, messages: list[tuple[str, bytes]], part: TakePart, problem: str
 ) -> None:
     with pytest.raises(TakeError, match=problem):
-        export_messages(tmp_path, messages, f"walk{extension}", **options)
+        export_messages(tmp_path, messages, f"walk{extension}", part=part)
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
 
 
@@ -99,7 +100,7 @@ def test_trc_and_csv_count_from_the_beginning_of_the_take(tmp_path: Path) -> Non
 def test_a_c3d_file_counts_from_its_first_frame_and_says_when_that_was(
     tmp_path: Path, from_s: float | None, first: float
 ) -> None:
-    notes = notes_of(export_messages(tmp_path, messages(), "walk.c3d", from_s=from_s))
+    notes = notes_of(export_messages(tmp_path, messages(), "walk.c3d", part=TakePart(from_s=from_s)))
     found = C3d(tmp_path / "walk.c3d")
     assert found("TRIAL", "TIME_OFFSET") == pytest.approx([first], abs=0.01)
     [text] = found("TRIAL", "DATE_TIME")

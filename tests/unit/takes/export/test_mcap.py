@@ -35,6 +35,7 @@ from gateway.rtc3d.parameters import (
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes.export.job import TakePart
 from gateway.takes.export.mcap_file import McapFile
 from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.take import TakeSource
@@ -349,7 +350,7 @@ def test_only_the_chosen_time_and_source_are_exported(tmp_path: Path) -> None:
     messages = [message for source in ("lab", "b") for message in (description(source), unit("mm"))]
     messages += [markers(1, number, source=source) for number in range(100) for source in ("lab", "b")]
     messages.insert(50, parameters(SCENE.parameters, 2))
-    content = export(tmp_path, messages, source="lab", from_s=0.2, to_s=0.6)
+    content = export(tmp_path, messages, part=TakePart("lab", 0.2, 0.6))
     assert set(content.topics) == {"/lab/markers", "/lab/plates", "/lab/parameters"}
     logged = content.topics["/lab/markers"]
     assert [points_of(log.content)["y"][0] * 1000 for log in logged] == pytest.approx(range(20, 60))

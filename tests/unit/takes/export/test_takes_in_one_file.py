@@ -10,7 +10,7 @@ import pytest
 
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
-from gateway.takes.export.job import ExportJob, export_take
+from gateway.takes.export.job import ExportJob, TakePart, export_take
 from tests.support.takes import Message, description, parameters, scene_messages, write_take
 from tests.unit.takes.export.exported import notes_of
 from tests.unit.takes.export.test_every_format import NAMES, job_for
@@ -71,8 +71,8 @@ def test_the_range_counts_from_the_first_moment_of_all_takes(
     tmp_path: Path, form: str, from_s: float | None, to_s: float | None
 ) -> None:
     """Also if the file begins with another moment."""
-    limits = {"from_s": from_s, "to_s": to_s}
-    assert export_of(tmp_path, form, "ba", **limits)[0] == export_of(tmp_path, form, "ab", **limits)[0]
+    part = TakePart(None, from_s, to_s)
+    assert export_of(tmp_path, form, "ba", part=part)[0] == export_of(tmp_path, form, "ab", part=part)[0]
 
 
 def test_csv_has_the_rows_of_open_take(tmp_path: Path) -> None:
