@@ -16,6 +16,7 @@ from gateway.takes.export.grid import Grid, place
 from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array
 from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.series import Series
+from gateway.takes.files.series_data import SeriesContent
 
 PERIOD_US: Final = 10_000
 
@@ -46,10 +47,9 @@ def series_of(frames: Frames, announced_hz: float | None = 1e6 / PERIOD_US) -> S
     columns["num_items"][:] = 1
     items = np.full((count, 1), MISSING, NATIVE_ITEM_DTYPES[ComponentType.MARKERS])
     described = Parameters(markers=Parameters3D(announced_hz, "mm", (Marker("1", "head"),)))
-    return Series(
-        ComponentType.MARKERS, columns, {1: items}, [ParametersEntry(0, 0, described, b"")], 10**15,
-        np.zeros(count, np.int64),
-    )  # fmt: skip
+    entries = np.zeros(count, np.int64)
+    content = SeriesContent(columns, {1: items}, [ParametersEntry(0, 0, described, b"")], entries)
+    return Series(ComponentType.MARKERS, content, 10**15)
 
 
 @st.composite

@@ -8,6 +8,7 @@ import numpy as np
 from gateway.takes.files.component_rows import Array
 from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.series import Series
+from gateway.takes.files.series_data import SeriesContent
 
 
 def join_series(parts: Sequence[Series]) -> Series:
@@ -41,14 +42,13 @@ def join_series(parts: Sequence[Series]) -> Series:
         items = np.concatenate([each.recorded[number] for each in contents if number in each.recorded])
         places = np.cumsum(num_items == number) - 1
         recorded[number] = items[places[order[num_items[order] == number]]]
-    return Series(
-        parts[0].component,
+    content = SeriesContent(
         {name: column[order] for name, column in columns.items()},
         recorded,
         parameters,
-        parts[0].start_utime,
         np.concatenate(entries)[order],
     )
+    return Series(parts[0].component, content, parts[0].start_utime)
 
 
 def _order_without_duplicates(columns: dict[str, Array], part: Array) -> Array:

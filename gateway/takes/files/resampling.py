@@ -8,7 +8,13 @@ import numpy as np
 from gateway.errors import TakeError
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array
-from gateway.takes.files.series_data import MAX_PADDING, MIN_LIMIT_BYTES, SeriesData, regular_step
+from gateway.takes.files.series_data import (
+    MAX_PADDING,
+    MIN_LIMIT_BYTES,
+    SeriesContent,
+    SeriesData,
+    regular_step,
+)
 
 _MAX_RATE_HZ: Final = 1_000_000
 """Times are in whole µs."""
@@ -61,15 +67,13 @@ def resample(
         for name in series.content.columns
     }
     columns["capture_utime"] = times
-    return type(series)(
-        series.component,
+    content = SeriesContent(
         columns,
         {number: np.concatenate(found) for number, found in items.items()},
         series.content.parameters,
-        series.start_utime,
         np.concatenate([run.content.entries[frames] for run, frames in nearest]),
-        rate_hz,
     )
+    return type(series)(series.component, content, series.start_utime, rate_hz)
 
 
 def _between_clock_steps(run: _SeriesT) -> list[_SeriesT]:

@@ -8,9 +8,9 @@ import numpy as np
 
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.files.component_rows import HEAD, NATIVE_ITEM_DTYPES, GrowingArray, Rows
-from gateway.takes.files.parameters_history import ParametersEntry
+from gateway.takes.files.parameters_history import ParametersEntry, entries_of_rows
 from gateway.takes.files.resampling import resample
-from gateway.takes.files.series_data import COLUMNS, SeriesData
+from gateway.takes.files.series_data import COLUMNS, SeriesContent, SeriesData
 from gateway.takes.files.tables import to_pandas, to_xarray
 
 if TYPE_CHECKING:
@@ -127,4 +127,5 @@ class SeriesBuilder:
         recorded = {num_items: items.take() for num_items, items in self._items.items()}
         if not len(columns["utime"]):
             return None
-        return Series(self._component, columns, recorded, parameters, start_utime)
+        entries = entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
+        return Series(self._component, SeriesContent(columns, recorded, parameters, entries), start_utime)

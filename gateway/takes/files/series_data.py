@@ -17,7 +17,7 @@ from gateway.takes.files.component_rows import (
     Array,
     find_restarts,
 )
-from gateway.takes.files.parameters_history import ParametersEntry, entries_of_rows
+from gateway.takes.files.parameters_history import ParametersEntry
 from gateway.takes.files.row import ItemValues
 from gateway.takes.files.spool import pieces
 
@@ -46,6 +46,15 @@ class SeriesContent(NamedTuple):
     parameters: Sequence[ParametersEntry]
     entries: Array
 
+    @property
+    def num_items(self) -> Array:
+        """How many items each row has."""
+        return self.columns["num_items"]
+
+    def parameters_of(self, entry: int) -> Parameters | None:
+        """Return the parameters with an index of ``entries``; None if it is -1."""
+        return self.parameters[entry].parameters if entry >= 0 else None
+
     def __repr__(self) -> str:
         """Return a summary."""
         return f"<SeriesContent: {len(self.entries)} rows, {len(self.parameters)} parameters>"
@@ -65,27 +74,15 @@ class SeriesData(ItemValues):
     def __init__(
         self,
         component: ComponentType,
-        columns: dict[str, Array],
-        recorded: dict[int, Array],
-        parameters: Sequence[ParametersEntry],
+        content: SeriesContent,
         start_utime: int,
-        entries: Array | None = None,
         resampled_hz: float | None = None,
     ) -> None:
         self.component = component
-        self.key = component.key
+        self._content = content
         self.start_utime = start_utime
-        self._parameters = parameters
-        self._recorded = recorded  # items by their number, as in Rows; of events, all below 1
-        self._columns = columns
         for name in COLUMNS:
-            setattr(self, name, columns[name])
-        self._num_items = columns["num_items"]
-        self._entries = (
-            entries_of_rows(columns["utime"], columns["parameters_version"], parameters)
-            if entries is None
-            else entries
-        )
+            setattr(self, name, content.columns[name])
         self._resampled_hz = resampled_hz
 
     def __len__(self) -> int:
@@ -99,7 +96,12 @@ class SeriesData(ItemValues):
     @property
     def content(self) -> SeriesContent:
         """What this series was made of, to make another one of it."""
-        return SeriesContent(self._columns, self._recorded, self._parameters, self._entries)
+        return self._content
+
+    @property
+    def key(self) -> str:
+        """The component: "3d", "6d", "analog", "force" or "event"."""
+        return self.component.key
 
     @property
     def seconds(self) -> Array:
@@ -112,8 +114,8 @@ class SeriesData(ItemValues):
 
     def parameters_of(self, row: int) -> Parameters:
         """Return the server's parameters that describe a row; without any section if the take has none."""
-        entry = int(self._entries[row])
-        return self._parameters[entry].parameters if entry >= 0 else Parameters()
+        entry = int(self.content.entries[row])
+        return self.content.parameters_of(entry) or Parameters()
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -173,12 +175,13 @@ class SeriesData(ItemValues):
         Raises TakeError if the labels change so much that this array would be several times as large as the
         recording; use ``runs`` then.
         """
+        content = self.content
         if self.component is ComponentType.EVENT:
-            return self._recorded[1][:, 0]
-        if len(self._recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
-            return next(iter(self._recorded.values()))
+            return content.recorded[1][:, 0]
+        if len(content.recorded) == 1 and len({layout.labels for layout in self._layouts.values()}) == 1:
+            return next(iter(content.recorded.values()))
         dtype = NATIVE_ITEM_DTYPES[self.component]
-        recorded_bytes = sum(items.nbytes for items in self._recorded.values())
+        recorded_bytes = sum(items.nbytes for items in content.recorded.values())
         num_bytes = len(self) * len(self.labels) * dtype.itemsize
         if num_bytes > max(MAX_PADDING * recorded_bytes, MIN_LIMIT_BYTES):
             raise TakeError(
@@ -187,12 +190,12 @@ class SeriesData(ItemValues):
             )
         items = np.full((len(self), len(self.labels)), MISSING, np.float32 if not dtype.names else dtype)
         columns = {label: column for column, label in enumerate(self.labels)}
-        rows_of = {number: np.flatnonzero(self._num_items == number) for number in self._recorded}
+        rows_of = {number: np.flatnonzero(content.num_items == number) for number in content.recorded}
         for (entry, num_items), layout in self._layouts.items():
             rows = rows_of[num_items]
-            chosen = self._entries[rows] == entry
+            chosen = content.entries[rows] == entry
             places = np.array([columns[label] for label in layout.labels], np.intp)
-            items[rows[chosen][:, None], places] = self._recorded[num_items][chosen]
+            items[rows[chosen][:, None], places] = content.recorded[num_items][chosen]
         return items
 
     @property
@@ -201,10 +204,10 @@ class SeriesData(ItemValues):
         if self.component is not ComponentType.EVENT:
             return ()
         names = {
-            entry: event_labels(self._parameters[entry].parameters if entry >= 0 else None)
-            for entry in np.unique(self._entries).tolist()
+            entry: event_labels(self.content.parameters_of(entry))
+            for entry in np.unique(self.content.entries).tolist()
         }
-        rows = zip(self._entries.tolist(), self.items["id"].tolist(), strict=True)
+        rows = zip(self.content.entries.tolist(), self.items["id"].tolist(), strict=True)
         return tuple(names[entry].get(number, "") for entry, number in rows)
 
     def runs(self) -> list[Self]:
@@ -215,16 +218,17 @@ class SeriesData(ItemValues):
         """
         if not len(self):
             return []
+        content = self.content
         starts = [0, *self._starts(), len(self)]
-        before = dict.fromkeys(self._recorded, 0)
+        before = dict.fromkeys(content.recorded, 0)
         runs = []
         for start, stop in pairwise(starts):
-            num_items = int(self._num_items[start])
+            num_items = int(content.num_items[start])
             first = before[num_items]
             before[num_items] += stop - start
-            recorded = {num_items: self._recorded[num_items][first : before[num_items]]}
-            columns = {name: values[start:stop] for name, values in self._columns.items()}
-            runs.append(self._part(columns, recorded, self._entries[start:stop]))
+            recorded = {num_items: content.recorded[num_items][first : before[num_items]]}
+            columns = {name: values[start:stop] for name, values in content.columns.items()}
+            runs.append(self._part(columns, recorded, content.entries[start:stop]))
         return runs
 
     def _starts(self) -> list[int]:
@@ -245,12 +249,13 @@ class SeriesData(ItemValues):
 
     def without_empty_frames(self) -> Self:
         """Return the frames that have items; all frames if none has."""
-        has_items = self._num_items > 0
+        content = self.content
+        has_items = content.num_items > 0
         if has_items.all() or not has_items.any():
             return self
-        columns = {name: values[has_items] for name, values in self._columns.items()}
-        recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
-        return self._part(columns, recorded, self._entries[has_items])
+        columns = {name: values[has_items] for name, values in content.columns.items()}
+        recorded = {num_items: items for num_items, items in content.recorded.items() if num_items}
+        return self._part(columns, recorded, content.entries[has_items])
 
     def with_constant_labels(self) -> Self:
         """Return the frames with as many items each as the parameters have at most, NaN where one is missing.
@@ -258,61 +263,63 @@ class SeriesData(ItemValues):
         The number of markers changes from frame to frame if a server sends unlabelled ones. Frames whose
         labels would take several times as much memory as was recorded stay as they are.
         """
-        most = max(self._recorded, default=0)
+        content = self.content
+        most = max(content.recorded, default=0)
         sizes: dict[tuple[str, ...], int] = {}
         labels: dict[int, tuple[str, ...]] = {}
         for entry, num_items in self._layouts:
-            parameters = self._parameters[entry].parameters if entry >= 0 else None
+            parameters = content.parameters_of(entry)
             labels[entry] = describe(self.component, parameters, most).labels
             sizes[labels[entry]] = max(sizes.get(labels[entry], 0), num_items)
         if all(sizes[labels[entry]] == num_items for entry, num_items in self._layouts):
             return self
-        padded = np.zeros(len(self), self._num_items.dtype)
+        padded = np.zeros(len(self), content.num_items.dtype)
         for entry, found in labels.items():
-            padded[self._entries == entry] = sizes[found]
+            padded[content.entries == entry] = sizes[found]
         item_bytes = NATIVE_ITEM_DTYPES[self.component].itemsize
-        recorded_bytes = int(self._num_items.sum(dtype=np.int64)) * item_bytes
+        recorded_bytes = int(content.num_items.sum(dtype=np.int64)) * item_bytes
         if padded.sum(dtype=np.int64) * item_bytes > max(MAX_PADDING * recorded_bytes, MIN_LIMIT_BYTES):
             return self
         recorded = {}
         for number in np.unique(padded).tolist():
             (rows,) = np.nonzero(padded == number)
-            counts = self._num_items[rows]
+            counts = content.num_items[rows]
             items = np.full((len(rows), number), MISSING, NATIVE_ITEM_DTYPES[self.component])
             for count in np.unique(counts).tolist():
-                places = padded[self._num_items == count] == number
-                items[counts == count, :count] = self._recorded[count][places]
+                places = padded[content.num_items == count] == number
+                items[counts == count, :count] = content.recorded[count][places]
             recorded[number] = items
-        return self._part(self._columns | {"num_items": padded}, recorded, self._entries)
+        return self._part(content.columns | {"num_items": padded}, recorded, content.entries)
 
     def rows(self, chosen: Array) -> Self:
         """Return some of the rows of a run, in which all have the same number of items."""
-        [(num_items, items)] = self._recorded.items()
-        columns = {name: values[chosen] for name, values in self._columns.items()}
-        return self._part(columns, {num_items: items[chosen]}, self._entries[chosen])
+        content = self.content
+        [(num_items, items)] = content.recorded.items()
+        columns = {name: values[chosen] for name, values in content.columns.items()}
+        return self._part(columns, {num_items: items[chosen]}, content.entries[chosen])
 
     def _part(self, columns: dict[str, Array], recorded: dict[int, Array], entries: Array) -> Self:
         """Return a series of some of the rows."""
-        about = (self._parameters, self.start_utime)
-        return type(self)(self.component, columns, recorded, *about, entries, self._resampled_hz)
+        content = SeriesContent(columns, recorded, self.content.parameters, entries)
+        return type(self)(self.component, content, self.start_utime, self._resampled_hz)
 
     @cached_property
     def _layouts(self) -> dict[tuple[int, int], Description]:
-        """What describes rows, by index in ``_parameters`` and number of items, as they appear."""
+        """What describes rows, by index in ``content.parameters`` and number of items, as they appear."""
         layouts: dict[tuple[int, int], Description] = {}
         for start, stop in pieces(len(self)):
-            pairs = np.stack([self._entries[start:stop], self._num_items[start:stop]], axis=1)
+            pairs = np.stack([self.content.entries[start:stop], self.content.num_items[start:stop]], axis=1)
             unique, first = np.unique(pairs, axis=0, return_index=True)
             for entry, num_items in unique[np.argsort(first)].tolist():
                 if (entry, num_items) not in layouts:
-                    parameters = self._parameters[entry].parameters if entry >= 0 else None
+                    parameters = self.content.parameters_of(entry)
                     layouts[entry, num_items] = describe(self.component, parameters, num_items)
         return layouts
 
     def _layout_numbers(self, rows: slice) -> Array:
         """Return a number for each of some rows; rows with the same number have the same description."""
         numbers: dict[Description, int] = {}
-        entries, num_items = self._entries[rows], self._num_items[rows]
+        entries, num_items = self.content.entries[rows], self.content.num_items[rows]
         result = np.zeros(len(entries), np.int64)
         for (entry, count), layout in self._layouts.items():
             number = numbers.setdefault(layout, len(numbers))
