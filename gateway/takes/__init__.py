@@ -13,8 +13,8 @@ In ``files``:
 - Arrays: ``take``, ``series`` and ``series_data`` decode a take into numpy arrays; ``component_rows`` does so
   for many messages at once, and ``parameters_history`` says which parameters describe them. ``joined`` makes
   one series of several, ``resampling`` changes the rate, and ``tables`` makes tables for pandas and xarray.
-- Statistics: ``statistics`` and ``component_statistics`` describe a take in one pass with bounded memory,
-  with what interrupts it.
+- Statistics: ``statistics``, ``component_statistics`` and ``parameters_statistics`` describe a take in one
+  pass with bounded memory, with what interrupts it.
 
 ``export`` converts takes for other programs. What records takes is elsewhere: ``gateway.client.recorder`` as
 a subscriber, and the output ``gateway.outputs.takes`` in the gateway itself. ``gateway.tools.replay``

@@ -3,47 +3,33 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode
-from gateway.messages.descriptions.labels import describe, event_labels
+from gateway.messages.descriptions.labels import describe
 from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
 from gateway.messages.topics import MAX_SOURCES
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
-from gateway.rtc3d.parameters import Parameters, changed_sections, describe_renames, sections_of
 from gateway.takes.files.component_rows import decode_rows
 from gateway.takes.files.component_statistics import ClockSteps, ComponentStatistics, MessageStatistics
 from gateway.takes.files.description import NO_DETAILS, decoded_details, has_end
 from gateway.takes.files.event_log import MAX_LISTED_DAMAGE, Damage
 from gateway.takes.files.parameters_history import ParametersHistory
+from gateway.takes.files.parameters_statistics import ParametersStatistics
 from gateway.takes.files.reader import DESCRIPTIONS, TakeReader
 
-MAX_LISTED_CHANGES: Final = 100
-"""How many changes of the parameters are listed; all are counted."""
-
-_MAX_VERSIONS: Final = 32
-"""How many versions of the parameters are kept to label what follows."""
 _MAX_TEXTS: Final = 20
 _MAX_KEYS: Final = 1000
 _HEAD_BYTES: Final = FINGERPRINT_BYTES + PREFIX.size
 
 
-class ParametersChange(NamedTuple):
-    """The server's parameters at the beginning or after a change; ``text`` says what changed."""
+class SourceOrigin:
+    """Where a source of a take comes from, as the descriptions and the statuses in the take say."""
 
-    utime: int
-    version: int
-    text: str
-
-
-class SourceStatistics:
-    """What a take has of one source."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self) -> None:
         self.take_name = self.recorder = self.host = ""
         """What the newest description in the take says; "" without a description."""
         self.details = NO_DETAILS
@@ -51,24 +37,62 @@ class SourceStatistics:
         self.servers: list[str] = []
         """HOST:PORT of the server; several if it changed."""
         self.gateway_versions: list[str] = []
+
+    def add(self, key: str, message: Any) -> None:
+        """Take the next message of this key."""
+        if key == "details":
+            self.details = decoded_details(message)
+        if key == "take":
+            self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
+        if key in {"take", "status"}:
+            for texts, text in (
+                (self.servers, message.server),
+                (self.gateway_versions, message.gateway_version),
+            ):
+                if text and text not in texts and len(texts) < _MAX_TEXTS:
+                    texts.append(text)
+
+
+class GatewayLosses:
+    """What the gateway lost during the take. It counts from its own start, so only the differences matter."""
+
+    def __init__(self) -> None:
+        self.counts: dict[tuple[str, str], int] = {}
+        """Messages by stream or output and by cause."""
+        self._newest: dict[tuple[str, str], int] | None = None  # in the newest status
+
+    def add(self, status: Any) -> None:
+        """Add what was lost since the status before."""
+        places = [(stream.components, stream.drops) for stream in status.streams]
+        places += [(output.name, output.drops) for output in status.outputs]
+        newest = {(name, loss.cause): loss.messages for name, drops in places for loss in drops}
+        before = newest if self._newest is None else self._newest
+        for place, number in newest.items():
+            lost = number - before.get(place, 0)
+            if lost < 0:  # the gateway has started again
+                lost = number
+            if lost and (place in self.counts or len(self.counts) < _MAX_KEYS):
+                self.counts[place] = self.counts.get(place, 0) + lost
+        self._newest = newest
+
+
+class SourceStatistics:
+    """What a take has of one source."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.origin = SourceOrigin()
         self.components: dict[str, ComponentStatistics] = {}
         """By key: 3d, 6d, analog, force, event."""
         self.others: dict[str, MessageStatistics] = {}
         """Other messages by key: status, clock, parameters, 6d/LABEL (poses), take."""
-        self.parameters_changes: list[ParametersChange] = []
-        self.num_parameters_changes = 0
-        self.event_labels: dict[int, str] = {}
-        """The labels of events by id (§6.6)."""
-        self.drops: dict[tuple[str, str], int] = {}
-        """Messages that the gateway lost during the take, by stream or output and by cause."""
+        self.parameters = ParametersStatistics()
+        self.gateway_losses = GatewayLosses()
         self.num_lost = 0
         """Messages that the recorder lost, according to the ends of the files."""
         self.clock_steps = ClockSteps()
         self._num_open = 0  # files that should have an end, and have none so far
-        self._drops: dict[tuple[str, str], int] | None = None  # in the newest status
-        self._parameters: dict[int, Parameters] = {}  # by version
         self._history = ParametersHistory()
-        self._clock_key = ""
 
     @property
     def is_cut_off(self) -> bool:
@@ -114,7 +138,7 @@ class SourceStatistics:
         """Count what is left under its labels. Call it at the end."""
         for component in self.components.values():
             for version in component.versions:
-                component.set_labels(version, self._parameters.get(version))
+                component.set_labels(version, self.parameters.by_version.get(version))
 
     def _add_components(self, component: ComponentType, messages: list[bytes]) -> None:
         key = component.key
@@ -124,8 +148,7 @@ class SourceStatistics:
         statistics.num_bytes += sum(map(len, messages))
         rows = decode_rows(component, messages)
         statistics.add(rows)
-        self._clock_key = self._clock_key or key
-        if key == self._clock_key:
+        if key == next(iter(self.components)):  # one component shows the steps of the clock
             heads = rows.heads
             self.clock_steps.add(heads["utime"].astype(np.int64), heads["timestamp_us"].astype(np.int64))
 
@@ -146,72 +169,27 @@ class SourceStatistics:
             statistics.add_messages(heads[:, 0].astype(np.int64), heads[:, 2].astype(np.int64))
 
     def _describe(self, key: str, message: Any) -> None:
+        self.origin.add(key, message)
         match key:
             case "parameters":
                 self._set_parameters(message)
+            case "take":
+                self._num_open += has_end(message)
             case "end":
                 self.num_lost += message.messages_lost
                 self._num_open -= 1
-            case "details":
-                self.details = decoded_details(message)
-            case "take":
-                self.take_name, self.recorder, self.host = message.name, message.recorder, message.host
-                self._num_open += has_end(message)
-            case _:
-                self._count_drops(message)
-        if key in {"take", "status"}:
-            for texts, text in (
-                (self.servers, message.server),
-                (self.gateway_versions, message.gateway_version),
-            ):
-                if text and text not in texts and len(texts) < _MAX_TEXTS:
-                    texts.append(text)
-
-    def _count_drops(self, status: Any) -> None:
-        """Add what was lost since the status before; the gateway counts from its own start."""
-        places = [(stream.components, stream.drops) for stream in status.streams]
-        places += [(output.name, output.drops) for output in status.outputs]
-        newest = {(name, loss.cause): loss.messages for name, drops in places for loss in drops}
-        before = newest if self._drops is None else self._drops
-        for place, number in newest.items():
-            lost = number - before.get(place, 0)
-            if lost < 0:  # the gateway has started again
-                lost = number
-            if lost and (place in self.drops or len(self.drops) < _MAX_KEYS):
-                self.drops[place] = self.drops.get(place, 0) + lost
-        self._drops = newest
+            case "status":
+                self.gateway_losses.add(message)
 
     def _set_parameters(self, message: Any) -> None:
         before, entry = self._history.newest, self._history.add(message)
         if entry is None:
             return
-        utime, version, parameters, _ = entry
         self.others["parameters"].malformed += not self._history.is_readable
-        self._label(version)  # what came before, if versions start again
-        self.num_parameters_changes += 1
-        if len(self.parameters_changes) < MAX_LISTED_CHANGES:
-            text = _change_text(None if before is None else before.parameters, parameters)
-            self.parameters_changes.append(ParametersChange(utime, version, text))
-        self.event_labels |= event_labels(parameters)
-        self._parameters[version] = parameters
-        if len(self._parameters) > _MAX_VERSIONS:
-            oldest = next(iter(self._parameters))
-            self._label(oldest)
-            del self._parameters[oldest]
-
-    def _label(self, version: int) -> None:
-        if version in self._parameters:
+        removed = self.parameters.add(entry, None if before is None else before.parameters)
+        for version, parameters in removed.items():
             for component in self.components.values():
-                component.set_labels(version, self._parameters[version])
-
-
-def _change_text(before: Parameters | None, after: Parameters) -> str:
-    if before is None:
-        return "first: " + (", ".join(sorted(sections_of(after))) or "none")
-    if after == Parameters():
-        return "the server gives no parameters now"
-    texts = [describe_renames(before, after), ", ".join(changed_sections(before, after))]
-    return "; ".join(text for text in texts if text) or "the same"
+                component.set_labels(version, parameters)
 
 
 @dataclass

@@ -124,12 +124,12 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
         for key, part in source.components.items()
     }
     return {
-        "take": source.take_name,
-        "recorder": source.recorder,
-        "host": source.host,
-        **source.details._asdict(),
-        "servers": source.servers,
-        "gateway_versions": source.gateway_versions,
+        "take": source.origin.take_name,
+        "recorder": source.origin.recorder,
+        "host": source.origin.host,
+        **source.origin.details._asdict(),
+        "servers": source.origin.servers,
+        "gateway_versions": source.origin.gateway_versions,
         "sessions": source.sessions,
         "server_restarts": source.server_restarts,
         "measurements": source.measurements,
@@ -137,14 +137,14 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
         "components": components,
         "other": {key: _messages_json(statistics, part) for key, part in source.others.items()},
         "events": [
-            {"id": number, "label": source.event_labels.get(number, ""), "count": count}
+            {"id": number, "label": source.parameters.event_labels.get(number, ""), "count": count}
             for number, count in sorted(events.event_counts.items() if events else ())
         ],
         "parameters": [
             {"at_s": statistics.seconds_at(change.utime), "version": change.version, "change": change.text}
-            for change in source.parameters_changes
+            for change in source.parameters.changes
         ],
-        "parameters_changes": source.num_parameters_changes,
+        "parameters_changes": source.parameters.num_changes,
         "clock_steps": [
             {"at_s": statistics.seconds_at(step.utime), "step_s": step.step_us / 1e6}
             for step in source.clock_steps.steps
@@ -153,7 +153,7 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
         "is_cut_off": source.is_cut_off,
         "lost_by_gateway": [
             {"where": place, "cause": cause, "messages": number}
-            for (place, cause), number in source.drops.items()
+            for (place, cause), number in source.gateway_losses.counts.items()
         ],
     }
 
@@ -232,14 +232,15 @@ def _incomplete(statistics: TakeStatistics) -> Iterator[str]:
 
 
 def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
-    servers = ", ".join(source.servers) or "unknown server"
-    versions = ", ".join(source.gateway_versions)
+    origin = source.origin
+    servers = ", ".join(origin.servers) or "unknown server"
+    versions = ", ".join(origin.gateway_versions)
     yield f"Source {source.name}: {servers}" + (f", gateway {versions}" if versions else "")
-    if source.take_name:
-        host = f" on {source.host}" if source.host else ""
-        yield f"Take {source.take_name!r}, recorded by {source.recorder}{host}"
-    if source.details.text:
-        yield f"About {source.details.text}"
+    if origin.take_name:
+        host = f" on {origin.host}" if origin.host else ""
+        yield f"Take {origin.take_name!r}, recorded by {origin.recorder}{host}"
+    if origin.details.text:
+        yield f"About {origin.details.text}"
     texts = [counted(source.sessions, "connection")]
     if source.server_restarts:
         times = _times(source.server_restarts)
@@ -313,7 +314,7 @@ def _item_lists(source: SourceStatistics) -> Iterator[RenderableType]:
             yield _columns(texts)
     events = source.components.get("event")
     if events is not None and events.event_counts:
-        labels = source.event_labels
+        labels = source.parameters.event_labels
         texts = [
             f"{labels.get(number, '')} ({number:#x})  {count}".lstrip()
             for number, count in sorted(events.event_counts.items())
@@ -330,13 +331,13 @@ def _columns(texts: Sequence[str]) -> Columns:
 
 
 def _changes(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
-    changes = source.parameters_changes[:_MAX_SHOWN]
+    changes = source.parameters.changes[:_MAX_SHOWN]
     if not changes:
         yield "No parameters: labels, units and rates are not known"
     for change in changes:
         yield f"Parameters {change.version} at {_at(statistics, change.utime)}: {change.text}"
-    if source.num_parameters_changes > len(changes):
-        yield f"… and {source.num_parameters_changes - len(changes)} more changes of parameters"
+    if source.parameters.num_changes > len(changes):
+        yield f"… and {source.parameters.num_changes - len(changes)} more changes of parameters"
 
 
 def _problems(statistics: TakeStatistics) -> Iterator[str]:
@@ -358,7 +359,7 @@ def _problems(statistics: TakeStatistics) -> Iterator[str]:
 
 
 def _source_problems(source: SourceStatistics) -> Iterator[str]:
-    for (place, cause), number in source.drops.items():
+    for (place, cause), number in source.gateway_losses.counts.items():
         yield f"the gateway lost {counted(number, 'message')} ({place}: {cause})"
     parts: dict[str, MessageStatistics] = {**source.components, **source.others}
     for key, part in parts.items():

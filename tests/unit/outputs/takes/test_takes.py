@@ -87,7 +87,7 @@ async def test_what_a_take_is_about_is_in_its_file_and_its_list(tmp_path: Path) 
     path = lab.path("walk.lcmlog")
     assert [event.channel for event in events(path)[:2]] == ["MOCAP_LAB_TAKE", "MOCAP_LAB_DETAILS"]
     assert open_take(path).sources["lab"].details == about
-    assert take_statistics(path).sources["lab"].details == about
+    assert take_statistics(path).sources["lab"].origin.details == about
 
 
 async def test_parameters_stay_in_order_although_long_ones_are_encoded_elsewhere(tmp_path: Path) -> None:

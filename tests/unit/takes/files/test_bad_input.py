@@ -162,7 +162,7 @@ def test_segments_that_were_joined_are_one_take(tmp_path: Path) -> None:
     source = found.sources["lab"]
     assert found.is_complete
     assert (source.components["3d"].num_messages, source.gateway_restarts) == (3, 0)
-    assert source.num_parameters_changes == 1
+    assert source.parameters.num_changes == 1
     assert len(open_take(tmp_path / "take.lcmlog").sources["lab"].runs("3d")) == 1
 
 

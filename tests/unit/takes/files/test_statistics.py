@@ -64,13 +64,13 @@ def test_a_complete_take(tmp_path: Path) -> None:
     found = source.components["3d"]
     assert statistics.is_complete
     assert (statistics.seconds, statistics.num_messages) == (2.0, 203)
-    assert (source.servers, source.gateway_versions) == (["192.0.2.20:3020"], ["1.0"])
-    assert source.take_name == "take"
+    assert (source.origin.servers, source.origin.gateway_versions) == (["192.0.2.20:3020"], ["1.0"])
+    assert source.origin.take_name == "take"
     assert (source.sessions, source.server_restarts, source.gateway_restarts) == (1, 0, 0)
     assert (found.num_messages, found.min_items, found.max_items, found.rate_hz) == (201, 2, 2, 100.0)
     assert (source.announced_hz("3d"), source.announced_hz("6d")) == (100.0, None)
     assert found.visibility == {"a": 1.0, "b": 51 / 201}
-    assert [change.text for change in source.parameters_changes] == ["first: 3d"]
+    assert [change.text for change in source.parameters.changes] == ["first: 3d"]
 
 
 def test_the_rate_is_that_of_frames_that_follow_each_other(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_changes_of_parameters_say_what_changed(tmp_path: Path) -> None:
     messages = [parameters(labelled("a", "b")), markers(2, 0), renamed, renamed, markers(2, 1, version=2)]
     messages += [parameters(b"", 3), markers(1, 2, version=3)]
     source = lab(tmp_path, messages)
-    texts = [(change.version, change.text) for change in source.parameters_changes]
+    texts = [(change.version, change.text) for change in source.parameters.changes]
     assert texts[:2] == [(1, "first: 3d"), (2, "3d 'b' to 'c'")]
     [(version, text)] = texts[2:]
     assert version == 3
@@ -142,7 +142,7 @@ def test_events_are_counted_by_id_with_their_labels(tmp_path: Path) -> None:
     definition = Parameters(events=ParametersEvents((EventDefinition("0x10", "jump"),)))
     source = lab(tmp_path, [parameters(definition), frame(ComponentType.EVENT, events)])
     assert source.components["event"].event_counts == {7: 2, 16: 1}
-    assert source.event_labels == {16: "jump"}
+    assert source.parameters.event_labels == {16: "jump"}
     many = lab(tmp_path, [frame(ComponentType.EVENT, [(number, 0, -1, -1, -1) for number in range(1005)])])
     assert (len(many.components["event"].event_counts), many.components["event"].other_events) == (1000, 5)
 
@@ -150,8 +150,8 @@ def test_events_are_counted_by_id_with_their_labels(tmp_path: Path) -> None:
 def test_what_the_gateway_lost_during_the_take_is_counted_from_its_beginning(tmp_path: Path) -> None:
     # It lost 10 before the take, 3 during it, and 2 after it started again.
     source = lab(tmp_path, [status(0, 10), status(1, 10), status(2, 13), status(3, 2)])
-    assert source.drops == {("zenoh", "closed"): 5}
-    assert (source.servers, source.gateway_versions) == (["192.0.2.20:3020"], ["2.0"])
+    assert source.gateway_losses.counts == {("zenoh", "closed"): 5}
+    assert (source.origin.servers, source.origin.gateway_versions) == (["192.0.2.20:3020"], ["2.0"])
 
 
 def test_steps_of_the_clock_are_found_and_pauses_of_the_network_are_not(tmp_path: Path) -> None:
