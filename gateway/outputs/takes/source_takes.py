@@ -29,9 +29,10 @@ from gateway.messages.history import FoundMessages, WantedMessages
 from gateway.messages.host_time import now_utime
 from gateway.messages.take_names import check_name, default_name
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.outputs.contract import ServerParameters, encode_parameters, published_again
+from gateway.outputs.contract import ServerParameters
 from gateway.outputs.takes.disk import Storage, disk_result
 from gateway.outputs.takes.folder import ROLLING, StoredTake, TakePiece, add_c3d
+from gateway.outputs.takes.newest_parameters import NewestParameters
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import SourceFacts, SourceWriter, TakeFile
@@ -47,9 +48,6 @@ MAX_SAVES: Final = 16
 
 C3D_WAIT_S: Final = 60.0
 """A C3D file that the server sends within this time after a take belongs to the take."""
-
-_LONG_XML_BYTES: Final = 32 * 1024
-"""Longer parameters are encoded by a thread: 16 MB take 30 ms."""
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +77,6 @@ class SourceTakes:
         self.source = source
         self.storage = storage
         self._delete_rolling = delete_rolling
-        self._monotonic = storage.host.monotonic
         self.losses = Losses(logger, source)
         """Where losses are counted."""
         self.on_wanted_changed: Callable[[], None] = lambda: None
@@ -91,11 +88,7 @@ class SourceTakes:
         self.saves: dict[Save, asyncio.TimerHandle] = {}
         """The takes that are being saved, and what will end them."""
         self._publishers: list[TakesPublisher] = []
-        self._parameters: bytes | None = None  # the newest parameters_t
-        self._num_parameters = 0
-        self._long_parameters: Future[bytes] | None = None  # that are being encoded
-        self._encoder = storage.host.thread("takes-parameters")
-        self._are_parameters_missing = False
+        self._parameters = NewestParameters(storage.host.thread("takes-parameters"), self._record_parameters)
         self._newest_take: tuple[Path, float] | None = None  # that has ended, and when
 
     # For peers.
@@ -199,7 +192,7 @@ class SourceTakes:
                 "complete",
                 code="refused",
             )
-        now_s = self._monotonic()
+        now_s = self.storage.host.monotonic()
         since_s = now_s - last_s
         call = partial(segments.save, stem, since_s, details, has_free_name=not name, goes_on=after_s > 0)
         saved = writer.call(call)
@@ -211,10 +204,10 @@ class SourceTakes:
             raise
         if after_s > 0:
             loop = asyncio.get_running_loop()
-            delay_s = max(0.0, now_s + after_s - self._monotonic())
+            delay_s = max(0.0, now_s + after_s - self.storage.host.monotonic())
             self.saves[save] = loop.call_later(delay_s, self.end_save, save)
         else:
-            self._newest_take = save.folder, self._monotonic()
+            self._note_end(save.folder)
         logger.info("takes: saving %s", save.folder)
         stored = partial(self.storage.folder.take_at, save.folder, is_running=after_s > 0)
         return await self.storage.read(stored, stem)
@@ -272,7 +265,7 @@ class SourceTakes:
         channels = lcm_channel(settings.prefix, self.source)
         description = SourceDescription(self.source, channels, server, details=details)
         disk, components = self.storage.disk, settings.components
-        return SourceFacts(description, self._parameters, disk, self.losses, components)
+        return SourceFacts(description, self._parameters.message, disk, self.losses, components)
 
     # The end, and the last seconds.
 
@@ -280,7 +273,7 @@ class SourceTakes:
         """End the running take; the future is done when its file is complete."""
         self.take = None
         self._update()
-        self._newest_take = take.stem, self._monotonic()
+        self._note_end(take.stem)
         take.give_up()
         return self._call(take.end)
 
@@ -289,9 +282,12 @@ class SourceTakes:
         timer = self.saves.pop(save, None)
         if timer is not None:
             timer.cancel()
-        self._newest_take = save.folder, self._monotonic()
+        self._note_end(save.folder)
         if self.segments is not None:
             self._call(partial(self.segments.end_save, save))
+
+    def _note_end(self, path: Path) -> None:
+        self._newest_take = path, self.storage.host.monotonic()
 
     def end_takes(self) -> None:
         """End the running take, and those that are being saved."""
@@ -306,7 +302,8 @@ class SourceTakes:
         if writer is None or self.storage.is_closed or not self.is_announced or not settings.keep_last_s:
             return
         folder = self.storage.folder.directory / ROLLING / self.source
-        self.segments = RollingSegments(folder, settings.keep_last_s, self._facts(), self._monotonic)
+        monotonic = self.storage.host.monotonic
+        self.segments = RollingSegments(folder, settings.keep_last_s, self._facts(), monotonic)
         self._update()
 
     def end_segments(self) -> None:
@@ -343,7 +340,7 @@ class SourceTakes:
         elif self.saves:
             path = [*self.saves][-1].folder
         else:
-            path = ended if self._monotonic() - ended_s <= C3D_WAIT_S else None
+            path = ended if self.storage.host.monotonic() - ended_s <= C3D_WAIT_S else None
         if path is not None:
             self.storage.copy_thread.submit(partial(_add_c3d, path, c3d_file))
 
@@ -387,33 +384,19 @@ class SourceTakes:
 
     def publish_parameters(self, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Record parameters; returns a future if they have to be encoded before what follows them."""
-        utime, sequence = now_utime(), self._num_parameters
-        self._num_parameters += 1
-        encode = partial(encode_parameters, parameters, utime=utime, arrived_utime=utime, sequence=sequence)
-        if self._long_parameters is None and len(parameters.xml) <= _LONG_XML_BYTES:
-            self._record_parameters(encode())
-            return None
-        self._long_parameters = encoded = self._encoder.submit(encode)
-        return asyncio.ensure_future(self._record_when_encoded(encoded))
+        return self._parameters.publish(parameters)
 
-    async def _record_when_encoded(self, encoded: Future[bytes]) -> None:
-        message = await asyncio.wrap_future(encoded)
-        if self._long_parameters is encoded:
-            self._long_parameters = None
-        self._record_parameters(published_again(message, now_utime()))
-
-    def _record_parameters(self, message: bytes) -> None:
-        self._parameters = message
-        self._are_parameters_missing = False
-        writer = self.storage.writer
+    def _record_parameters(self, message: bytes) -> bool:
+        """Record parameters in each file; return False if one has no room for them."""
+        writer, is_recorded = self.storage.writer, True
         for sink in self._sinks:
             if writer is None or not writer.record(sink, sink.parameters_channel, message):
-                self._are_parameters_missing = True
+                is_recorded = False
+        return is_recorded
 
     def maintain(self) -> None:
         """Record parameters that did not fit into the queue. Called once a second."""
-        if self._are_parameters_missing and self._parameters is not None:
-            self._record_parameters(self._parameters)
+        self._parameters.maintain()
 
 
 def _add_c3d(take: Path, c3d_file: Path) -> None:
