@@ -36,6 +36,11 @@ class Gap:
     late: int = 0
     """A bit for each message that arrived late: 0 for number ``stop - 1``, 1 for the one before."""
 
+    @property
+    def first(self) -> int:
+        """The first number of the gap: the missing and the late messages are all of it."""
+        return self.stop - self.missing - self.late.bit_count()
+
     def fill(self, number: int) -> bool:
         """Take a late message; return whether it was missing. At most MAX_LATE bits are set."""
         bit = 1 << (self.stop - 1 - number)
@@ -44,6 +49,66 @@ class Gap:
         self.late |= bit
         self.missing -= 1
         return True
+
+
+class GapList:
+    """The gaps in the numbers of one key: all are counted, and the first ``max_listed`` are listed.
+
+    Late messages fill gaps, and some gaps turn out to be none. So the counts change with each gap, here only.
+    """
+
+    def __init__(self, max_listed: int) -> None:
+        self.num_lost = 0
+        """How many messages are missing."""
+        self.num_gaps = 0
+        """In how many places they are missing."""
+        self._max_listed = max_listed
+        self._listed: list[Gap] = []
+        self._largest: Gap | None = None
+
+    @property
+    def listed(self) -> list[Gap]:
+        """The first gaps of which messages are still missing."""
+        return [gap for gap in self._listed if gap.missing]
+
+    @property
+    def largest(self) -> Gap | None:
+        """The largest gap; None if there is none, or none is listed."""
+        candidates = self.listed
+        if self._largest is not None and self._largest.missing:
+            candidates.append(self._largest)
+        return max(candidates, key=lambda gap: gap.missing, default=None)
+
+    def add(self, gap: Gap) -> None:
+        """Count a new gap."""
+        self.num_gaps += 1
+        self.num_lost += gap.missing
+        if len(self._listed) < self._max_listed:
+            self._listed.append(gap)
+        if self._max_listed and (self._largest is None or gap.missing > self._largest.missing):
+            self._largest = gap
+
+    def fill(self, gap: Gap, number: int) -> bool:
+        """Take a late message; return whether it was missing."""
+        if not gap.fill(number):
+            return False
+        self.num_lost -= 1
+        self.num_gaps -= not gap.missing
+        return True
+
+    def shorten(self, gap: Gap, stop: int) -> None:
+        """Let a gap end before number ``stop``: what seemed to be missing from there on was not."""
+        num_before = gap.missing
+        gap.missing, gap.stop, gap.late = min(num_before, max(0, stop - gap.first)), stop, 0
+        self.num_lost -= num_before - gap.missing
+        self.num_gaps -= num_before > 0 and not gap.missing
+
+    def remove(self, gap: Gap) -> None:
+        """Forget a gap: nothing was missing there."""
+        self.num_lost -= gap.missing
+        self.num_gaps -= gap.missing > 0
+        gap.missing = 0
+        self._listed = [each for each in self._listed if each is not gap]
 
 
 @dataclass(slots=True)
@@ -73,10 +138,6 @@ class SequenceCheck:
     """
 
     def __init__(self, *, max_listed: int = 0, counts_first: bool = False) -> None:
-        self.num_lost = 0
-        """How many messages are missing."""
-        self.num_gaps = 0
-        """In how many places they are missing."""
         self.num_restarts = 0
         """How often the numbers started again: the gateway did, or another recording follows."""
         self.num_late = 0
@@ -89,10 +150,8 @@ class SequenceCheck:
         """How often an interrupted numbering went on."""
         self.session = 0
         """The session of the newest message."""
-        self._max_listed = max_listed
+        self._gaps = GapList(max_listed)
         self._counts_first = counts_first
-        self._listed: list[Gap] = []
-        self._largest: Gap | None = None
         self._current: _Numbering | None = None
         self._begins_at: int | None = None  # what is missing from here to the first message is lost
         self._former: deque[_Numbering] = deque(maxlen=_NUM_FORMER)
@@ -104,17 +163,24 @@ class SequenceCheck:
         return self.num_alternations >= _MANY_ALTERNATIONS
 
     @property
+    def num_lost(self) -> int:
+        """How many messages are missing."""
+        return self._gaps.num_lost
+
+    @property
+    def num_gaps(self) -> int:
+        """In how many places they are missing."""
+        return self._gaps.num_gaps
+
+    @property
     def gaps(self) -> list[Gap]:
         """The first gaps, at most ``max_listed``."""
-        return [gap for gap in self._listed if gap.missing]
+        return self._gaps.listed
 
     @property
     def largest(self) -> Gap | None:
         """The largest gap; None if there is none, or none is listed."""
-        candidates = self.gaps
-        if self._largest is not None and self._largest.missing:
-            candidates.append(self._largest)
-        return max(candidates, key=lambda gap: gap.missing, default=None)
+        return self._gaps.largest
 
     def add(self, sequence: int, utime: int, session: int = 0) -> None:
         """Take the next message, by its number, its time, and its session if sessions can show a restart."""
@@ -153,7 +219,8 @@ class SequenceCheck:
         current = self._current
         if current is None:
             if self._begins_at is not None and stop > self._begins_at:
-                self._begin(stop, 0).newest = stop - 1
+                current = self._begin(stop, 0)
+                current.newest = stop - 1
         elif stop > current.newest + 1:
             self._add_gap(Gap(current.utime, stop - current.newest - 1, stop), current.gaps)
             current.newest = stop - 1
@@ -189,11 +256,7 @@ class SequenceCheck:
         # What seemed to be missing up to the false number was not.
         for gap in current.gaps:
             if gap.stop > number:
-                first = gap.stop - gap.missing - gap.late.bit_count()
-                num_before = gap.missing
-                gap.missing, gap.stop, gap.late = min(num_before, max(0, number - first)), number, 0
-                self.num_lost -= num_before - gap.missing
-                self.num_gaps -= num_before > 0 and not gap.missing
+                self._gaps.shorten(gap, number)
 
     def _fill_gap(self, current: _Numbering, sequence: int, utime: int) -> bool:
         """Return whether a message was missing, and was only overtaken by others."""
@@ -204,11 +267,8 @@ class SequenceCheck:
             # number. To fill that would take a bit for each of the numbers between, which can be 2^62.
             if gap.stop > current.newest + 1:
                 continue
-            # The missing and the late messages of a gap are all of it.
-            if gap.stop - gap.missing - gap.late.bit_count() <= sequence < gap.stop and gap.fill(sequence):
+            if gap.first <= sequence < gap.stop and self._gaps.fill(gap, sequence):
                 self.num_late += 1
-                self.num_lost -= 1
-                self.num_gaps -= not gap.missing
                 return True
         return False
 
@@ -236,12 +296,7 @@ class SequenceCheck:
 
     def _add_gap(self, gap: Gap, gaps: deque[Gap]) -> None:
         gaps.append(gap)
-        self.num_gaps += 1
-        self.num_lost += gap.missing
-        if len(self._listed) < self._max_listed:
-            self._listed.append(gap)
-        if self._max_listed and (self._largest is None or gap.missing > self._largest.missing):
-            self._largest = gap
+        self._gaps.add(gap)
 
     def _find_former(self, current: _Numbering, sequence: int) -> _Numbering | None:
         """Return the interrupted numbering that a message continues; None if it continues none."""
@@ -262,11 +317,8 @@ class SequenceCheck:
         self.num_implausible += current.num_messages == 1
         self.num_restarts -= former.is_restart
         if (gap := former.gap) is not None:
-            self.num_lost -= gap.missing
-            self.num_gaps -= gap.missing > 0
-            gap.missing = 0
+            self._gaps.remove(gap)
             former.gaps = deque((each for each in former.gaps if each is not gap), _NUM_RECENT)
-            self._listed = [each for each in self._listed if each is not gap]
         former.gap, former.is_restart = None, False
         current.gap, current.is_restart = None, False
         self._former.append(current)
