@@ -44,13 +44,61 @@ ReadClocks = Callable[[], tuple[int, int]]
 """Returns the time in µs since the Unix epoch and on a steady clock, as ``HostClock.read`` does."""
 
 
+class BacklogPace:
+    """When the frames of a backlog are due: at the stream's own pace, times ``speed``.
+
+    That is according to the server's time stamps while they are those of a ``clock``. Without a clock, or if
+    ``speed`` is None, every frame is due at once.
+    """
+
+    def __init__(self, clock: ServerClock, speed: float | None) -> None:
+        self.due_s = 0.0
+        """When the next frame is due, on the steady clock."""
+        self._clock = clock
+        self._speed = speed
+        self._timestamp_us: int | None = None  # of the newest frame published at a pace
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether frames wait until they are due."""
+        return self._speed is not None and self._clock.has_clock
+
+    def begin(self, now_s: float) -> None:
+        """Begin a backlog. If it follows another one closely, it continues the pace of that."""
+        if now_s - self.due_s > _IDLE_S:
+            self.due_s = now_s
+            self._timestamp_us = None
+
+    def catch_up(self, now_s: float) -> None:
+        """Limit how late the next frame is: that much is made up for."""
+        self.due_s = max(self.due_s, now_s - _MAX_LATE_S)
+
+    def is_due(self, now_s: float) -> bool:
+        """Return whether the next frame is due."""
+        return self.due_s < now_s + _RESOLUTION_S
+
+    def plan_after(self, frame: RawFrame) -> None:
+        """Plan the frame after ``frame``: it waits as long as ``frame`` did after the one before."""
+        speed = self._speed
+        if speed is None or frame.layout.first_component_type is None:
+            return
+        _, timestamp_us = frame.number_and_timestamp
+        before_us = self._timestamp_us
+        self._timestamp_us = timestamp_us
+        if before_us is not None and timestamp_us > before_us:
+            self.due_s += min((timestamp_us - before_us) / (1e6 * speed), _MAX_WAIT_S)
+
+    def end(self) -> None:
+        """Let every frame be due at once from now on."""
+        self._speed = None
+
+
 class Backlog:
     """The frames of one session: a few are published at once, and others wait until they are due.
 
-    ``publish`` takes frames as Ingest.receive does. ``speed`` is the pace as a multiple of the stream's own,
-    according to the server's time stamps while they are those of a ``clock``. Without a clock, or if
-    ``speed`` is None because ``publish`` skips late frames, every frame is due at once; one call still takes
-    a limited time.
+    ``publish`` takes frames as Ingest.receive does. ``clock`` and ``speed`` say when they are due (see
+    BacklogPace); ``speed`` is None if ``publish`` skips late frames. One call takes a limited time in any
+    case.
 
     ``on_waiting`` is called with whether frames wait. The session stops reading while they do, so the data
     stays in the kernel, and TCP makes the server wait when the kernel's buffer is full: the number of frames
@@ -70,8 +118,7 @@ class Backlog:
         self.caught_up_s = 0.0
         """When a part of a backlog was last published, on the running clock; 0 before the first."""
         self._publish = publish
-        self._clock = clock
-        self._speed = speed
+        self._pace = BacklogPace(clock, speed)
         self._skips_frames = speed is None
         self._frame_s = 0.0  # how long it took to publish one of the newest frames
         self._read_clocks = read_clocks
@@ -82,8 +129,6 @@ class Backlog:
         self._next = 0
         self._utime = 0  # when they arrived
         self._arrival_us = 0  # the same on the steady clock
-        self._due_s = 0.0  # when the next frame is due, on the steady clock
-        self._timestamp_us: int | None = None  # of the newest frame published at a pace
 
     @property
     def is_empty(self) -> bool:
@@ -101,10 +146,7 @@ class Backlog:
             self._frames += frames
         else:
             self._frames = frames
-            now_s = steady_us * 1e-6
-            if now_s - self._due_s > _IDLE_S:
-                self._due_s = now_s
-                self._timestamp_us = None
+            self._pace.begin(steady_us * 1e-6)
         self._next = 0
         self._utime = utime
         self._arrival_us = steady_us
@@ -113,7 +155,7 @@ class Backlog:
 
     def finish(self) -> None:
         """Publish what waits, and what comes after it, without a pace: the session has ended."""
-        self._speed = None
+        self._pace.end()
         if self._timer is not None:
             self._timer.cancel()
             self._publish_part()
@@ -156,11 +198,11 @@ class Backlog:
         """Publish what is due. Return in how many s to call again, or None if nothing waits any more."""
         now_s = self._read_clocks()[1] * 1e-6
         end_s = now_s + _TURN_S
-        self._due_s = max(self._due_s, now_s - _MAX_LATE_S)
+        self._pace.catch_up(now_s)
         while self._frames and now_s < end_s:
             end = self._end_of_due(now_s)
             if end == self._next:
-                return self._due_s - now_s
+                return self._pace.due_s - now_s
             frames = self._frames[self._next : end]
             self._next = end
             if end == len(self._frames):
@@ -173,8 +215,8 @@ class Backlog:
     def _end_of_due(self, now_s: float) -> int:
         """Return the index after the last of the next frames that is due; plan when the one after it is."""
         at = self._next
-        speed = self._speed
-        has_pace = speed is not None and self._clock.has_clock
+        pace = self._pace
+        has_pace = pace.is_limited
         num_frames = _MAX_CHUNK if has_pace else _MAX_CHUNK_WITHOUT_PACE
         # Frames that take long, such as those of hundreds of tools, are published one by one. If late frames
         # are skipped, only the last one of a chunk takes any time.
@@ -182,24 +224,12 @@ class Backlog:
             num_frames //= 2
         last = min(len(self._frames), at + num_frames)
         while at < last:
-            frame = self._frames[at]
-            if speed is not None and has_pace:
-                if self._due_s >= now_s + _RESOLUTION_S:
+            if has_pace:
+                if not pace.is_due(now_s):
                     break
-                self._due_s += self._wait_s(frame, speed)
+                pace.plan_after(self._frames[at])
             at += 1
         return at
-
-    def _wait_s(self, frame: RawFrame, speed: float) -> float:
-        """Return how long to wait after ``frame`` was due: as long as after the one before it."""
-        if frame.layout.first_component_type is None:
-            return 0.0
-        _, timestamp_us = frame.number_and_timestamp
-        before_us = self._timestamp_us
-        self._timestamp_us = timestamp_us
-        if before_us is None or timestamp_us <= before_us:
-            return 0.0
-        return min((timestamp_us - before_us) / (1e6 * speed), _MAX_WAIT_S)
 
 
 LONG_READ_BYTES: Final = 64 * 1024
