@@ -19,6 +19,7 @@ from gateway.client.history_requests import (
     Completeness,
     HistoryAnswer,
     HistoryRequest,
+    NewestRequest,
 )
 from gateway.client.publisher_watch import PublisherWatch
 from gateway.client.request_timing import GRACE_S, RequestTiming
@@ -69,8 +70,7 @@ class Completion:
         self._end = End.OPEN
         self._delivery = Delivery(hand_on, check, held_bytes)
         self._timing = RequestTiming(completeness.patience_s, is_past=is_past)
-        self._requested = 0  # the number of the newest request; only its answer counts
-        self._newest_since = -1  # the largest number that has arrived since that request was made
+        self._newest_request = NewestRequest()
         # BEGINNING: what the history is asked to begin with; None if the first message says it.
         self._first_request = HistoryRequest(0, last_s=completeness.last_s) if is_past else None
         self._restart = RestartCheck(held_bytes)  # CHECKING
@@ -157,7 +157,7 @@ class Completion:
         """Hand a message on if it is the next one, or hold it, or let it go."""
         delivery, arrived = self._delivery, self._arriving
         arrived.note(sequence, utime, session)
-        self._newest_since = max(self._newest_since, sequence)
+        self._newest_request.note_arrival(sequence)
         if self.is_past:
             self._timing.wait_for_past(now_s)
         if self._state is CompletionState.BEGINNING and self._first_request is None:
@@ -237,7 +237,7 @@ class Completion:
         self._state, self._first_request = CompletionState.PASSING, None
         self._timing.stop()
         self._timing.end_past()
-        self._requested += 1
+        self._newest_request.revoke()
 
     def _resume(self, now_s: float) -> None:
         """Fill gaps again, from the newest message on."""
@@ -270,17 +270,16 @@ class Completion:
 
     def request(self) -> HistoryRequest:
         """Return what to request; only if something is due."""
-        self._requested += 1
-        self._newest_since = -1
+        number = self._newest_request.make()
         if self._state is CompletionState.CHECKING:
-            return self._restart.request(self._requested, self._delivery)
+            return self._restart.request(number, self._delivery)
         if self._state is CompletionState.BEGINNING:
-            return (self._first_request or HistoryRequest(0))._replace(number=self._requested)
-        return self._delivery.request(self._requested, knows_last=self._end is not End.ENDING)
+            return (self._first_request or HistoryRequest(0))._replace(number=number)
+        return self._delivery.request(number, knows_last=self._end is not End.ENDING)
 
     def answer(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Take the answer to a request."""
-        if request.number != self._requested:
+        if not self._newest_request.is_same(request):
             return
         self._timing.note_answer()
         if self._state is CompletionState.CHECKING:
@@ -290,7 +289,7 @@ class Completion:
             # message was in this request: go on with the question for its time.
             self._suspect_restart(now_s, has_arrived=False)
             self._restart.begin(asks_for_time=True)
-        elif self._delivery.is_of_this_run(request, answer, self._newest_of(answer)):
+        elif self._delivery.is_of_this_run(request, answer, self._newest_request.newest_of(answer)):
             self._take(request, answer, now_s)
         elif self._delivery.reached is not None:
             self._suspect_restart(now_s, has_arrived=False)
@@ -298,10 +297,6 @@ class Completion:
             # Nothing of the run was handed on, so there is no message to ask for: another restart, whose
             # numbers are past those that are held.
             self._begin_run(answer, now_s, is_held_before=True)
-
-    def _newest_of(self, answer: HistoryAnswer) -> int:
-        """Return the largest number that the gateway has published: some can have overtaken the answer."""
-        return max(answer.newest, self._newest_since)
 
     def _take(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Hand on, or hold, what the history has."""
@@ -330,7 +325,7 @@ class Completion:
 
         Unless the subscriber ``is_connected``, the gateway may have never got the request.
         """
-        if request.number != self._requested:
+        if not self._newest_request.is_same(request):
             return
         if code in RETRY_CODES:
             # Without a connection, nobody takes a request either: only if messages arrive, the gateway is one
@@ -411,7 +406,7 @@ class Completion:
             self._flush()
             self._state = CompletionState.PASSING
             self._timing.stop()
-            self._requested += 1  # the past may still come, and would be handed on after what is live
+            self._newest_request.revoke()  # the past may still come: it would be handed on after what is live
         self._timing.end_past()
 
     # Restarts.
@@ -427,11 +422,11 @@ class Completion:
             self._state = CompletionState.CHECKING
             self._restart.begin()
             self._timing.request_now(now_s)
-        self._requested += 1  # an answer that is on its way may be of before the restart, and would deny it
+        self._newest_request.revoke()  # its answer may be of before the restart, and would deny it
 
     def _take_verdict(self, request: HistoryRequest, answer: HistoryAnswer, now_s: float) -> None:
         """Go on as an answer of the history says."""
-        newest = self._newest_of(answer)
+        newest = self._newest_request.newest_of(answer)
         verdict = self._restart.judge(request, answer, self._delivery, newest)
         if verdict is Verdict.ASK_AGAIN:
             self._repeat(now_s, has_helped=False)
@@ -455,7 +450,7 @@ class Completion:
         self._flush()
         self._delivery.check.begin_at(0, is_restart=True)
         self._delivery.begin_run(new, after_utime=after_utime)
-        self._requested += 1
+        self._newest_request.revoke()
         if self._end is End.KNOWN:
             self._end = End.ENDING  # that was the end of the former run
         self._state, self._first_request = CompletionState.FOLLOWING, None
@@ -485,4 +480,4 @@ class Completion:
         self.unknown[Unknown.END] += self._end is End.ENDING
         self._state = CompletionState.ENDED
         self._timing.stop()
-        self._requested += 1
+        self._newest_request.revoke()

@@ -100,6 +100,36 @@ class HistoryAnswer(NamedTuple):
     is_whole: bool = True
 
 
+class NewestRequest:
+    """The newest request of one key: only its answer counts."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._newest_since = -1  # the largest number of a message that has arrived since it was made
+
+    def make(self) -> int:
+        """Return the number of a new request, which is the newest from now on."""
+        self._number += 1
+        self._newest_since = -1
+        return self._number
+
+    def revoke(self) -> None:
+        """Ignore an answer that is on its way: what it was for has changed."""
+        self._number += 1
+
+    def is_same(self, request: HistoryRequest) -> bool:
+        """Return whether this is the request, and it was not revoked."""
+        return request.number == self._number
+
+    def note_arrival(self, sequence: int) -> None:
+        """Note that a message has arrived."""
+        self._newest_since = max(self._newest_since, sequence)
+
+    def newest_of(self, answer: HistoryAnswer) -> int:
+        """Return the largest number that the gateway has published: some can have overtaken the answer."""
+        return max(answer.newest, self._newest_since)
+
+
 def history_answer(
     facts: Mapping[str, Any], messages: Sequence[bytes], *, is_whole: bool = True
 ) -> HistoryAnswer:
