@@ -95,7 +95,9 @@ class ZenohRig:
         self._router = open_zenoh("router", listen=self._endpoint)
 
     def close(self) -> None:
-        wait_until(lambda: not self.output._holder._opener.is_alive())  # a later test would see what it logs
+        wait_until(
+            lambda: not self.output._holder._opener._thread.is_alive()
+        )  # a later test would see what it logs
         if self._session is not None:
             self._session.close()
         self._router.close()

@@ -62,7 +62,7 @@ class SessionTexts(NamedTuple):
 
 
 class SessionHolder:
-    """Opens a session, and tries again until it succeeds. Zenoh itself reconnects afterwards.
+    """The session of an output. Zenoh itself reconnects it once it is open.
 
     ``declare`` declares everything on the new session, in the thread that opens it and with ``lock`` held. If
     it raises, the session is closed, and the next one gets everything. ``on_link`` is called in any thread
@@ -84,7 +84,6 @@ class SessionHolder:
         self.lock = threading.Lock()
         """Protects ``session`` and what the owner declares on it."""
         self._texts = texts
-        self._config = config
         self.is_client: Final = json.loads(config.get_json("mode") or "null") == "client"
         """Whether the session sends everything to one router."""
         self._declare = declare
@@ -94,61 +93,24 @@ class SessionHolder:
         """Whether each put would panic, because Zenoh cannot express the time."""
         self._num_transports = 0
         self._counting = threading.Lock()  # of _num_transports, which several threads of Zenoh change
-        self._problem = texts.not_open
-        self._closing = threading.Event()
-        self._opener = threading.Thread(target=self._run, name=f"{texts.output}-open", daemon=True)
-        self._failures = FailureLog(logger, texts.output)
         self._router_failures = FailureLog(logger, texts.output)
-        self._defects = DefectLog(logger, texts.output)
+        self._opener = SessionOpener(texts, config, self._use, self._update)
 
     def start(self) -> None:
-        """Start the thread that opens the session."""
-        thread_starts.start(self._opener)
+        """Open the session, in a thread."""
+        self._opener.start()
 
-    def _run(self) -> None:
-        prepare_threads()
-        while not self._closing.is_set():
-            try:
-                self._open()
-            except OutputError as error:
-                self._problem = str(error)
-                self._failures.failed(self._problem)
-            except zenoh.ZError as error:
-                texts = self._texts
-                self._problem = f"{texts.cannot_open}: {zenoh_reason(error)}; {texts.remedy}"
-                self._failures.failed(self._problem)
-            except BaseException as defect:  # noqa: BLE001 - the next try may succeed
-                raise_unless_defect(defect)
-                self._problem = defect_text(defect)
-                self._defects.log(defect)
-            else:
-                return
-            self._closing.wait(_RETRY_S)
-
-    def _open(self) -> None:
-        num_closing = sum(closer.is_alive() for closer in tuple(_closers))
-        if num_closing >= _MAX_CLOSING:
-            raise OutputError(
-                f"{num_closing} former Zenoh sessions are still closing, because programs connected to them "
-                "do not read; the next one opens after them",
-                cause="not open",
-            )
-        session = zenoh.open(self._config)
-        try:
-            self._num_transports = 0
-            session.info.declare_transport_events_listener(in_zenoh_thread(self._on_transport), history=True)
-            with self.lock:
-                if self._closing.is_set():
-                    session.close()
-                    return
-                self._declare(session)
-                self.session = session
-        except Exception:
-            close_session(session, self._texts.output)
-            raise
-        self._problem = ""
-        self._update()
-        self._failures.succeeded(self._texts.opened)
+    def _use(self, session: zenoh.Session) -> bool:
+        """Declare everything on a session that has just been opened; return False if it comes too late."""
+        self._num_transports = 0
+        session.info.declare_transport_events_listener(in_zenoh_thread(self._on_transport), history=True)
+        with self.lock:
+            if self._opener.is_stopped:  # close() closes only a session that is in use
+                session.close()
+                return False
+            self._declare(session)
+            self.session = session
+        return True
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
         with self._counting:
@@ -171,7 +133,7 @@ class SessionHolder:
     def health(self) -> OutputHealth:
         """Whether messages can be sent, and if not, what to do."""
         if self.session is None:
-            return OutputHealth(False, self._problem)
+            return OutputHealth(False, self._opener.problem)
         if self.is_clock_wrong:
             return OutputHealth(False, _WRONG_CLOCK)
         return OutputHealth(False, self._texts.no_router) if self.lacks_router else _HEALTHY
@@ -184,7 +146,7 @@ class SessionHolder:
         if self.session is not None and self.lacks_router:
             return OutputError(self._texts.no_router, cause="no router")
         # The session may be there already, and what is declared on it not yet.
-        return OutputError(self._problem, cause="not open")
+        return OutputError(self._opener.problem, cause="not open")
 
     def maintain(self) -> None:
         """Log when the router goes and comes back. Called once a second."""
@@ -198,15 +160,93 @@ class SessionHolder:
 
     def close(self) -> None:
         """Close the session, so that all that it has declared disappears."""
-        self._closing.set()
-        if self._opener.is_alive():
-            self._opener.join(_JOIN_S)  # If zenoh.open blocks longer, the thread closes what it opens.
+        self._opener.stop()
         with self.lock:
             session, self.session = self.session, None
-            self._problem = "the Zenoh session is closed; start the gateway again"
+            self._opener.problem = "the Zenoh session is closed; start the gateway again"
             self._update()
         if session is not None:
             close_session(session, self._texts.output)
+
+
+class SessionOpener:
+    """Opens a session in a thread of its own, and tries again until it succeeds.
+
+    ``use`` prepares a session, and returns False if it is not wanted any more. If ``use`` raises, the session
+    is closed, and another one is opened. ``on_open`` is called when the session is ready.
+    """
+
+    def __init__(
+        self,
+        texts: SessionTexts,
+        config: zenoh.Config,
+        use: Callable[[zenoh.Session], bool],
+        on_open: Callable[[], None],
+    ) -> None:
+        self.problem = texts.not_open
+        """Why there is no session."""
+        self._texts = texts
+        self._config = config
+        self._use = use
+        self._on_open = on_open
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"{texts.output}-open", daemon=True)
+        self._failures = FailureLog(logger, texts.output)
+        self._defects = DefectLog(logger, texts.output)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether nobody wants a session any more."""
+        return self._stopped.is_set()
+
+    def start(self) -> None:
+        """Start the thread."""
+        thread_starts.start(self._thread)
+
+    def stop(self) -> None:
+        """Open no further session."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_S)  # If zenoh.open blocks longer, the thread closes what it opens.
+
+    def _run(self) -> None:
+        prepare_threads()
+        while not self.is_stopped:
+            try:
+                self._open()
+            except OutputError as error:
+                self.problem = str(error)
+                self._failures.failed(self.problem)
+            except zenoh.ZError as error:
+                texts = self._texts
+                self.problem = f"{texts.cannot_open}: {zenoh_reason(error)}; {texts.remedy}"
+                self._failures.failed(self.problem)
+            except BaseException as defect:  # noqa: BLE001 - the next try may succeed
+                raise_unless_defect(defect)
+                self.problem = defect_text(defect)
+                self._defects.log(defect)
+            else:
+                return
+            self._stopped.wait(_RETRY_S)
+
+    def _open(self) -> None:
+        num_closing = sum(closer.is_alive() for closer in tuple(_closers))
+        if num_closing >= _MAX_CLOSING:
+            raise OutputError(
+                f"{num_closing} former Zenoh sessions are still closing, because programs connected to them "
+                "do not read; the next one opens after them",
+                cause="not open",
+            )
+        session = zenoh.open(self._config)
+        try:
+            is_used = self._use(session)
+        except Exception:
+            close_session(session, self._texts.output)
+            raise
+        if is_used:
+            self.problem = ""
+            self._on_open()
+            self._failures.succeeded(self._texts.opened)
 
 
 def close_session(session: zenoh.Session, output: str) -> None:

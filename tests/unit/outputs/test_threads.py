@@ -83,7 +83,7 @@ def test_zenoh_has_no_thread_for_each_key() -> None:
     """With three sources of 256 tools, no further thread could start, and the gateway stopped working."""
     output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
     output.start()
-    wait_until(lambda: not output._holder._opener.is_alive())
+    wait_until(lambda: not output._holder._opener._thread.is_alive())
     threads = Path("/proc/self/task")
     num_before = len([*threads.iterdir()])
     publishers = [output.publisher(Topic("lab", ("6d", str(at)), "rtc3d.tool_pose_t")) for at in range(90)]
@@ -97,7 +97,7 @@ def test_zenoh_has_no_thread_for_each_source() -> None:
     with asyncio.Runner() as runner:
         runner.run(_serve_queries(output))
         output.start()
-        wait_until(lambda: not output._holder._opener.is_alive())
+        wait_until(lambda: not output._holder._opener._thread.is_alive())
         threads = Path("/proc/self/task")
         num_before = len([*threads.iterdir()])
         for number in range(30):

@@ -92,7 +92,7 @@ class Lab:
         self.output.count_losses("lab", self.losses)
         self.output.start()
         wait_until(lambda: self.output.health().connected)
-        wait_until(lambda: not self.output._holder._opener.is_alive())
+        wait_until(lambda: not self.output._holder._opener._thread.is_alive())
 
     def subscribe(self, keys: str) -> zenoh.Subscriber[None]:
         return self.peer.declare_subscriber(keys, self.samples.append)

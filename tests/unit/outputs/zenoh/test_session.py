@@ -40,7 +40,7 @@ class Lab:
         monkeypatch.setattr(session_module, "_closers", set())
         config = zenoh_config(zenoh_keys(mode, connect="tcp/192.0.2.9:7447"))
         self.holder = SessionHolder(TEXTS, config, self._declare)
-        monkeypatch.setattr(self.holder._closing, "wait", self.waits_s.append)
+        monkeypatch.setattr(self.holder._opener._stopped, "wait", self.waits_s.append)
 
     def _open(self, _config: zenoh.Config) -> Mock:
         self.before_open()
@@ -56,7 +56,7 @@ class Lab:
 
     def open(self) -> None:
         """Do what the opening thread does."""
-        self.holder._run()
+        self.holder._opener._run()
 
     def transport(self, *, is_open: bool) -> None:
         """Tell the gateway that the router has come or gone."""
@@ -155,7 +155,7 @@ def test_only_some_sessions_may_be_closing_when_another_one_opens(monkeypatch: p
         can_close.set()
         closers[0].join()
 
-    monkeypatch.setattr(lab.holder._closing, "wait", wait)
+    monkeypatch.setattr(lab.holder._opener._stopped, "wait", wait)
     lab.open()
     [problem] = problems
     assert names(problem, 4)
