@@ -5,8 +5,6 @@ sends the replies, because replying to a peer that has stopped reading blocks fo
 link. Dropping a query can block in the same way, and so can freeing one that has not been dropped: both tell
 the peer that no further reply follows. So queries end in that thread only.
 
-Equal queries that arrive before there is an answer are one question.
-
 If a handler fails or does not reply, the peer cannot distinguish that from a gateway that is not running. So
 every query gets a reply, which is an error if there is no answer, unless there are too many of them.
 """
@@ -16,11 +14,10 @@ import contextlib
 import functools
 import itertools
 import logging
-import threading
 import time
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Collection, Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import zenoh
 
@@ -29,6 +26,7 @@ from gateway.messages.decode import LCM_MESSAGES, TEXT, json_bytes
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import CONTROL_OPTION, STOP, Answer, KeyPath, QueryService
 from gateway.outputs.query_admission import NO_REPLY, QueryAdmission, QueryDefects, QueryLimits, Refusal
+from gateway.outputs.zenoh.open_questions import OpenQuestions, SharedQuestion
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.runtime.failures import log_fields
 from gateway.runtime.losses import Losses
@@ -66,22 +64,6 @@ So JSON for peers takes a quarter of a core at most.
 logger = logging.getLogger(__name__)
 
 
-class _Question(NamedTuple):
-    """What equal queries ask for. They get the same answers."""
-
-    source: str
-    selected: str
-    options: tuple[tuple[str, str], ...]
-    number: int = 0
-    """Tells commands apart: a second stop is for what was started after the first one."""
-
-    @property
-    def selector(self) -> str:
-        """The key and the options."""
-        options = ";".join(f"{name}={value}" for name, value in self.options)
-        return f"{self.selected}?{options}" if options else self.selected
-
-
 class ZenohAnswers:
     """Answers queries below PREFIX/SOURCE/ with ``service``.
 
@@ -107,12 +89,8 @@ class ZenohAnswers:
         self._sender = sender
         self._long_sender = WorkerThread("zenoh-send-long")
         self._losses = losses
-        self._lock = threading.Lock()  # of the next three, shared with Zenoh's threads
-        self._open: dict[_Question, list[zenoh.Query]] = {}  # until there is an answer, more can join
-        self._waiting: deque[_Question] = deque()
-        self._is_scheduled = False  # the call of _start_next
+        self._questions = OpenQuestions(self._wake)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._is_closed = False
         self._numbers = itertools.count(1)  # of commands
         self._rest_until_s = 0.0
         self._defects = QueryDefects(logger)
@@ -124,8 +102,9 @@ class ZenohAnswers:
         if self._is_admitted(source, query):
             options = _options(query)
             number = next(self._numbers) if CONTROL_OPTION in options else 0
-            question = _Question(source, str(query.key_expr), tuple(sorted(options.items())), number)
-            self._add(question, query)
+            question = SharedQuestion(source, str(query.key_expr), tuple(sorted(options.items())), number)
+            if not self._questions.add(question, query):
+                self._drop([query], source)
 
     def reply(self, source: str, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
         """Reply to a query about ``source`` with answers, by key, that are known already, or refuse it."""
@@ -161,31 +140,17 @@ class ZenohAnswers:
         if not self._sender.offer(reply if refusal.is_sent else query.drop):
             query.drop()  # this holds up the peers that ask, which is better than to store their queries
 
-    def _add(self, question: _Question, query: zenoh.Query) -> None:
-        with self._lock:
-            is_closed = self._is_closed
-            is_new = not is_closed and question not in self._open
-            is_due = is_new and not self._is_scheduled
-            if not is_closed:
-                self._open.setdefault(question, []).append(query)
-            if is_new:
-                self._waiting.append(question)
-                self._is_scheduled = True
-        if is_closed:
-            self._drop([query], question.source)
-        elif is_due:
-            with contextlib.suppress(RuntimeError):  # the loop has just ended
-                self._loop.call_soon_threadsafe(self._start_next)
+    def _wake(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has just ended
+            self._loop.call_soon_threadsafe(self._start_next)
 
     # In the event loop.
 
     def _start_next(self) -> None:
         """Start to answer one question. Frames that have arrived come before the next one."""
-        with self._lock:
-            if not self._waiting or len(self._tasks) >= MAX_QUESTIONS:
-                self._is_scheduled = False
-                return
-            question = self._waiting.popleft()
+        question = self._questions.start_next(has_room=len(self._tasks) < MAX_QUESTIONS)
+        if question is None:
+            return
         with log_fields(source=question.source):
             task = asyncio.create_task(self._answer(question))
         self._tasks.add(task)
@@ -194,13 +159,10 @@ class ZenohAnswers:
 
     def _finish(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
-        with self._lock:
-            if self._is_scheduled or not self._waiting:
-                return
-            self._is_scheduled = True
-        self._loop.call_soon(self._start_next)
+        if self._questions.resume():
+            self._loop.call_soon(self._start_next)
 
-    async def _answer(self, question: _Question) -> None:
+    async def _answer(self, question: SharedQuestion) -> None:
         outcome: dict[str, Answer] | QueryError | None = None
         try:
             if self._service.serves(question.source):
@@ -211,14 +173,13 @@ class ZenohAnswers:
             raise_unless_defect(defect)
             outcome = self._defects.log(question.source, defect, f"query {safe_text(question.selector)}")
         finally:
-            with self._lock:
-                queries = self._open.pop(question)
+            queries = self._questions.take_queries(question)
         if outcome is None:  # the source has been removed
             self._drop(queries, question.source)
         else:
             self._send(queries, question.source, outcome)
 
-    async def _answers(self, question: _Question) -> dict[str, Answer]:
+    async def _answers(self, question: SharedQuestion) -> dict[str, Answer]:
         """Return the answers by key. Raises QueryError if there is none."""
         source, selected, options = question.source, question.selected, dict(question.options)
         base = zenoh_key(self._prefix, source) + "/"
@@ -242,10 +203,7 @@ class ZenohAnswers:
 
     async def close(self) -> None:
         """Drop the pending queries, and close the sender. Peers see at once that no reply follows."""
-        with self._lock:
-            self._is_closed = True
-            pending = list(self._open.items())
-            self._waiting.clear()
+        pending = self._questions.close()
 
         def drop() -> None:
             for question, queries in pending:
@@ -269,7 +227,7 @@ class ZenohAnswers:
             reply = functools.partial(self._reply, query, source, outcome)
             if not sender.offer(reply, num_bytes // len(queries)):
                 self._drop([query], source)
-                if not self._is_closed:
+                if not self._questions.is_closed:
                     self._losses[source].lost(
                         "answer beyond the queue",
                         "answers to queries are dropped, because earlier ones wait to be sent; ask less "
