@@ -41,7 +41,7 @@ from gateway.messages.texts import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import DISCOVERY_S, missing_source
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
-from gateway.outputs.lcm.requests import is_presence
+from gateway.outputs.lcm.presence import is_presence
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway_on_lcm
 from gateway.runtime.safe_text import safe_text
 

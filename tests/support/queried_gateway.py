@@ -152,7 +152,7 @@ async def wait_until_cached(gateway: Gateway) -> None:
     for output in (each.output for each in gateway.outputs):
         if isinstance(output, LcmOutput) and output._requests is not None and output.settings.queries:
             # The thread that receives requests opens it once it receives; a request before that is lost.
-            replies = output._requests._sender
+            replies = output._requests.replies.sender
             await wait_until_async(lambda: not replies.problem)  # noqa: B023
     [source] = gateway.sources
     await wait_until_async(lambda: source.queries.parameters.newest)

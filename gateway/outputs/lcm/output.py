@@ -15,7 +15,8 @@ from gateway.errors import OutputError
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, OutputHealth, QueryService, ServerParameters, encode_parameters
-from gateway.outputs.lcm.requests import LONG_REPLY_BYTES, LcmRequests
+from gateway.outputs.lcm.replies import LONG_REPLY_BYTES
+from gateway.outputs.lcm.requests import LcmRequests
 from gateway.outputs.lcm.sender import LcmPublisher, new_sender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.runtime.losses import Losses
@@ -82,7 +83,7 @@ class LcmOutput(Output):
 
     def warnings(self) -> Sequence[str]:
         """Return which sources other gateways publish, too."""
-        return () if self._requests is None else self._requests.others.warnings
+        return () if self._requests is None else self._requests.presence.others.warnings
 
     def maintain(self) -> None:
         """Retry to open LCM if it is time, and publish parameters again that are due."""
@@ -112,7 +113,7 @@ class LcmOutput(Output):
         """Stop publishing its parameters. The service no longer serves requests about it."""
         self._publications.pop(source, None)
         if self._requests is not None:
-            self._requests.others.forget(source)
+            self._requests.presence.others.forget(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML as ``parameters_t``, now and every REPEAT_S. LCM keeps the order of messages.
@@ -137,7 +138,7 @@ class LcmOutput(Output):
             return None
         # If one waits to be sent, it may have begun with the former parameters.
         publish = functools.partial(self._publish_newest, source, publication)
-        publication.sent = requests.long_sender.submit(publish)
+        publication.sent = requests.replies.long_sender.submit(publish)
         return publication.sent
 
     def _publish_newest(self, source: str, publication: _Publication) -> None:

@@ -41,6 +41,9 @@ _MAX_DATAGRAM_BYTES: Final = 65_535
 MAX_PENDING: Final = 64
 """The maximum number of requests in progress. Further ones are dropped and counted."""
 
+MAX_REQUEST_BYTES: Final = 4096
+"""Longer messages are no requests: anybody can send them, and to decode them takes time."""
+
 RECEIVED_PER_S: Final = 2000.0
 """How many messages a second are received. LCM or the kernel discards further ones, uncounted."""
 

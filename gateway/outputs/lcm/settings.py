@@ -177,6 +177,11 @@ class LcmSettings(OutputSettings):
         """``queries_url``, else the default for ``effective_url``."""
         return self.queries_url or lcm_queries_url(self.effective_url)
 
+    @property
+    def has_own_queries_url(self) -> bool:
+        """Whether requests and replies do not use ``effective_url``."""
+        return self.effective_queries_url != self.effective_url
+
 
 LCM: Final = OutputKind(
     name="lcm",

@@ -11,7 +11,7 @@ from gateway.messages.topics import DEFAULT_LCM_PREFIX, lcm_channel
 from gateway.outputs.kind import DemoSide, Receive, Subscription, SubscriptionRequest
 from gateway.outputs.lcm.connection import QUEUE_MESSAGES, Waiting, open_lcm, receiving_url, reconnect
 from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.requests import is_presence
+from gateway.outputs.lcm.presence import is_presence
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.outputs.lcm.settings import LcmSettings, effective_lcm_url
 from gateway.runtime.failures import FailureLog

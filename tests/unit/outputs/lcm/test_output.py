@@ -153,7 +153,7 @@ async def test_long_parameters_are_sent_by_a_thread(lab: Lab, monkeypatch: pytes
     """Short ones must not overtake them: late subscribers would keep the old names."""
     monkeypatch.setattr(output_module, "LONG_REPLY_BYTES", 10)
     may_send = threading.Event()
-    lab.requests.long_sender.submit(may_send.wait)
+    lab.requests.replies.long_sender.submit(may_send.wait)
     sent = lab.output.publish_parameters("lab", ServerParameters(b"<long enough/>", 3, 4))
     short = lab.output.publish_parameters("lab", ServerParameters(b"<a/>", 3, 5))
     may_send.set()

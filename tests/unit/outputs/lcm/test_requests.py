@@ -1,23 +1,15 @@
-"""Requests on LCM in memory: what peers receive, and what the output counts.
-
-Commands on LCM in memory: what the service gets, and what peers receive.
-"""
+"""Requests on LCM in memory: what peers receive, and what the output counts."""
 
 import asyncio
-import itertools
-import json
 import threading
 
 import pytest
 
-from gateway.errors import OutputError, QueryError
-from gateway.messages.decode import C3D, JSON, LCM_MESSAGES
-from gateway.messages.history import pack_messages
-from gateway.outputs import other_gateways
-from gateway.outputs.contract import Answer, ServerParameters
+from gateway.errors import QueryError
+from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm import requests
-from gateway.outputs.lcm.receiver import LcmReceiver
-from gateway.outputs.lcm.requests import MAX_REMEMBERED, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmRequests
+from gateway.outputs.lcm.receiver import MAX_REQUEST_BYTES, LcmReceiver
+from gateway.outputs.lcm.requests import MAX_REQUESTER_BYTES, LcmRequests
 from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.runtime.token_bucket import TokenBucket
@@ -103,23 +95,10 @@ async def test_a_flood_of_requests_is_not_a_flood_of_errors(lab: Lab) -> None:
     lab.requests.admission._refusals = TokenBucket(2.0, monotonic=Clock())
     for number in range(8):
         lab.send(request(number))
-    lab.requests.long_sender.offer(is_sent.set)
+    lab.requests.replies.long_sender.offer(is_sent.set)
     await wait_until_async(is_sent.is_set)
     lab.deliver()
     assert [reply.error_code for reply in lab.replies].count("rate") == 2
-
-
-async def test_a_long_reply_is_sent_by_a_thread(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would keep the frames of all sources waiting."""
-    monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
-    may_send = threading.Event()
-    lab.requests.long_sender.submit(may_send.wait)
-    lab.send(request(1))
-    await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
-    lab.deliver()
-    assert lab.replies == []
-    may_send.set()
-    await lab.receive()
 
 
 @with_settings(max_reply_bytes_per_s=1024)
@@ -215,105 +194,6 @@ def test_messages_on_other_channels_leave_room_for_requests() -> None:
     assert requests == [b"request"]
 
 
-START = ("take", "set=start", "name=walk-1")
-
-
-async def test_a_command_gets_the_answer_of_the_service_as_json(lab: Lab) -> None:
-    lab.send(command_request(7, *START), kind="COMMAND")
-    [reply] = await lab.receive()
-    assert (reply.request_id, reply.requester) == (7, "test")
-    assert json.loads(reply.content) == {"name": "walk-1"}
-    assert (reply.error, reply.error_code) == ("", "")
-    assert lab.service.commands_received == [("lab", ("take",), {"set": "start", "name": "walk-1"})]
-    assert lab.output.query_results == {"lab": {"ok": 1}}
-
-
-@pytest.mark.parametrize(
-    ("command", "value"),
-    [
-        *(((name,), "history, recording, take") for name in ("c3d", "", "take/", "x" * 3000)),
-        *((("take", option), "NAME=VALUE") for option in ("start", "", "ä")),
-        (("take", "read=walk-1", "offset=0"), "rtc3d-gateway take fetch"),
-    ],
-)
-async def test_what_is_no_command_on_lcm_is_refused(lab: Lab, command: tuple[str, ...], value: str) -> None:
-    lab.send(command_request(7, *command), kind="COMMAND")
-    [reply] = await lab.receive()
-    assert reply.error_code == "bad-request"
-    assert names(reply.error, value)
-    assert len(reply.error) < 200
-    assert lab.service.commands_received == []
-
-
-@pytest.mark.parametrize(
-    ("answer", "code", "value"),
-    [
-        (QueryError("is off", code="refused"), "refused", "is off"),
-        (Answer(b"\0" * 100, C3D), "bad-request", "Zenoh"),
-    ],
-)
-async def test_an_error_of_the_service_and_an_answer_without_json_are_errors(
-    lab: Lab, answer: Answer | Exception, code: str, value: str
-) -> None:
-    lab.service.answers["take"] = answer
-    lab.send(command_request(7, "take"), kind="COMMAND")
-    [reply] = await lab.receive()
-    assert (reply.content, reply.error_code) == ("", code)
-    assert names(reply.error, value)
-
-
-async def test_a_repeated_command_is_carried_out_once(lab: Lab) -> None:
-    for _ in range(3):
-        lab.send(command_request(7, *START), kind="COMMAND")
-    replies = await lab.receive(3)
-    assert {reply.content for reply in replies} == {'{"name":"walk-1"}'}
-    assert len(lab.service.commands_received) == 1
-    lab.send(command_request(8, *START), kind="COMMAND")
-    lab.send(command_request(7, *START, requester="another"), kind="COMMAND")
-    await lab.receive(5)
-    assert len(lab.service.commands_received) == 3
-
-
-async def test_a_command_that_is_in_progress_is_not_started_again(lab: Lab) -> None:
-    lab.service.may_answer.clear()
-    lab.send(command_request(7, *START), kind="COMMAND")
-    await wait_until_async(lambda: lab.service.commands_received)
-    lab.send(command_request(7, *START), kind="COMMAND")
-    await asyncio.sleep(0)
-    lab.service.may_answer.set()
-    await lab.receive(2)
-    assert len(lab.service.commands_received) == 1
-
-
-async def test_a_command_that_failed_can_be_tried_again(lab: Lab) -> None:
-    lab.service.answers["take"] = QueryError("the disk is full", code="refused")
-    lab.send(command_request(7, *START), kind="COMMAND")
-    await lab.receive()
-    lab.service.answers["take"] = Answer(b"{}", JSON)
-    lab.send(command_request(7, *START), kind="COMMAND")
-    assert (await lab.receive(2))[1].content == "{}"
-
-
-async def test_a_command_that_changes_nothing_is_asked_each_time(lab: Lab) -> None:
-    for _ in range(2):
-        lab.send(command_request(7, "take"), kind="COMMAND")
-    await lab.receive(2)
-    assert len(lab.service.commands_received) == 2
-
-
-@with_settings(max_queries_per_source_per_s=1000.0, max_queries_per_s=1000.0)
-async def test_only_the_newest_commands_are_remembered(lab: Lab) -> None:
-    for number in range(MAX_REMEMBERED + 1):
-        lab.send(command_request(number, *START), kind="COMMAND")
-        await lab.receive(number + 1)
-    lab.send(command_request(MAX_REMEMBERED, *START), kind="COMMAND")
-    await lab.receive(MAX_REMEMBERED + 2)
-    assert len(lab.service.commands_received) == MAX_REMEMBERED + 1
-    lab.send(command_request(0, *START), kind="COMMAND")
-    await lab.receive(MAX_REMEMBERED + 3)
-    assert len(lab.service.commands_received) == MAX_REMEMBERED + 2
-
-
 @with_settings(max_queries_per_source_per_s=1.0)
 async def test_commands_and_requests_for_parameters_share_their_limits(lab: Lab) -> None:
     for number in range(4):
@@ -339,153 +219,3 @@ async def test_another_message_on_the_channel_of_commands_is_malformed(lab: Lab)
         lab.send(data, kind="COMMAND")
     assert lab.lost("lab") == {"malformed request": (4, 0)}
     assert lab.replies == []
-
-
-# Messages of the history ---------------------------------------------------------------------
-
-MESSAGES = [bytes([number]) * 1000 for number in range(40)]
-REFILL = command_request(7, "history", "key=3d", "from=0")
-
-
-def let_messages_be_asked_for(lab: Lab) -> list[bytes]:
-    """Let the service have messages of 3D; return those that are sent again."""
-    lab.service.answers["3d"] = Answer(pack_messages(MESSAGES), LCM_MESSAGES, {"from": 0})
-    sent: list[bytes] = []
-    lab.lcm.subscribe("MOCAP_LAB_3D_REFILL", lambda _, data: sent.append(data)).set_queue_capacity(1000)
-    return sent
-
-
-async def test_a_refill_without_room_for_its_reply_is_an_error_and_counted(lab: Lab) -> None:
-    """Its asker got nothing, not even a reason, and asked until it gave up. The next one has room again."""
-    sent = let_messages_be_asked_for(lab)
-    may_send = threading.Event()
-    lab.requests.long_sender.submit(may_send.wait)
-    while lab.requests.long_sender.offer(lambda: None):
-        pass
-    lab.send(REFILL, kind="COMMAND")
-    [reply] = await lab.receive()
-    assert (reply.request_id, reply.error_code) == (7, "busy")
-    assert lab.lost("lab") == {"reply beyond the queue": (1, 0)}
-    may_send.set()
-    await wait_until_async(lambda: lab.requests.long_sender.offer(lambda: None))
-    lab.send(REFILL, kind="COMMAND")
-    assert [each.error_code for each in await lab.receive(2)] == ["busy", ""]
-
-    def is_complete() -> bool:
-        lab.deliver()
-        return len(sent) == len(MESSAGES)
-
-    await wait_until_async(is_complete)
-    assert sent == MESSAGES
-
-
-async def test_a_long_reply_without_room_is_an_error_and_counted(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(requests, "LONG_REPLY_BYTES", len(XML) - 1)
-    monkeypatch.setattr(lab.requests.long_sender, "offer", lambda *_: False)
-    lab.send(request(1))
-    assert [each.error_code for each in await lab.receive()] == ["busy"]
-    assert lab.lost("lab") == {"reply beyond the queue": (1, 0)}
-
-
-class FakeTime:
-    """A clock that goes on while the sender sleeps, and by 0.1 ms with each look at it."""
-
-    def __init__(self) -> None:
-        self.now_s = 1000.0
-        self.sent: list[tuple[float, int]] = []
-
-    def monotonic(self) -> float:
-        self.now_s += 1e-4
-        return self.now_s
-
-    def sleep(self, duration_s: float) -> None:
-        assert duration_s > 0
-        self.now_s += duration_s
-
-
-@pytest.mark.interpreted
-@with_settings(max_reply_bytes_per_s=10_000)
-async def test_messages_are_sent_again_no_faster_than_replies_may_be(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Otherwise, they fill the buffers of everybody who receives on LCM. The reply comes first."""
-    clock = FakeTime()
-    monkeypatch.setattr(requests, "time", clock)
-    order: list[tuple[str, float]] = []
-    monkeypatch.setattr(lab.requests._sender, "send", lambda channel, _: order.append((channel, clock.now_s)))
-    lab.requests._is_refilling = True
-    lab.requests._refill("lab", lambda: order.append(("reply", clock.now_s)), "again", MESSAGES)
-    assert [channel for channel, _ in order] == ["reply", *["again"] * len(MESSAGES)]
-    times_s = [sent_s for _, sent_s in order[1:]]
-    steps_s = [after - before for before, after in itertools.pairwise(times_s)]
-    assert steps_s == pytest.approx([0.1] * len(steps_s), rel=0.01)
-    assert not lab.requests._is_refilling
-
-
-@pytest.mark.interpreted
-async def test_a_refill_that_cannot_be_sent_is_counted_and_ends(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without this, no subscriber could be refilled any more."""
-
-    def refuse(_channel: str, _data: bytes) -> None:
-        raise OutputError("no multicast", cause="send failed")
-
-    monkeypatch.setattr(lab.requests._sender, "send", refuse)
-    lab.requests._is_refilling = True
-    lab.requests._refill("lab", lambda: None, "again", MESSAGES)
-    assert not lab.requests._is_refilling
-    assert lab.lost("lab") == {"send failed": (1, 0)}
-
-
-async def test_one_subscriber_is_refilled_at_a_time(lab: Lab) -> None:
-    """Everybody receives what is sent again, so two at once would be twice the load for all."""
-    let_messages_be_asked_for(lab)
-    may_send = threading.Event()
-    lab.requests.long_sender.submit(may_send.wait)
-    lab.send(REFILL, kind="COMMAND")
-    await wait_until_async(lambda: lab.requests._is_refilling)
-    lab.send(command_request(8, "history", "key=3d", "from=0"), kind="COMMAND")
-    assert [(each.request_id, each.error_code) for each in await lab.receive()] == [(8, "busy")]
-    may_send.set()
-    await lab.receive(2)
-    await wait_until_async(lambda: not lab.requests._is_refilling)
-
-
-# Other gateways ------------------------------------------------------------------------------
-
-
-async def test_gateways_with_a_source_of_one_name_notice_each_other(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A gateway shows itself on the URL of requests. It receives that, too, and is no other one."""
-    monkeypatch.setattr(other_gateways, "HOLD_S", 0.0)
-    shown: list[bytes] = []
-    lab.lcm.subscribe("MOCAP_LAB_GATEWAY", lambda _, data: shown.append(data))
-    for _ in range(3):
-        lab.output.maintain()
-    lab.deliver()
-    assert len(shown) == 1
-    assert lab.output.warnings() == []
-    for data in (b"", bytes(8), shown[0][:-1], shown[0] + bytes(MAX_REQUEST_BYTES)):
-        lab.lcm.publish("MOCAP_LAB_GATEWAY", data)
-    lab.lcm.publish("MOCAP_HALL_GATEWAY", command_request(0, "", requester="another"))
-    lab.deliver()
-    assert lab.output.warnings() == []
-    lab.lcm.publish("MOCAP_LAB_GATEWAY", command_request(0, "", requester="another"))
-    lab.deliver()
-    assert len(lab.output.warnings()) == 1
-    lab.output.withdraw("lab")
-    assert lab.output.warnings() == []
-
-
-@with_settings(queries=False)
-async def test_a_gateway_that_receives_nothing_shows_itself_to_nobody(lab: Lab) -> None:
-    """Its messages would be the only ones on the URL of requests."""
-    shown: list[bytes] = []
-    lab.lcm.subscribe("MOCAP_LAB_GATEWAY", lambda _, data: shown.append(data))
-    lab.output.maintain()
-    lab.deliver()
-    assert shown == []
