@@ -4,7 +4,6 @@ This decides what to hold, what to request and what to hand on. It does no I/O, 
 clock: ``gateway.client.refill`` requests.
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from typing import Final
@@ -75,7 +74,6 @@ class Completion:
         self._first_request = HistoryRequest(0, last_s=completeness.last_s) if is_past else None
         self._restart = RestartCheck(held_bytes)  # CHECKING
         self._watch = PublisherWatch()
-        self._passes_until_s = math.inf  # PASSING because of a problem
 
     @property
     def due_s(self) -> float:
@@ -226,17 +224,15 @@ class Completion:
         if has_two and self._state is not CompletionState.PASSING:
             self.unknown[Unknown.TWO_GATEWAYS] += 1
             self._pass_on_only("two gateways publish it", now_s)
-        elif self.problem and now_s >= self._passes_until_s and not has_two:
+        elif self.problem and self._timing.is_pause_over(now_s) and not has_two:
             self._resume(now_s)
 
     def _pass_on_only(self, problem: str, until_s: float) -> None:
         """Hand on what is held, and then each message when it arrives."""
         self._delivery.flush(self._restart.take_runs(), has_restarted=False)
         self.problem = self.last_problem = problem
-        self._passes_until_s = until_s
         self._state, self._first_request = CompletionState.PASSING, None
-        self._timing.stop()
-        self._timing.end_past()
+        self._timing.pause(until_s)
         self._newest_request.revoke()
 
     def _resume(self, now_s: float) -> None:

@@ -45,6 +45,7 @@ class RequestTiming:
         self._num_past = 0  # how many messages of the past have come since something waits for it
         self._heard_s = -math.inf  # when something arrived last
         self._nobody_s = NOBODY_S
+        self._pause_until_s = math.inf
 
     @property
     def is_due(self) -> bool:
@@ -68,6 +69,16 @@ class RequestTiming:
     def stop(self) -> None:
         """Request nothing more."""
         self.due_s = math.inf
+
+    def pause(self, until_s: float) -> None:
+        """Request nothing until a time, and the past not even then: what is live was handed on meanwhile."""
+        self.stop()
+        self.end_past()
+        self._pause_until_s = until_s
+
+    def is_pause_over(self, now_s: float) -> bool:
+        """Whether gaps may be filled again."""
+        return now_s >= self._pause_until_s
 
     def repeat(self, now_s: float, *, has_helped: bool, is_nobody: bool = False) -> bool:
         """Request again what is still missing; return False if that has taken too long.
