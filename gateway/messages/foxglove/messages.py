@@ -4,6 +4,7 @@ docs/reference/takes.md has the table of topics.
 """
 
 from collections.abc import Container, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
@@ -71,6 +72,23 @@ _MAX_LAYOUTS: Final = 100
 _MILLIMETRE: Final = 1e-3
 
 
+@dataclass(frozen=True, slots=True)
+class FixedTopics:
+    """The topics of a source whose schemas do not depend on its labels; FloatTopics has the others."""
+
+    markers: FoxgloveTopic
+    tools: FoxgloveTopic
+    events: FoxgloveTopic
+    outlines: FoxgloveTopic
+    """The outlines of force plates."""
+
+    arrows: FoxgloveTopic
+    """The forces on the plates."""
+
+    description: FoxgloveTopic
+    """The labels, units and rates."""
+
+
 class FoxgloveSource:
     """Converts messages of one source, as long as its parameters are the same.
 
@@ -102,17 +120,19 @@ class FoxgloveSource:
         self._plates = PlateScene(parameters, frame)
         self._labels_of = lru_cache(_MAX_LAYOUTS)(self._find_labels)
         self._number_records = lru_cache(_MAX_LAYOUTS)(self._new_records)
-        self._markers = topic_of(f"/{source}/markers", PointCloud)
-        self._tools = topic_of(f"/{source}/tools", FrameTransforms)
-        self._events = topic_of(f"/{source}/events", Log)
-        self._outlines = topic_of(f"/{source}/plates", SceneUpdate)
-        self._arrows = topic_of(f"/{source}/forces", SceneUpdate)
-        self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
+        self._fixed = FixedTopics(
+            markers=topic_of(f"/{source}/markers", PointCloud),
+            tools=topic_of(f"/{source}/tools", FrameTransforms),
+            events=topic_of(f"/{source}/events", Log),
+            outlines=topic_of(f"/{source}/plates", SceneUpdate),
+            arrows=topic_of(f"/{source}/forces", SceneUpdate),
+            description=json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"}),
+        )
 
     @property
     def known_topics(self) -> dict[FoxgloveTopic, ComponentType | None]:
         """All topics and their components; those of numbers only if the parameters say how many there are."""
-        return dict.fromkeys((self._description, self._outlines)) | {
+        return dict.fromkeys((self._fixed.description, self._fixed.outlines)) | {
             topic: component
             for component in WIRE_ORDER
             for topic in self.topics(component, num_described_items(self._parameters, component))
@@ -132,15 +152,15 @@ class FoxgloveSource:
         """Return the topics that a component with this many items has."""
         match component:
             case ComponentType.MARKERS:
-                return (self._markers,)
+                return (self._fixed.markers,)
             case ComponentType.TOOLS:
-                return (self._tools,)
+                return (self._fixed.tools,)
             case ComponentType.ANALOG:
                 return tuple(self._number_records(component, num_items))
             case ComponentType.FORCE:
-                return (*self._number_records(component, num_items), self._arrows)
+                return (*self._number_records(component, num_items), self._fixed.arrows)
             case ComponentType.EVENT:
-                return (self._events,)
+                return (self._fixed.events,)
 
     def describe(self, utime: int) -> list[FoxgloveMessage]:
         """Return what is the same for all messages: labels, units and rates, and the outlines of plates."""
@@ -160,8 +180,8 @@ class FoxgloveSource:
         content["event"] = {"labels": labels}
         data = json_text(content).encode()
         return [
-            FoxgloveMessage(self._description, utime, data),
-            FoxgloveMessage(self._outlines, utime, self._plates.outlines(utime)),
+            FoxgloveMessage(self._fixed.description, utime, data),
+            FoxgloveMessage(self._fixed.outlines, utime, self._plates.outlines(utime)),
         ]
 
     def convert(
@@ -181,16 +201,16 @@ class FoxgloveSource:
         for topic in self.topics(component, len(items)):
             if wanted is not None and topic not in wanted:
                 continue
-            if topic is self._markers:
+            if topic is self._fixed.markers:
                 [data] = self._clouds(items[np.newaxis], [capture_utime])
                 found.append(FoxgloveMessage(topic, capture_utime, data))
-            elif topic is self._tools:
+            elif topic is self._fixed.tools:
                 data = self._transforms(items, capture_utime)
                 if data:
                     found.append(FoxgloveMessage(topic, capture_utime, data))
-            elif topic is self._events:
+            elif topic is self._fixed.events:
                 found += [self._log(item, capture_utime, timestamp_us) for item in items]
-            elif topic is self._arrows:
+            elif topic is self._fixed.arrows:
                 data = self._plates.arrows(items, capture_utime)
                 found.append(FoxgloveMessage(topic, capture_utime, data))
             else:
@@ -216,10 +236,10 @@ class FoxgloveSource:
             record = records.get(topic)
             if isinstance(record, ProtobufRecord):  # as all in files
                 yield TopicMessages(topic, capture_utimes, record.encode_rows(_floats(items)))
-            elif topic is self._markers:
+            elif topic is self._fixed.markers:
                 yield TopicMessages(topic, capture_utimes, self._clouds(items, capture_utimes))
             else:
-                chosen = slice(None, None, arrow_interval if topic is self._arrows else 1)
+                chosen = slice(None, None, arrow_interval if topic is self._fixed.arrows else 1)
                 frames = zip(items[chosen], capture_utimes[chosen], timestamps_us[chosen], strict=True)
                 converted = [
                     message
@@ -292,7 +312,7 @@ class FoxgloveSource:
         text = event_text(self._parameters, item)
         message = f"{text.label} ({text.description})" if text.description else text.label
         log = Log(timestamp=timestamp(utime), level=LogLevel.Info, message=message, name=self.source)
-        return FoxgloveMessage(self._events, utime, log.encode())
+        return FoxgloveMessage(self._fixed.events, utime, log.encode())
 
     def _find_labels(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
         return describe(component, self._parameters, num_items).labels
