@@ -1,6 +1,6 @@
 """What moves in a synthetic scene: rigid bodies with markers and tools, force plates, and their noise."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,7 @@ from gateway.rtc3d.parameters import ForceChannel, ParametersForce, Plate, Point
 from gateway.session.server.scene import SampleNumbers
 
 Floats = npt.NDArray[np.floating[Any]]
+_Integers = npt.NDArray[np.int64]
 
 _TABLE_SIZE: Final = 2**16
 _STRIDE: Final = 7919  # odd, so that a column reads the whole table before it repeats
@@ -28,7 +29,7 @@ class Noise:
 
     def __call__(self, samples: SampleNumbers) -> Floats:
         """Return the noise of each sample, shape (len(samples), width)."""
-        positions: npt.NDArray[np.int64] = (samples[:, None] * _STRIDE + self._columns) & (_TABLE_SIZE - 1)
+        positions: _Integers = (samples[:, None] * _STRIDE + self._columns) & (_TABLE_SIZE - 1)
         return self._table.take(positions)
 
 
@@ -54,29 +55,29 @@ class RigidBodies:
     def __init__(self, num_markers: int, num_tools: int, rate_hz: float, rng: np.random.Generator) -> None:
         self._rate_hz = rate_hz
         bodies = max(1, num_markers // _MARKERS_PER_BODY)
-        self._body_of_marker = np.minimum(np.arange(num_markers) // _MARKERS_PER_BODY, bodies - 1)
-        self._body_of_tool = np.arange(num_tools) % bodies
+        body_of_marker = np.minimum(np.arange(num_markers) // _MARKERS_PER_BODY, bodies - 1)
+        body_of_tool = np.arange(num_tools) % bodies
         self._first_markers = np.arange(bodies) * _MARKERS_PER_BODY
-        self.tool_markers: _Booleans = self._body_of_marker[:, None] == self._body_of_tool
+        self.tool_markers: _Booleans = body_of_marker[:, None] == body_of_tool
         """Whether each marker belongs to each tool, shape (markers, tools)."""
 
-        self._travel = _Waves(rng, (bodies, 3), amplitude=(50.0, 300.0), period_s=(2.0, 9.0))
-        self._swing = _Waves(rng, (bodies,), amplitude=(0.3, 1.5), period_s=(1.5, 6.0))
-        self._marker_hiding = _Waves(rng, (num_markers,), amplitude=(1.0, 1.0), period_s=(6.0, 16.0))
-        self._body_hiding = _Waves(rng, (bodies,), amplitude=(1.0, 1.0), period_s=(9.0, 21.0))
+        # A scene is the same for the same seed only as long as random numbers are drawn in this order.
+        travel = _Waves(rng, (bodies, 3), amplitude=(50.0, 300.0), period_s=(2.0, 9.0))
+        swing = _Waves(rng, (bodies,), amplitude=(0.3, 1.5), period_s=(1.5, 6.0))
+        self._hiding = _Hiding(rng, body_of_marker, bodies)
         self._noise = Noise(rng, num_markers * 3)
 
-        self._centre_mm = rng.uniform((-1000.0, -1000.0, 500.0), (1000.0, 1000.0, 1500.0), (bodies, 3))
-        self._axis = _normalised(rng.standard_normal((bodies, 3)))
+        centre_mm = rng.uniform((-1000.0, -1000.0, 500.0), (1000.0, 1000.0, 1500.0), (bodies, 3))
+        self._motion = _Motion(centre_mm, travel, _normalised(rng.standard_normal((bodies, 3))), swing)
         # No four consecutive directions are close to one line or plane.
         corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
         directions = corners[np.arange(num_markers) % 4] + rng.uniform(-0.3, 0.3, (num_markers, 3))
-        self._markers = self._rotation_terms(_BODY_RADIUS_MM * directions, self._body_of_marker)
+        self._markers = self._motion.attached(_BODY_RADIUS_MM * directions, body_of_marker)
         origin_mm = rng.uniform(-20.0, 20.0, (num_tools, 3))
-        self._origins = self._rotation_terms(origin_mm, self._body_of_tool)
+        self._origins = self._motion.attached(origin_mm, body_of_tool)
         # A tool's quaternion is the body's, (cos a/2, axis · sin a/2), times its own on the body.
         own = _normalised(rng.standard_normal((num_tools, 4)))
-        axis = self._axis[self._body_of_tool]
+        axis = self._motion.axis[body_of_tool]
         self._quaternion_cos = own
         scalar = -np.sum(axis * own[:, 1:], axis=1, keepdims=True)
         vector = own[:, :1] * axis + np.cross(axis, own[:, 1:])
@@ -86,11 +87,11 @@ class RigidBodies:
         """Return the 3D items, shape (len(samples), markers), in mm."""
         time_s = samples / self._rate_hz
         noise_mm = self._noise_mm(samples)
-        position_mm = self._positions_mm(time_s, self._markers, self._body_of_marker)
+        position_mm = self._motion.positions_mm(time_s, self._markers)
         values = np.empty((*noise_mm.shape[:2], 4), np.float32)
         np.add(position_mm, noise_mm, out=values[..., :3], casting="same_kind")
         values[..., 3] = np.sqrt(_square_sum(noise_mm))
-        values[self._hidden(time_s)] = MISSING_MARKER
+        values[self._hiding(time_s)] = MISSING_MARKER
         return values.astype(">f4").view(_MARKER_ITEM)[..., 0]
 
     def tools(self, samples: SampleNumbers) -> Items:
@@ -100,44 +101,16 @@ class RigidBodies:
         from where the pose puts them. With fewer than three visible markers, the tool is missing.
         """
         time_s = samples / self._rate_hz
-        half = self._swing(time_s).take(self._body_of_tool, axis=1)[..., None] / 2
-        visible = ~self._hidden(time_s)
+        half = self._motion.swing(time_s).take(self._origins.body, axis=1)[..., None] / 2
+        visible = ~self._hiding(time_s)
         num_visible = self._sum_per_tool(visible.astype(np.float32))
         square_mm = self._sum_per_tool(_square_sum(self._noise_mm(samples)) * visible)
         values = np.empty((*num_visible.shape, 8), np.float32)
         values[..., :4] = self._quaternion_cos * np.cos(half) + self._quaternion_sin * np.sin(half)
-        values[..., 4:7] = self._positions_mm(time_s, self._origins, self._body_of_tool)
+        values[..., 4:7] = self._motion.positions_mm(time_s, self._origins)
         values[..., 7] = np.sqrt(square_mm / np.maximum(num_visible, 1))
         values[num_visible < _MIN_VISIBLE_MARKERS] = MISSING
         return values.astype(">f4").view(_TOOL_ITEM)[..., 0]
-
-    def _rotation_terms(self, local_mm: Floats, body: npt.NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
-        """Return (along, across, beside) of points on bodies, each of shape (points, 3).
-
-        By Rodrigues' formula, along + across · cos a + beside · sin a is the point rotated about the
-        body's axis by the angle a.
-        """
-        axis = self._axis[body]
-        along = axis * np.sum(axis * local_mm, axis=1, keepdims=True)
-        return along, local_mm - along, np.cross(axis, local_mm)
-
-    def _positions_mm(
-        self, time_s: Floats, terms: tuple[Floats, Floats, Floats], body: npt.NDArray[np.int64]
-    ) -> Floats:
-        along, across, beside = terms
-        angle = self._swing(time_s)
-        # take() and in-place sums are several times faster than array indexing and temporary arrays.
-        position_mm: Floats = (self._centre_mm + self._travel(time_s)).take(body, axis=1)
-        position_mm += along
-        position_mm += across * np.cos(angle).take(body, axis=1)[..., None]
-        position_mm += beside * np.sin(angle).take(body, axis=1)[..., None]
-        return position_mm
-
-    def _hidden(self, time_s: Floats) -> _Booleans:
-        """Return whether each marker is out of view, shape (len(time_s), markers)."""
-        marker: _Booleans = self._marker_hiding(time_s) > np.cos(np.pi * _MARKER_HIDDEN)
-        body: _Booleans = self._body_hiding(time_s) > np.cos(np.pi * _BODY_HIDDEN)
-        return marker | body.take(self._body_of_marker, axis=1)
 
     def _sum_per_tool(self, per_marker: Floats) -> Floats:
         """Return the sum of ``per_marker`` over the markers of each tool, shape (samples, tools).
@@ -145,13 +118,13 @@ class RigidBodies:
         ``per_marker`` has the shape (samples, markers).
         """
         if per_marker.shape[1] == 0:
-            return np.zeros((len(per_marker), len(self._body_of_tool)))
+            return np.zeros((len(per_marker), len(self._origins.body)))
         # Not a matrix product: its rounding would depend on the number of samples in one call.
         sums: Floats = np.add.reduceat(per_marker, self._first_markers, axis=1)
-        return sums.take(self._body_of_tool, axis=1)
+        return sums.take(self._origins.body, axis=1)
 
     def _noise_mm(self, samples: SampleNumbers) -> Floats:
-        return _NOISE_MM * self._noise(samples).reshape(len(samples), len(self._body_of_marker), 3)
+        return _NOISE_MM * self._noise(samples).reshape(len(samples), len(self._markers.body), 3)
 
 
 class _Waves:
@@ -176,6 +149,60 @@ class _Waves:
         angle = np.multiply.outer(time_s, self._angular_rate) + self._phase
         values: npt.NDArray[Any] = self._amplitude * np.sin(angle)
         return values
+
+
+class _BodyPoints(NamedTuple):
+    """Points that are fixed to bodies. ``body`` is the number of each point's body, shape (points,).
+
+    By Rodrigues' formula, along + across · cos a + beside · sin a, each of shape (points, 3), is the point
+    rotated about the body's axis by the angle a.
+    """
+
+    body: _Integers
+    along: Floats
+    across: Floats
+    beside: Floats
+
+
+class _Motion(NamedTuple):
+    """How bodies move: their centres travel around ``centre_mm`` while they swing about their ``axis``."""
+
+    centre_mm: Floats
+    travel: _Waves
+    axis: Floats
+    swing: _Waves
+
+    def attached(self, local_mm: Floats, body: _Integers) -> _BodyPoints:
+        """Return the points that are fixed to bodies at ``local_mm`` from their centres."""
+        axis = self.axis[body]
+        along = axis * np.sum(axis * local_mm, axis=1, keepdims=True)
+        return _BodyPoints(body, along, local_mm - along, np.cross(axis, local_mm))
+
+    def positions_mm(self, time_s: Floats, points: _BodyPoints) -> Floats:
+        """Return where points are, shape (len(time_s), points, 3)."""
+        body, along, across, beside = points
+        angle = self.swing(time_s)
+        # take() and in-place sums are several times faster than array indexing and temporary arrays.
+        position_mm: Floats = (self.centre_mm + self.travel(time_s)).take(body, axis=1)
+        position_mm += along
+        position_mm += across * np.cos(angle).take(body, axis=1)[..., None]
+        position_mm += beside * np.sin(angle).take(body, axis=1)[..., None]
+        return position_mm
+
+
+class _Hiding:
+    """Which markers are out of view: single ones, and all of a body together."""
+
+    def __init__(self, rng: np.random.Generator, body_of_marker: _Integers, bodies: int) -> None:
+        self._body_of_marker = body_of_marker
+        self._marker = _Waves(rng, (len(body_of_marker),), amplitude=(1.0, 1.0), period_s=(6.0, 16.0))
+        self._body = _Waves(rng, (bodies,), amplitude=(1.0, 1.0), period_s=(9.0, 21.0))
+
+    def __call__(self, time_s: Floats) -> _Booleans:
+        """Return whether each marker is out of view, shape (len(time_s), markers)."""
+        marker: _Booleans = self._marker(time_s) > np.cos(np.pi * _MARKER_HIDDEN)
+        body: _Booleans = self._body(time_s) > np.cos(np.pi * _BODY_HIDDEN)
+        return marker | body.take(self._body_of_marker, axis=1)
 
 
 def _square_sum(vectors: Floats) -> Floats:
