@@ -1,118 +1,20 @@
-"""The frames of a take: read from its files in moments, and sent for each choice of components."""
+"""The frames of a take for each choice of components: which of its moments become frames, and their bytes."""
 
-import itertools
-import math
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
 from statistics import median_low
-from typing import Final
+from typing import Final, Generic, TypeVar
 
-from gateway.errors import ProtocolError
-from gateway.messages.decode import decode, prefix_of
-from gateway.messages.encode import CONTENT_OFFSET
-from gateway.messages.texts import xml_bytes
-from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
 from gateway.session.server.measurement import exact_rate
 from gateway.session.server.scene import NOT_YET_US, DataPacket
-from gateway.simulator.take_moments import (
-    Moment,
-    MomentBuilder,
-    RecordedParameters,
-    component_bytes,
-    is_whole,
-)
-from gateway.takes.files.reader import TakeMessage, TakeReader
-
-_MAX_LATE_CAPTURE_US: Final = 3_600_000_000
-"""A time of capture this far from the arrival is not plausible."""
-
-_RANGE_SLACK_US: Final = 5_000_000
-"""Messages of one moment are at most this far apart in a take, so a range is complete after this time."""
-
-_MAX_VERSIONS: Final = 1000
-"""How many versions of the parameters are remembered: a faulty server can change them all the time."""
-
-
-class TakePass:
-    """One reading of a take. ``first_utime`` and ``end_utime`` limit its events; None is no limit."""
-
-    def __init__(
-        self,
-        reader: TakeReader,
-        source: str,
-        first_utime: int | None,
-        end_utime: int | None,
-        default: RecordedParameters,
-    ) -> None:
-        self._reader = reader
-        self._source = source
-        self._first_utime = -math.inf if first_utime is None else first_utime
-        self._end_utime = math.inf if end_utime is None else end_utime
-        self._builder = MomentBuilder()
-        self._newest: RecordedParameters | None = None
-        self._versions: dict[int, RecordedParameters] = {}
-        self.default = default
-        """The parameters of components before the first parameters in the take."""
-        self.first_parameters: RecordedParameters | None = None
-        """The first parameters in the take; None if none have been read."""
-        self.num_malformed = 0
-        """How many messages could not be read."""
-
-    def moments(self) -> Iterator[Moment]:
-        """Yield the moments, in order; their times are in µs from the first one. Raises TakeError."""
-        for message in self._reader.messages():
-            if message.source != self._source:
-                continue
-            if message.utime >= self._end_utime + _RANGE_SLACK_US:
-                break
-            if message.key == "parameters":
-                self._take_parameters(message.message)
-            elif message.key in COMPONENTS_BY_KEY and self._first_utime <= message.utime < self._end_utime:
-                yield from self._take_component(message)
-        yield from self._builder.finish()
-
-    def _take_parameters(self, message: bytes) -> None:
-        try:
-            content = decode(message)
-        except ProtocolError:
-            self.num_malformed += 1
-            return
-        xml = xml_bytes(content.xml)
-        if not xml:  # the server gives no parameters any more
-            self._newest = None
-            self._versions.pop(content.parameters_version, None)
-            return
-        if self._newest is None or self._newest.xml != xml:
-            self._newest = RecordedParameters(xml)
-            _ = self._newest.rates_hz  # parsing takes long, so it is done in this thread
-        self.first_parameters = self.first_parameters or self._newest
-        self._versions[content.parameters_version] = self._newest
-        if len(self._versions) > _MAX_VERSIONS:
-            self._versions = dict(itertools.islice(self._versions.items(), _MAX_VERSIONS // 2, None))
-
-    def _take_component(self, message: TakeMessage) -> list[Moment]:
-        component = COMPONENTS_BY_KEY[message.key]
-        content = message.message[CONTENT_OFFSET:]
-        if not is_whole(component, content):
-            self.num_malformed += 1
-            return []
-        prefix = prefix_of(message.message)
-        is_plausible = abs(prefix.utime - prefix.capture_utime) < _MAX_LATE_CAPTURE_US
-        return self._builder.add(
-            component,
-            prefix.capture_utime if is_plausible else prefix.utime,
-            prefix.session,
-            message.message[8:24] + message.message[32:CONTENT_OFFSET],
-            content,
-            self._versions.get(prefix.parameters_version) or self._newest or self.default,
-        )
-
+from gateway.simulator.take_moments import Moment, component_bytes
 
 LATE_US: Final = 3_000_000
 """Frames that are later than this are dropped: longer than for a live scene, because a take is complete."""
@@ -130,6 +32,8 @@ _MAX_EVENTS: Final = 4096  # are kept for clients that are late
 _FORGET_FRAMES: Final = 1000  # are forgotten together
 _FORGOTTEN_US: Final = -1  # the time of a frame that has been forgotten: long ago
 _MAX_GAPS: Final = 64  # a faulty server can announce another rate all the time
+
+_Item = TypeVar("_Item")
 
 
 class RecordedFrames:
@@ -153,21 +57,13 @@ class RecordedFrames:
         self.measured = tuple(component for component in chosen if component is not ComponentType.EVENT)
         self._event_bytes = event_bytes
         self._rates_hz = rates_hz
+        self._gaps = FrameGaps()
         self._seen: set[ComponentType] = set()  # measured components of the choice
         # Moments that may become frames, each with the gap of its slowest component, None if it has none.
         self._waiting: deque[tuple[Moment, float | None]] = deque()
-        self._gaps_us: list[float] = []  # of all rates so far
-        self._next_us: dict[float, deque[int]] = {}  # when moments with each gap come, among those that wait
-        self._last_us: dict[float, int] = {}  # when the last one was, among those before
-        self._horizon_us = -1  # up to here, all moments are known
         self._newest: dict[ComponentType, bytes] = {}  # since the last frame
-        # The frames from _first on: their times and contents.
-        self._first = 0
-        self._times_us: list[int] = []
-        self._contents: list[dict[ComponentType, bytes]] = []
-        # The newest events: their times and contents.
-        self._event_times_us: list[int] = []
-        self._events: list[bytes] = []
+        self._frames: TimedItems[dict[ComponentType, bytes]] = TimedItems()  # their contents
+        self._events: TimedItems[bytes] = TimedItems()  # the contents of the newest ones
         self._packet = lru_cache(_CACHED_PACKETS)(self._build_packet)
 
     # FrameSource ----------------------------------------------------------------------------
@@ -175,7 +71,7 @@ class RecordedFrames:
     @property
     def rate(self) -> Fraction:
         """See FrameSource."""
-        times_us = self._times_us[-_RATE_FRAMES:]
+        times_us = self._frames.times_us[-_RATE_FRAMES:]
         intervals_us = [later - earlier for earlier, later in pairwise(times_us)]
         if len(intervals_us) > 1:
             return exact_rate(1e6 / median_low(intervals_us))
@@ -184,14 +80,11 @@ class RecordedFrames:
 
     def time_us(self, tick: int) -> int:
         """See FrameSource."""
-        index = tick - self._first
-        if index < 0:
-            return _FORGOTTEN_US
-        return self._times_us[index] if index < len(self._times_us) else NOT_YET_US
+        return self._frames.time_us(tick)
 
     def tick_after(self, elapsed_us: int) -> int:
         """See FrameSource."""
-        return self._first + bisect_right(self._times_us, elapsed_us)
+        return self._frames.number_after(elapsed_us)
 
     def oldest_us(self, elapsed_us: int) -> int:
         """See FrameSource."""
@@ -200,14 +93,13 @@ class RecordedFrames:
     def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
         """See FrameSource. Events of several frames become one component."""
         if events_from_us is not None:
-            first = bisect_left(self._event_times_us, events_from_us)
-            events = tuple(self._events[first : bisect_right(self._event_times_us, self.time_us(tick))])
+            events = self._events.between(events_from_us, self.time_us(tick))
             if events:
                 return self._build_packet(byte_order, tick, events)
         return self._packet(byte_order, tick)
 
     def _build_packet(self, byte_order: ByteOrder, tick: int, events: tuple[bytes, ...] = ()) -> DataPacket:
-        contents = self._contents[tick - self._first]
+        contents = self._frames[tick]
         parts: dict[ComponentType, Sequence[bytes]] = {each: [content] for each, content in contents.items()}
         if events:
             parts[ComponentType.EVENT] = events
@@ -219,34 +111,32 @@ class RecordedFrames:
     def add(self, moments: Sequence[Moment], *, is_end: bool) -> None:
         """Take the next moments; ``is_end`` if nothing follows in this pass."""
         for moment in moments:
-            self._horizon_us = moment.due_us
+            self._gaps.horizon_us = moment.due_us
             self._add(moment)
         while self._waiting:
             moment, gap_us = self._waiting[0]
-            is_frame = False if gap_us is None else self._is_frame(moment.due_us, gap_us)
+            is_frame = False if gap_us is None else self._gaps.is_frame(moment.due_us, gap_us)
             if is_frame is None and not is_end:
                 return
             self._waiting.popleft()
             if gap_us is not None:
-                self._last_us[gap_us] = self._next_us[gap_us].popleft()
+                self._gaps.pass_next(gap_us)
             self._newest.update(moment.contents)
             if is_frame is not False:
                 self._add_frame(moment.due_us)
         if is_end:
-            last_frame_us = self._times_us[-1] if self._times_us else -1
-            if self._event_times_us and self._event_times_us[-1] > last_frame_us:
-                self._add_frame(self._event_times_us[-1])
+            if self._events.last_us > self._frames.last_us:
+                self._add_frame(self._events.last_us)
             self._newest = {}
 
     def forget(self, before_us: int) -> None:
         """Forget frames before this time, except for the newest of them."""
-        count = bisect_right(self._times_us, before_us) - 1
+        count = self._frames.num_until(before_us) - 1
         if count > _FORGET_FRAMES:
-            del self._times_us[:count], self._contents[:count]
-            self._first += count
-        excess = bisect_right(self._event_times_us, before_us) - _MAX_EVENTS
+            self._frames.forget(count)
+        excess = self._events.num_until(before_us) - _MAX_EVENTS
         if excess > 0:
-            del self._event_times_us[:excess], self._events[:excess]
+            self._events.forget(excess)
 
     # Which moments become frames ------------------------------------------------------------
 
@@ -254,19 +144,17 @@ class RecordedFrames:
         found = [component for component in self.measured if component in moment.contents]
         if found and not self._seen:  # until now, the rate of the others counted
             self._waiting = deque((each, None) for each, _ in self._waiting)
-            self._next_us.clear()
-            self._last_us.clear()
+            self._gaps.forget_moments()
         self._seen.update(found)
         event = moment.contents.get(ComponentType.EVENT) if self.has_events else None
         if event is not None:
-            self._event_times_us.append(moment.due_us)
-            self._events.append(event)
+            self._events.append(moment.due_us, event)
         others = [] if self._seen else [each for each in moment.contents if each is not ComponentType.EVENT]
         gap_us = None if event is None else _EVENTS_ONLY
         if found or others:
             gap_us = self._gap_us(found or others, moment)
         if gap_us is not None:
-            self._next_us.setdefault(gap_us, deque()).append(moment.due_us)
+            self._gaps.add_next(gap_us, moment.due_us)
         self._waiting.append((moment, gap_us))
 
     def _gap_us(self, components: Sequence[ComponentType], moment: Moment) -> float:
@@ -276,6 +164,30 @@ class RecordedFrames:
             rate_hz = moment.parameters.rates_hz.get(component) or self._rates_hz.get(component)
             if rate_hz is not None:
                 gap_us = max(gap_us, min(_GAP_PERIODS * 1e6 / rate_hz, float(_MAX_GAP_US)))
+        return self._gaps.known(gap_us)
+
+    def _add_frame(self, due_us: int) -> None:
+        newest = self._newest
+        self._frames.append(due_us, {each: newest[each] for each in self.measured if each in newest})
+        self._newest = {}
+
+
+class FrameGaps:
+    """Which moments become frames: those that have no moment of a slower component near them.
+
+    A moment is near if it is less than the gap of its slowest component away: the time for which that one can
+    pause before a faster one sets the rate.
+    """
+
+    def __init__(self) -> None:
+        self.horizon_us = -1
+        """Up to here, all moments are known."""
+        self._gaps_us: list[float] = []  # of all rates so far
+        self._next_us: dict[float, deque[int]] = {}  # when moments with each gap come, among those that wait
+        self._last_us: dict[float, int] = {}  # when the last one was, among those before
+
+    def known(self, gap_us: float) -> float:
+        """Return the gap so far that is the same as this one; it is a new one if there is none."""
         for known_us in self._gaps_us:
             if known_us <= gap_us * _SAME_GAP and gap_us <= known_us * _SAME_GAP:
                 return known_us
@@ -284,7 +196,20 @@ class RecordedFrames:
         self._gaps_us.append(gap_us)
         return gap_us
 
-    def _is_frame(self, due_us: int, gap_us: float) -> bool | None:
+    def add_next(self, gap_us: float, due_us: int) -> None:
+        """Note a moment with this gap, which waits until it is known whether it becomes a frame."""
+        self._next_us.setdefault(gap_us, deque()).append(due_us)
+
+    def pass_next(self, gap_us: float) -> None:
+        """Note that the next moment with this gap does not wait any more."""
+        self._last_us[gap_us] = self._next_us[gap_us].popleft()
+
+    def forget_moments(self) -> None:
+        """Forget the moments so far."""
+        self._next_us.clear()
+        self._last_us.clear()
+
+    def is_frame(self, due_us: int, gap_us: float) -> bool | None:
         """Return whether no slower component is near; None if what follows must be known first."""
         is_known = True
         for slower_us in self._gaps_us:
@@ -295,11 +220,52 @@ class RecordedFrames:
                 return False
             if next_us and next_us[0] - due_us < slower_us:
                 return False
-            is_known = is_known and (bool(next_us) or self._horizon_us - due_us >= slower_us)
+            is_known = is_known and (bool(next_us) or self.horizon_us - due_us >= slower_us)
         return True if is_known else None
 
-    def _add_frame(self, due_us: int) -> None:
-        newest = self._newest
-        self._times_us.append(due_us)
-        self._contents.append({each: newest[each] for each in self.measured if each in newest})
-        self._newest = {}
+
+class TimedItems(Generic[_Item]):
+    """Items in the order of their times, with numbers from 0; the oldest ones can be forgotten."""
+
+    def __init__(self) -> None:
+        self.times_us: list[int] = []
+        """The times of the items that are kept."""
+        self._items: list[_Item] = []
+        self._first = 0  # the number of the oldest item that is kept
+
+    def __getitem__(self, number: int) -> _Item:
+        return self._items[number - self._first]
+
+    @property
+    def last_us(self) -> int:
+        """The time of the newest item; -1 if none is kept."""
+        return self.times_us[-1] if self.times_us else -1
+
+    def append(self, time_us: int, item: _Item) -> None:
+        """Append an item that is not earlier than those before it."""
+        self.times_us.append(time_us)
+        self._items.append(item)
+
+    def time_us(self, number: int) -> int:
+        """Return the time of an item; NOT_YET_US if there is none yet, _FORGOTTEN_US if it is not kept."""
+        index = number - self._first
+        if index < 0:
+            return _FORGOTTEN_US
+        return self.times_us[index] if index < len(self.times_us) else NOT_YET_US
+
+    def number_after(self, time_us: int) -> int:
+        """Return the number of the first item that is later."""
+        return self._first + bisect_right(self.times_us, time_us)
+
+    def num_until(self, time_us: int) -> int:
+        """Return how many of the items that are kept are not later."""
+        return bisect_right(self.times_us, time_us)
+
+    def between(self, first_us: int, last_us: int) -> tuple[_Item, ...]:
+        """Return the items from one time to another, both included."""
+        return tuple(self._items[bisect_left(self.times_us, first_us) : bisect_right(self.times_us, last_us)])
+
+    def forget(self, count: int) -> None:
+        """Forget the oldest ``count`` items."""
+        del self.times_us[:count], self._items[:count]
+        self._first += count
