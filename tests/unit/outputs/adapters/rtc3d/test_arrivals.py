@@ -167,7 +167,7 @@ def test_a_new_connection_takes_over_the_rate_and_the_old_one_is_forgotten() -> 
     assert source.arrivals.stream_of == {MARKERS: 7, ANALOG: FAST}
     for stream in range(8, 20):
         source.arrive(stream * 10_000, analog(stream, 10_000 * stream), stream=stream)
-    assert len(source.frames._samples) <= 2
+    assert len(source.frames._join._samples) <= 2
 
 
 # Which frame is meant -----------------------------------------------------------------------
