@@ -71,5 +71,5 @@ async def test_little_is_kept_of_what_a_client_sends_too_fast(sent: bytes) -> No
         for _ in range(50):
             assert (await flooding.read())[0] == ERROR
             [connection] = gateway.server.connections
-            num_bytes = sum(8 + len(each.body) for each in tuple(connection._inbox))
-            assert num_bytes + connection._reader.buffered_bytes < 70_000
+            num_bytes = sum(8 + len(each.body) for each in tuple(connection.waiting))
+            assert num_bytes + connection._commands._reader.buffered_bytes < 70_000

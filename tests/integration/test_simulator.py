@@ -215,7 +215,7 @@ async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it
 
         silent.resume()
         assert (await silent.read())[0] == COMMAND
-        frames = await silent.frames(full.frames_sent + 50)
+        frames = await silent.frames(full.sent.number + 50)
         assert not consecutive(frames)
         events = [each for frame in frames for each in frame if each.type == EVENT]
         ids = [event[0] for component in events for event in component.items]

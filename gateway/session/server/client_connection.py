@@ -4,22 +4,19 @@ import asyncio
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Final, cast
 
 import gateway
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.packets import Packet, PacketReader, PacketType
+from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import General
 from gateway.runtime.server_limits import ServerLimits
-from gateway.runtime.token_bucket import TokenBucket
 from gateway.session.server.client_session import ClientSession, error_packet
+from gateway.session.server.command_queue import MAX_COMMAND_BYTES, CommandQueue
 from gateway.session.server.measurement import Measurement
 from gateway.session.server.scene import FrameSource
-
-MAX_COMMAND_BYTES: Final = 64 * 1024
-"""The largest packet that a client may send."""
 
 LIMITS: Final = ServerLimits(
     clients=128, handshake_s=10.0, unread_bytes=4 * 1024 * 1024, unread_s=300.0, close_s=1.0
@@ -29,10 +26,6 @@ LIMITS: Final = ServerLimits(
 Only servers of live sources bound the number of clients, because the simulator is for one's own programs.
 """
 
-MAX_COMMANDS_PER_S: Final = 1000.0
-"""How many packets of one client are answered in a second; further ones wait."""
-
-_COMMANDS_PAUSE_S: Final = 0.05  # for a client that sends too many
 _MAX_LOGGED_BYTES: Final = 200  # of a command
 _log = logging.getLogger(__name__)
 
@@ -88,26 +81,17 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def __init__(self, owner: "ConnectionOwner") -> None:
         self._owner = owner
-        self._loop = asyncio.get_running_loop()
-        self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
         # The next bytes are read when all packets in these are answered, so that little waits in memory.
         self._read_buffer = bytearray(LIMITS.read_bytes)
-        self._inbox: deque[Packet] = deque()
-        self._commands = TokenBucket(MAX_COMMANDS_PER_S)
-        self._is_processing = False  # whether _process_inbox is to be called
-        self._is_held = False  # whether the packets in _inbox wait for the answer to the one before
+        self._commands = CommandQueue(self._answer_next)
         self._is_full = False  # whether as many bytes as may wait for the client to read
         self._was_full = False  # whether it has been full before
         self._has_ended = False  # whether the client has closed its sending half
         self._recording_end: asyncio.TimerHandle | None = None  # of a recording that has a duration
-        self._first_sent_s = self._last_sent_s = 0.0  # when frames were sent, on the monotonic clock
-        self.closed: asyncio.Future[None] = self._loop.create_future()
+        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Done once the connection has ended."""
-        self.frames_sent = 0
-        """How many frames were sent to this client."""
-        self.session = ClientSession(
-            owner.frames, self._parameters_xml, owner.frames_requested, self._record_for
-        )
+        self.sent = SentFrames()
+        self.session = ClientSession(self)
 
     @property
     def name(self) -> str:
@@ -132,9 +116,9 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
-        self._record_for(None)
+        self.record_for(None)
         self.filter.connection_lost()
-        self._inbox.clear()
+        self._commands.packets.clear()
         self._owner.connection_closed(self, exc)
         self.closed.set_result(None)
 
@@ -153,7 +137,7 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def resume_reading(self) -> None:
         """Read from the socket again, unless packets are waiting or the connection is closing."""
-        if self._can_send() and not self._inbox:
+        if self._can_send() and not self._commands.packets:
             self.transport.resume_reading()
 
     def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 - the size is bounded
@@ -173,10 +157,10 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def handle(self, data: bytes) -> None:
         """Process bytes from the client, bypassing the filter; the replies go through it."""
-        self._inbox.extend(self._reader.feed(data))
-        if not self._is_processing:
-            self._process_inbox()
-        if self._inbox and not self.transport.is_closing():
+        self._commands.feed(data)
+        if not self._commands.is_scheduled:
+            self._answer_next()
+        if self._commands.packets and not self.transport.is_closing():
             self.transport.pause_reading()
 
     def answer(self, packet: Packet) -> list[bytes]:
@@ -190,17 +174,17 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def hold_commands(self) -> None:
         """Answer no further packets until ``continue_commands``."""
-        self._is_held = True
+        self._commands.is_held = True
 
     @property
     def waiting(self) -> Sequence[Packet]:
         """The packets that wait for an answer to those before them."""
-        return self._inbox
+        return self._commands.packets
 
     def continue_commands(self) -> None:
         """Answer packets again."""
-        self._is_held = False
-        self._process_soon()
+        self._commands.is_held = False
+        self._commands.schedule()
 
     def continue_sending(self) -> None:
         """Send frames and replies again after ``is_busy``; the frames in between are dropped."""
@@ -208,7 +192,7 @@ class ClientConnection(asyncio.BufferedProtocol):
             self.session.drop_due_frames(elapsed_us)
         self.resume_reading()
         self._owner.schedule()
-        self._process_soon()
+        self._commands.schedule()
 
     # For the server -------------------------------------------------------------------------
 
@@ -220,10 +204,8 @@ class ClientConnection(asyncio.BufferedProtocol):
             return
         for packet, components, _ in self.session.due_frames(elapsed_us):
             self.filter.send(packet)
-            self.frames_sent += 1
+            self.sent.add()
             self._owner.sent[components] += 1
-            self._last_sent_s = time.monotonic()
-            self._first_sent_s = self._first_sent_s or self._last_sent_s
             if not self._can_send():
                 break
         self._close_if_ended()
@@ -236,13 +218,13 @@ class ClientConnection(asyncio.BufferedProtocol):
 
     def close(self) -> None:
         """Close the connection once everything has been sent; ``closed`` is done then."""
-        self._inbox.clear()
+        self._commands.packets.clear()
         self.filter.flush()
         self.transport.close()
 
     @property
     def _owes_answers(self) -> bool:
-        return bool(self._inbox) or self._is_held or self.session.waits_for_frame
+        return bool(self._commands.packets) or self._commands.is_held or self.session.waits_for_frame
 
     def _close_if_ended(self) -> None:
         if self._has_ended and not self._owes_answers and self._can_send():
@@ -251,24 +233,15 @@ class ClientConnection(asyncio.BufferedProtocol):
     def _can_send(self) -> bool:
         return not (self._is_full or self.filter.is_busy or self.transport.is_closing())
 
-    def _process_soon(self, delay_s: float = 0.0) -> None:
-        if not self._is_processing:
-            self._is_processing = True
-            if delay_s:
-                self._loop.call_later(delay_s, self._process_inbox)
-            else:
-                self._loop.call_soon(self._process_inbox)
-
-    def _process_inbox(self) -> None:
-        """Answer one packet. The next one waits for the loop's next turn, so no client delays the others."""
-        self._is_processing = False
-        if self._is_held or not self._can_send():
+    def _answer_next(self) -> None:
+        """Answer one packet, unless it has to wait. The next one waits for the loop's next turn."""
+        commands = self._commands
+        if commands.is_held or not self._can_send():
             return
-        if self._inbox:
-            if not self._commands.try_take():
-                self._process_soon(_COMMANDS_PAUSE_S)
+        if commands.packets:
+            packet = commands.take()
+            if packet is None:
                 return
-            packet = self._inbox.popleft()
             _log.debug("%s: received %s", self.name, _described(packet))
             for reply in self.filter.answer(packet):
                 self.filter.send(reply)
@@ -278,37 +251,69 @@ class ClientConnection(asyncio.BufferedProtocol):
             if (elapsed_us := self._owner.elapsed_us()) is not None:
                 self.send_due_frames(elapsed_us)
             self._owner.schedule()
-        if self._inbox:
-            self._process_soon()
+        if commands.packets:
+            commands.schedule()
             return
         self.resume_reading()
-        if self._reader.error is not None and not self._is_held:
-            size = self._reader.error.size
+        if commands.bad_size is not None and not commands.is_held:
+            size = commands.bad_size
             text = f"A packet of {size} bytes is out of bounds (8 to {MAX_COMMAND_BYTES}); closing"
             self.filter.send(error_packet(text))
             self.close()
         self._close_if_ended()
 
-    def _record_for(self, duration_s: float | None) -> None:
-        """See ClientSession."""
-        if self._recording_end is not None:
-            self._recording_end.cancel()
-            self._recording_end = None
-        if duration_s is not None:
-            self._recording_end = self._loop.call_later(duration_s, self.session.end_recording)
+    # For the session (see SessionHost) ------------------------------------------------------
 
-    def _parameters_xml(self, sections: Sequence[str]) -> bytes:
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        """Return the frames with these components; an empty sequence means all."""
+        return self._owner.frames(components)
+
+    def parameters_xml(self, sections: Sequence[str]) -> bytes:
+        """Return the XML of some sections, with the facts of this connection in General."""
         address, port = self.transport.get_extra_info("sockname")[:2]
-        frames, streaming_s = self.frames_sent, self._last_sent_s - self._first_sent_s
         general = General(
             name=self._owner.name,
             version=gateway.__version__,
             address=address,
             port=port,
-            frames_sent=frames,
-            frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
+            frames_sent=self.sent.number,
+            frames_per_s=self.sent.per_s,
         )
         return self._owner.parameters_xml(sections, general)
+
+    def frames_requested(self) -> int | None:
+        """Note that the client requests frames; return the measurement's time in µs, None without one."""
+        return self._owner.frames_requested()
+
+    def record_for(self, duration_s: float | None) -> None:
+        """End the client's recording after this time, or never if it is None."""
+        if self._recording_end is not None:
+            self._recording_end.cancel()
+            self._recording_end = None
+        if duration_s is not None:
+            loop = asyncio.get_running_loop()
+            self._recording_end = loop.call_later(duration_s, self.session.end_recording)
+
+
+class SentFrames:
+    """The frames that were sent to a client."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        """How many there were."""
+        self._first_s = self._last_s = 0.0  # when they were sent, on the monotonic clock
+
+    def add(self) -> None:
+        """Count a frame that is sent now."""
+        self.number += 1
+        self._last_s = time.monotonic()
+        self._first_s = self._first_s or self._last_s
+
+    @property
+    def per_s(self) -> float:
+        """How many there were in a second from the first to the last, with two decimals."""
+        streaming_s = self._last_s - self._first_s
+        return round((self.number - 1) / streaming_s, 2) if streaming_s > 0 else 0.0
 
 
 def _described(packet: Packet) -> str:

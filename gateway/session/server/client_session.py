@@ -2,10 +2,10 @@
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Final
+from typing import Final, Protocol
 
 from gateway.errors import CommandError, FrameError
 from gateway.rtc3d.commands import (
@@ -38,40 +38,41 @@ MAX_FRAME_REQUESTS: Final = 1000
 _log = logging.getLogger(__name__)
 
 
+class SessionHost(Protocol):
+    """What a session needs from its connection and the server."""
+
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        """Return the frames with these components; an empty sequence means all."""
+
+    def parameters_xml(self, sections: Sequence[str]) -> bytes:
+        """Return the XML of some sections of §6 (keys of SECTIONS), or of all if it is empty."""
+
+    def frames_requested(self) -> int | None:
+        """Note that the client requests frames; return the measurement's time in µs, None without one."""
+
+    def record_for(self, duration_s: float | None) -> None:
+        """Call ``end_recording`` after this time, or never if it is None; calls before do not count any more.
+
+        The session calls it when the client starts or stops a recording.
+        """
+
+
 class ClientSession:
     """The protocol with one client, independent of the transport.
 
     All times are in µs since the measurement's start; the caller has the clock. It calls
     ``measurement_started``, ``measurement_stopped`` and ``scene_changed``, sends the packets that ``answer``
     returns, and at ``due_us`` those that ``due_frames`` yields.
-
-    - ``frames`` returns the frames with these components; an empty sequence means all.
-    - ``parameters_xml`` returns the XML of some sections of §6 (keys of SECTIONS), or of all if it is empty.
-    - ``frames_requested`` is called when the client requests frames. It returns the measurement's time in µs,
-      None without one.
-    - ``record_for`` is called when the client starts or stops a recording, with the time in s after which the
-      caller has to call ``end_recording``; None if only the client stops it.
     """
 
-    def __init__(
-        self,
-        frames: Callable[[Sequence[ComponentType]], FrameSource],
-        parameters_xml: Callable[[Sequence[str]], bytes],
-        frames_requested: Callable[[], int | None],
-        record_for: Callable[[float | None], None] = lambda _duration_s: None,
-    ) -> None:
-        self._frames = frames
-        self._parameters_xml = parameters_xml
-        self._frames_requested = frames_requested
-        self._record_for = record_for
+    def __init__(self, host: SessionHost) -> None:
+        self._host = host
         self.name = "client"
         """The client's name in log messages."""
         self._stream_command: StreamFrames | None = None  # the newest one, until StreamFrames Stop
         self._schedule: FrameSchedule | None = None  # of that command, while a measurement is running
         self._frame_requests: deque[FrameRequest] = deque()  # SendCurrentFrame; answered in order
-        self._newest_us = -1  # time stamp of the newest frame built for this client
-        # When the first event to send occurs; None while no frames are requested.
-        self._events_from_us: int | None = None
+        self._progress = FrameProgress()
         self.byte_order: ByteOrder = "big"
         """The byte order of the client's data frames (§4.3)."""
         self.frames_dropped = 0
@@ -103,10 +104,9 @@ class ClientSession:
 
     def measurement_started(self) -> None:
         """Start the client's stream, if it requested one, with the measurement's first frame."""
-        self._newest_us = -1
-        self._events_from_us = None
+        self._progress = FrameProgress()
         if self._stream_command is not None:
-            self._events_from_us = 0
+            self._progress.events_from_us = 0
             self._start_stream(self._stream_command, 0)
 
     def measurement_stopped(self) -> list[bytes]:
@@ -180,7 +180,7 @@ class ClientSession:
             case SetByteOrder(byte_order):
                 self.byte_order = byte_order
             case SendParameters(sections):
-                return [encode_packet(PacketType.XML, self._parameters_xml(sections))]
+                return [encode_packet(PacketType.XML, self._host.parameters_xml(sections))]
             case SendCurrentFrame() if len(self._frame_requests) >= MAX_FRAME_REQUESTS:
                 return [error_packet(f"{MAX_FRAME_REQUESTS} requests for the current frame wait already")]
             case SendCurrentFrame() | StreamFrames():
@@ -188,7 +188,7 @@ class ClientSession:
             case StopStreaming():
                 self._stream_command = self._schedule = None
                 if not self._frame_requests:
-                    self._events_from_us = None
+                    self._progress.events_from_us = None
             case ControlRecording(start, options):
                 self._set_recording(start=start, options=options)
             case Bye():
@@ -198,7 +198,7 @@ class ClientSession:
 
     def _request_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:
         """Store a request for frames; return a No Data packet if no measurement is running."""
-        elapsed_us = self._frames_requested()
+        elapsed_us = self._host.frames_requested()
         if isinstance(command, StreamFrames):
             self._stream_command = command
         if elapsed_us is None:
@@ -206,27 +206,27 @@ class ClientSession:
         if isinstance(command, StreamFrames):
             self._start_stream(command, elapsed_us)
         else:
-            frames = self._frames(command.components)
-            self._frame_requests.append(FrameRequest(frames, self._newest_us))
-        if self._events_from_us is None:
-            self._events_from_us = elapsed_us
+            frames = self._host.frames(command.components)
+            self._frame_requests.append(FrameRequest(frames, self._progress.newest_us))
+        if self._progress.events_from_us is None:
+            self._progress.events_from_us = elapsed_us
         return []
 
     def _start_stream(self, command: StreamFrames, elapsed_us: int) -> None:
-        frames = self._frames(command.components)
+        frames = self._host.frames(command.components)
         # A frame that is due right now is sent, unless the client already has it. A request during a stream
         # continues that stream, so frames that are overdue are sent, too.
         start_us = elapsed_us if self._schedule is None else min(elapsed_us, self._schedule.due_us)
-        first_tick = frames.tick_after(max(start_us - 1, self._newest_us))
+        first_tick = frames.tick_after(max(start_us - 1, self._progress.newest_us))
         self._schedule = FrameSchedule(frames, command.rate, first_tick)
 
     def _build(self, frames: FrameSource, tick: int) -> DataPacket:
-        time_us = frames.time_us(tick)
-        self._newest_us = max(self._newest_us, time_us)
+        progress, time_us = self._progress, frames.time_us(tick)
+        progress.newest_us = max(progress.newest_us, time_us)
         if not frames.has_events:
             return frames.packet(self.byte_order, tick)
-        events_from_us = time_us if self._events_from_us is None else self._events_from_us
-        self._events_from_us = max(events_from_us, time_us + 1)
+        events_from_us = time_us if progress.events_from_us is None else progress.events_from_us
+        progress.events_from_us = max(events_from_us, time_us + 1)
         packet = frames.packet(self.byte_order, tick, events_from_us)
         self.frames_without_events += packet.lacks_events
         return packet
@@ -237,7 +237,7 @@ class ClientSession:
 
     def _set_recording(self, *, start: bool, options: str = "") -> None:
         """Start or stop a recording. Raises CommandError if the duration in ``options`` is none."""
-        self._record_for(recording_duration_s(options))
+        self._host.record_for(recording_duration_s(options))
         self.is_recording = start
         _log.info("%s: recording %s", self.name, "started" if start else "stopped")
 
@@ -246,6 +246,17 @@ class ClientSession:
 
 _SAME_RATE: Final = Fraction(101, 100)
 """Measured rates within this factor are one rate."""
+
+
+@dataclass(slots=True)
+class FrameProgress:
+    """How far a client has got in the frames and events of a measurement."""
+
+    newest_us: int = -1
+    """The time stamp of the newest frame that was built for it."""
+
+    events_from_us: int | None = None
+    """When the first event to send occurs; None while no frames are requested."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,13 +56,26 @@ class Client:
         self.elapsed_us = -SECOND_US
         self.sources: list[RecordedFrames] = []
         self._is_end = is_end
-        self.session = ClientSession(self._frames, lambda _: b"", lambda: self.elapsed_us)
+        self.session = ClientSession(self)
 
-    def _frames(self, components: Sequence[ComponentType]) -> RecordedFrames:
+    # SessionHost ----------------------------------------------------------------------------
+
+    def frames(self, components: Sequence[ComponentType]) -> RecordedFrames:
         frames = RecordedFrames(components, self.event_bytes, MEASURED)
         frames.add(self.moments, is_end=self._is_end)
         self.sources.append(frames)
         return frames
+
+    def parameters_xml(self, _sections: Sequence[str]) -> bytes:
+        return b""
+
+    def frames_requested(self) -> int:
+        return self.elapsed_us
+
+    def record_for(self, _duration_s: float | None) -> None:
+        """Do nothing: these clients do not record."""
+
+    # The client -----------------------------------------------------------------------------
 
     def send(self, text: str) -> None:
         self.session.answer(Packet(PacketType.COMMAND, text.encode()))

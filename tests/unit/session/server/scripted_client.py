@@ -1,8 +1,12 @@
 """A session of the RT server with one client; the test sets the measurement's time."""
 
+from collections.abc import Sequence
+
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
 from gateway.session.server.client_session import ClientSession
+from gateway.session.server.scene import FrameSource
 from tests.unit.session.server.counting_scene import CountingScene
 from tests.unit.session.server.wire import COMMAND, DATA, ByteOrder, WireComponent, components_in, packets_in
 
@@ -14,13 +18,23 @@ class ScriptedClient:
         self.scene = CountingScene(rate_hz)
         self.elapsed_us: int | None = 0
         self.recording_durations_s: list[float | None] = []
-        general = General(name="server under test")
-        self.session = ClientSession(
-            frames=lambda components: self.scene.frames(components, 24),
-            parameters_xml=lambda sections: self.scene.parameters_xml(sections, general),
-            frames_requested=lambda: self.elapsed_us,
-            record_for=self.recording_durations_s.append,
-        )
+        self.session = ClientSession(self)
+
+    # SessionHost ----------------------------------------------------------------------------
+
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        return self.scene.frames(components, 24)
+
+    def parameters_xml(self, sections: Sequence[str]) -> bytes:
+        return self.scene.parameters_xml(sections, General(name="server under test"))
+
+    def frames_requested(self) -> int | None:
+        return self.elapsed_us
+
+    def record_for(self, duration_s: float | None) -> None:
+        self.recording_durations_s.append(duration_s)
+
+    # The client -----------------------------------------------------------------------------
 
     def send(self, text: bytes | str, packet_type: int = COMMAND) -> list[tuple[int, bytes]]:
         body = text.encode() if isinstance(text, str) else text

@@ -1,5 +1,6 @@
 """Frames of a live source for its clients: passed on, cut, converted, joined by time stamp, and events."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
@@ -11,6 +12,7 @@ from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
 from gateway.session.server.client_session import ClientSession
+from gateway.session.server.scene import FrameSource
 from tests.unit.outputs.adapters.rtc3d.scripted_server import (
     FAST,
     SLOW,
@@ -96,12 +98,24 @@ class LiveClient:
 
     def __init__(self, source: LiveSource) -> None:
         self.bodies: list[bytes] = []
-        self.session = ClientSession(
-            source.scene.frames,
-            lambda sections: source.scene.parameters_xml(sections, General()),
-            lambda: max(source.now_us, source.scene.newest_us),
-        )
         self._source = source
+        self.session = ClientSession(self)
+
+    # SessionHost ----------------------------------------------------------------------------
+
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        return self._source.scene.frames(components)
+
+    def parameters_xml(self, sections: Sequence[str]) -> bytes:
+        return self._source.scene.parameters_xml(sections, General())
+
+    def frames_requested(self) -> int:
+        return max(self._source.now_us, self._source.scene.newest_us)
+
+    def record_for(self, _duration_s: float | None) -> None:
+        """Do nothing: these clients do not record."""
+
+    # The client -----------------------------------------------------------------------------
 
     def send(self, text: str) -> None:
         self.session.answer(Packet(COMMAND, text.encode()))
