@@ -2,9 +2,10 @@
 
 From the bytes upwards:
 
-- ``packets`` (§4.1): a size, a type, and a body. It finds packets in a stream of bytes.
+- ``packets`` (§4.1): a size, a type, and a body. It finds packets in a stream of bytes, no
+  longer than ``max_packet_bytes`` and ``max_c3d_bytes`` of a source allow.
 - ``frames`` (§7.1) and ``components`` (§7.3 to §7.7): what data packets contain, as views of the bytes
-  received. Nothing is converted unless somebody asks for numpy arrays.
+  received, and what counts as missing. Nothing is converted unless somebody asks for numpy arrays.
 - ``commands`` (§5): what a client sends, as typed objects.
 - ``parameters`` (§6): what a server says about itself, and the table of its elements and attributes in XML.
   ``parameters_xml`` reads and writes them.

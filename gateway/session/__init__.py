@@ -20,7 +20,7 @@ Around it, from the outside to the inside:
 - ``session``: one TCP connection, used once. It reads when other sources had their turn and no ``backlog``
   waits.
 - ``stream_requests``: what a session asks the server for, handshake and signs of life included, and what the
-  server should send now: at which rate, or nothing.
+  server should send now: at which rate (halved as ``plan`` decides, with ``adapt_rate``), or nothing.
   ``replies`` has the commands that wait for a reply; ``rate_check`` compares the rate that arrives with the
   one that was requested.
 - ``status``: what is known about a stream, its counters and its failures. ``state`` derives one word from it.

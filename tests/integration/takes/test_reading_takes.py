@@ -25,7 +25,8 @@ from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-LCM_URL = "udpm://239.255.76.67:7712?ttl=0&recv_buf_size=2000000"
+LCM_PORT = 7712
+LCM_URL = f"udpm://239.255.76.67:{LCM_PORT}?ttl=0&recv_buf_size=2000000"
 LOGGER = Path(lcm.__file__).parents[1] / "bin/lcm-logger"
 
 
@@ -42,6 +43,8 @@ async def logged(scene: Scene, log: Path, *options: str) -> AsyncIterator[None]:
         logger = await asyncio.create_subprocess_exec(
             LOGGER, "-q", "-l", LCM_URL, *options, log, cwd=log.parent
         )
+        # The first parameters come once: the logger must receive by then.
+        await wait_until_async(lambda: f":{LCM_PORT:04X} " in Path("/proc/net/udp").read_text())
         gateway = asyncio.create_task(Gateway(settings, [LcmOutput(settings.lcm)]).run(stop))
         try:
             yield

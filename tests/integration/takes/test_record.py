@@ -22,6 +22,7 @@ import rtc3d
 from gateway.client.sources import FINGERPRINTS
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import PREFIX
+from gateway.messages.topics import MAX_SOURCES
 from gateway.takes.files.event_log import EventLogReader
 from gateway.takes.files.statistics import take_statistics
 from tests.support.errors import names
@@ -211,7 +212,7 @@ def test_gaps_two_gateways_and_hostile_publishers_are_reported(tmp_path: Path, p
         assert text in ended.stdout
     assert ended.stdout.endswith("INCOMPLETE\n")
     assert "\x1b" not in ended.stdout + ended.stderr
-    assert len(ended.stdout.splitlines()) < 200
+    assert len(ended.stdout.splitlines()) < MAX_SOURCES + 50
 
 
 def test_a_restart_of_the_gateway_is_told_from_loss(tmp_path: Path, publisher: Publisher) -> None:
