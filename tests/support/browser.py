@@ -12,7 +12,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, Page, Request, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
 
 CHROMIUM: Final = Path("/usr/bin/chromium")
 FLAGS: Final = (
@@ -51,6 +51,7 @@ def pages(chromium: Browser) -> Iterator[NewPage]:
     Then the test fails if a page has logged an error, raised one, or contacted another host.
     """
     problems: list[str] = []
+    contexts: list[BrowserContext] = []  # not all of the browser's: other tests share pages of it
 
     def on_console(message: ConsoleMessage) -> None:
         if message.type == "error":
@@ -61,14 +62,15 @@ def pages(chromium: Browser) -> Iterator[NewPage]:
             problems.append(f"request to another host: {request.url}")
 
     def open_page(**options: Any) -> Page:
-        page = chromium.new_context(**options).new_page()
+        contexts.append(chromium.new_context(**options))
+        page = contexts[-1].new_page()
         page.on("console", on_console)
         page.on("pageerror", lambda error: problems.append(f"error in the page: {error}"))
         page.on("request", on_request)
         return page
 
     yield open_page
-    for context in chromium.contexts:
+    for context in contexts:
         context.close()
     if problems:
         pytest.fail("\n".join(problems), pytrace=False)
