@@ -197,7 +197,7 @@ def test_nobody_at_site_b_publishes_or_starts_a_recording(sites: Sites, who: str
 
 def test_a_forbidden_command_ends_with_a_sentence(sites: Sites) -> None:
     """Otherwise, who asks would wait for a gateway that never gets the query."""
-    with GatewayClient(GatewayAddress(zenoh_config=sites.recorder), timeout_s=60) as client:
+    with GatewayClient(GatewayAddress(zenoh_config=sites.recorder), timeout_s=10) as client:
         [problem] = client.stop_take(source="lab").problems
     assert names(str(problem), "mocap/lab/take?set=stop", "access control")
 
