@@ -55,7 +55,9 @@ class Kept(Generic[_Item]):
     Items have numbers from 0. ``first`` is the number of the oldest item that is kept.
     """
 
-    def __init__(self, most: int, max_bytes: int, num_bytes: Callable[[_Item], int]) -> None:
+    def __init__(
+        self, most: int, max_bytes: int, num_bytes: Callable[[_Item], int] = attrgetter("num_bytes")
+    ) -> None:
         self.first = 0
         self._items: deque[_Item] = deque()
         self._most = most
@@ -167,7 +169,7 @@ class NewestFrames:
     """
 
     def __init__(self) -> None:
-        self.frames: Kept[ArrivedFrame] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES, attrgetter("num_bytes"))
+        self.frames: Kept[ArrivedFrame] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES)
         """The newest frames."""
         self.stream_of: dict[ComponentType, int] = {}
         """On which stream each measured component came last."""

@@ -35,7 +35,6 @@ KEPT_EVENTS: Final = 4096
 _CACHED_PACKETS: Final = 64  # clients with equal streams share them
 
 _time_us: Final = attrgetter("time_us")
-_num_bytes: Final = attrgetter("num_bytes")
 
 
 class _LiveFrame(NamedTuple):
@@ -81,9 +80,9 @@ class LiveFrames:
         self._next_arrival = arrivals.frames.first
         self._streams = ChosenStreams(frozenset(self.measured), arrivals, announced_hz)
         # Frames that have arrived while it is not known yet what sets the rate; None once it is.
-        self._undecided: Kept[ArrivedFrame] | None = Kept(KEPT_SAMPLES, KEPT_BYTES, _num_bytes)
+        self._undecided: Kept[ArrivedFrame] | None = Kept(KEPT_SAMPLES, KEPT_BYTES)
         self._join = StreamJoin(self._streams)
-        self._frames: Kept[_LiveFrame] = Kept(KEPT_FRAMES, KEPT_BYTES, _num_bytes)
+        self._frames: Kept[_LiveFrame] = Kept(KEPT_FRAMES, KEPT_BYTES)
         self._events = RecentEvents()
         self._packets: dict[tuple[ByteOrder, int, int, int], DataPacket] = {}  # the newest
         self.update(arrivals.newest_us)
@@ -216,7 +215,7 @@ class RecentEvents:
     """The newest events, and since when there may be others that are not kept any more."""
 
     def __init__(self) -> None:
-        self._kept: Kept[Events] = Kept(KEPT_EVENTS, KEPT_BYTES, _num_bytes)
+        self._kept: Kept[Events] = Kept(KEPT_EVENTS, KEPT_BYTES)
         self._dropped_us = -1  # when the newest events came that are not kept any more
 
     def __getitem__(self, number: int) -> Events:

@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
-from operator import attrgetter
 from typing import Final
 
 from gateway.outputs.adapters.rtc3d.arrivals import ArrivedFrame, Kept, NewestFrames, StreamRate
@@ -138,7 +137,7 @@ class StreamJoin:
         if samples is None:
             current = self._streams.numbers
             self._samples = {number: each for number, each in self._samples.items() if number in current}
-            samples = Kept(KEPT_SAMPLES, KEPT_BYTES, attrgetter("num_bytes"))
+            samples = Kept(KEPT_SAMPLES, KEPT_BYTES)
             self._samples[arrival.stream] = samples
         elif samples and arrival.timestamp_us < samples.newest.timestamp_us:
             samples.clear()  # a new measurement
