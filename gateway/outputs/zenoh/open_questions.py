@@ -18,7 +18,7 @@ class SharedQuestion(NamedTuple):
     selected: str
     options: tuple[tuple[str, str], ...]
     number: int = 0
-    """Tells commands apart: a second stop is for what was started after the first one."""
+    """Makes each command a question of its own: a second stop is for what was started after the first one."""
 
     @property
     def selector(self) -> str:

@@ -174,7 +174,7 @@ _SLOW_BYTES: Final = 8 * 1024 * 1024
 
 
 class _DiskReports:
-    """Tells when the disk does not accept what is written, when it does again, and when it is too slow."""
+    """Reports when the disk does not accept what is written, when it does again, and when it is too slow."""
 
     def __init__(self) -> None:
         self._problem = ""
@@ -199,7 +199,7 @@ _MAX_LOSS_LINES: Final = 20
 
 
 class _LossReports:
-    """Tells how many more messages were lost, in a limited number of lines."""
+    """Reports how many more messages were lost, in a limited number of lines."""
 
     def __init__(self) -> None:
         self.num_lost = 0
