@@ -219,8 +219,7 @@ class SequenceCheck:
         current = self._current
         if current is None:
             if self._begins_at is not None and stop > self._begins_at:
-                current = self._begin(stop, 0)
-                current.newest = stop - 1
+                self._begin(stop, 0).newest = stop - 1
         elif stop > current.newest + 1:
             self._add_gap(Gap(current.utime, stop - current.newest - 1, stop), current.gaps)
             current.newest = stop - 1
