@@ -31,7 +31,7 @@ from tests.support.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-MAX_GROWTH_MIB = 48
+MAX_GROWTH_MIB = 40
 """How much memory an attack may leave behind; without limits, it was 160 to 300 MB."""
 
 MAX_WAITING_MIB = MAX_GROWTH_MIB + MAX_BYTES // 2**20
