@@ -16,7 +16,7 @@ from gateway.config.settings import Settings
 from gateway.daemon.gateway import Gateway
 from gateway.daemon.monitoring.process_limits import (
     ProcessLimits,
-    limit_arenas,
+    limit_kept_memory,
     raise_file_limit,
     return_free_memory,
 )
@@ -79,7 +79,7 @@ async def serve(load: Callable[[], Settings], every_second: Callable[[], None] =
     Raises ConfigError if the settings cannot be used at the start.
     """
     raise_file_limit()
-    limit_arenas()
+    limit_kept_memory()
     daemon = Daemon(load, Gateway(load()), every_second)
     in_loop = asyncio.get_running_loop().call_soon_threadsafe
     Signals(lambda: in_loop(daemon.request_stop), lambda: in_loop(daemon.hang_up), daemon.unfinished)

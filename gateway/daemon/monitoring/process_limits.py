@@ -33,6 +33,10 @@ _MAX_ARENAS: Final = 2
 _M_ARENA_MAX: Final = -8
 """The parameter of mallopt(3) that limits the number of arenas."""
 
+_LARGE_BLOCK_BYTES: Final = 1 << 20
+_M_MMAP_THRESHOLD: Final = -3
+"""The parameter of mallopt(3) from which size on a block is returned to the system when it is freed."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -48,14 +52,18 @@ def raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def limit_arenas() -> None:
-    """Let the threads of the process share two of malloc's arenas, so that they reuse each other's memory.
+def limit_kept_memory() -> None:
+    """Let malloc keep less of what is freed. Call it before Zenoh starts.
 
-    glibc gives the threads up to eight arenas per core, and returns little of what they free: floods of
-    queries and hundreds of reloads left up to three times the memory behind. Call it before Zenoh starts.
+    The threads share two arenas, so that they reuse each other's memory. glibc gives them up to eight per
+    core, and returns little of what they free: floods of queries and hundreds of reloads left up to three
+    times the memory behind. Large blocks, such as the answer with a C3D file, are returned at once: glibc
+    raises its threshold to the largest block freed, and a peer that asked for files left up to 40 MiB behind.
     """
     with contextlib.suppress(AttributeError):  # another libc, which has no arenas
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _MAX_ARENAS)
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_ARENA_MAX, _MAX_ARENAS)
+        libc.mallopt(_M_MMAP_THRESHOLD, _LARGE_BLOCK_BYTES)
 
 
 def return_free_memory() -> None:

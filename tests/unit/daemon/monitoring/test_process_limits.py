@@ -7,6 +7,8 @@ import asyncio
 import errno
 import resource
 import ssl
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -69,6 +71,27 @@ def test_memory_between_blocks_in_use_is_returned() -> None:
     return_free_memory()
     assert before - resident_bytes() > 40_000_000
     assert len(kept) == 160
+
+
+KEPT_BY_MALLOC = """
+import resource
+from pathlib import Path
+from gateway.daemon.monitoring.process_limits import limit_kept_memory
+
+def resident_bytes():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+limit_kept_memory()
+before = resident_bytes()
+for size in (10_000_000, 9_000_000):
+    bytes(b"x" * size)
+print(resident_bytes() - before)
+"""
+
+
+def test_large_blocks_are_returned_when_they_are_freed() -> None:
+    """Without a limit, glibc keeps the second one: the first one has raised its threshold."""
+    assert int(subprocess.check_output([sys.executable, "-c", KEPT_BY_MALLOC])) < 2_000_000
 
 
 @contextmanager
