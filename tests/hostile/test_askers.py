@@ -27,7 +27,7 @@ from tests.hostile.gateway_under_attack import (
     printed,
     python,
 )
-from tests.support.waiting import wait_until_async
+from tests.support.waiting import num_bytes_below, wait_until_async
 
 pytestmark = pytest.mark.netns
 
@@ -166,7 +166,7 @@ def rolling_takes(folder: Path) -> dict[str, Any]:
 
 async def wait_for_old_messages(folder: Path) -> None:
     """Wait until the disk has more than the memory."""
-    await wait_until_async(lambda: sum(each.stat().st_size for each in folder.rglob("*.lcmlog")) > 20_000_000)
+    await wait_until_async(lambda: num_bytes_below(folder) > 20_000_000)
 
 
 async def test_askers_for_the_whole_history_that_do_not_read_the_answers(

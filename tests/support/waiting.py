@@ -1,8 +1,10 @@
 """Waiting for conditions in tests."""
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 _TIMEOUT_S: Final = 60.0
@@ -27,3 +29,12 @@ async def wait_until_async(condition: Callable[[], object], timeout_s: float = _
         if time.monotonic() > deadline_s:
             raise AssertionError(f"still not true after {timeout_s:g} s")
         await asyncio.sleep(_POLL_S)
+
+
+def num_bytes_below(folder: Path) -> int:
+    """Return the size of all files below a folder, where files are renamed and deleted meanwhile."""
+    num_bytes = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):
+            num_bytes += path.stat().st_size if path.is_file() else 0
+    return num_bytes

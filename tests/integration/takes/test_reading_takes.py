@@ -21,7 +21,7 @@ from gateway.takes import open_take
 from gateway.takes.files.reader import TakeReader
 from gateway.takes.files.statistics import take_statistics
 from tests.support.configurations import make_settings
-from tests.support.waiting import wait_until_async
+from tests.support.waiting import num_bytes_below, wait_until_async
 
 pytestmark = pytest.mark.netns
 
@@ -59,7 +59,7 @@ async def logged(scene: Scene, log: Path, *options: str) -> AsyncIterator[None]:
 async def test_the_split_files_of_lcm_logger_are_one_take(tmp_path: Path, options: tuple[str, ...]) -> None:
     scene = SyntheticScene(markers=3, tools=1, analog=2, plates=1)
     async with logged(scene, tmp_path / "log", "--split-mb=0.1", *options):
-        await wait_until_async(lambda: sum(file.stat().st_size for file in tmp_path.iterdir()) > 500_000)
+        await wait_until_async(lambda: num_bytes_below(tmp_path) > 500_000)
     take, statistics = open_take(tmp_path), take_statistics(tmp_path)
     assert len(TakeReader(tmp_path).logs) >= 5
     markers, tools = take.sources["lab"].markers, take.sources["lab"].tools
