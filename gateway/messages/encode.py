@@ -25,7 +25,7 @@ from gateway.rtc3d.components import (
     ComponentType,
     big_endian_content,
 )
-from gateway.rtc3d.frames import ComponentLayout
+from gateway.rtc3d.frames import ComponentLayout, RawFrame
 
 PREFIX: Final = struct.Struct(">qqqii")
 """The fields after the fingerprint: utime, capture_utime, sequence, session, parameters_version."""
@@ -130,6 +130,14 @@ def encode_message(component: Component, stamp: Stamp, sequence: int) -> bytes:
 def encode_content(component_type: ComponentType, content: bytes, stamp: Stamp, sequence: int) -> bytes:
     """Return the LCM message of a component whose content is in LCM form."""
     return b"%b%b%b" % (_FINGERPRINTS[component_type], stamp.prefix(sequence), content)
+
+
+def frame_message(frame: RawFrame, index: int, stamp: Stamp, sequence: int) -> bytes:
+    """Return the LCM message of the component at ``index`` of a frame."""
+    layout = frame.layout.components[index]
+    if has_lcm_form(layout, frame.layout.byte_order):
+        return encode_content(layout.type, frame.content(index), stamp, sequence)
+    return encode_message(frame.component(index), stamp, sequence)
 
 
 def has_lcm_form(layout: ComponentLayout, byte_order: ByteOrder) -> bool:

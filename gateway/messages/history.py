@@ -1,6 +1,6 @@
 """The newest messages of one source, kept so that subscribers can ask for those they have missed.
 
-It holds the very objects that the outputs got, so it costs a reference per message, and no copy.
+Those of frames are kept as the frames that arrived, and made again when somebody asks (``frame_run``).
 """
 
 import time
@@ -10,7 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.errors import ProtocolError
-from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX
+from gateway.messages.encode import FINGERPRINT_BYTES, PREFIX, Stamp
+from gateway.messages.frame_run import (
+    FRAME_OVERHEAD_BYTES,
+    RUN_BYTES,
+    FrameMessages,
+    FrameRun,
+    NumberedLayout,
+)
 from gateway.messages.host_time import HostClock, host_clock
 
 MAX_ANSWER_BYTES: Final = 200_000
@@ -83,6 +90,8 @@ class MessageHistory:
         self._max_bytes = 0
         self._blocks: deque[_Block] = deque([self._new_block(monotonic())])
         self._newest = self._blocks[-1]
+        self._run: FrameRun | None = None
+        """The newest frames in the newest block; None if it has no frames yet."""
 
     def set_limits(self, seconds: float, max_bytes: int) -> None:
         """Keep messages within these limits from now on."""
@@ -102,7 +111,7 @@ class MessageHistory:
     @property
     def overview(self) -> dict[str, Any]:
         """The limits, and what there is of each key."""
-        keys = sorted({key for block in self._blocks for key in block.messages})
+        keys = sorted({key for block in self._blocks for key in block.keys})
         found = {key: self._runs(key) for key in keys}
         return {
             "seconds": self._seconds,
@@ -110,27 +119,48 @@ class MessageHistory:
             "num_bytes": self.num_bytes,
             "keys": {
                 key: {
-                    "oldest": sequence_of(runs[0][0]),
-                    "newest": sequence_of(runs[-1][-1]),
-                    "oldest_utime": utime_of(runs[0][0]),
-                    "newest_utime": utime_of(runs[-1][-1]),
+                    "oldest": runs[0].sequence(0),
+                    "newest": runs[-1].sequence(len(runs[-1]) - 1),
+                    "oldest_utime": runs[0].utime(0),
+                    "newest_utime": runs[-1].utime(len(runs[-1]) - 1),
                 }
                 for key, runs in found.items()
             },
         }
 
     def add(self, key: str, message: bytes) -> None:
-        """Keep a message."""
+        """Keep a message that belongs to no frame, or that has another number than that of its frame."""
         if self._max_bytes:
             if self._host.steps != self._steps:
-                self._blocks.append(self._new_block(self._monotonic()))
-                self._newest = self._blocks[-1]
+                self._append_block(self._monotonic())
             block = self._newest
             messages = block.messages.get(key)
             if messages is None:
                 messages = block.messages[key] = []
             messages.append(message)
             block.num_bytes += len(message) + MESSAGE_OVERHEAD_BYTES
+            if block.num_bytes * _BLOCKS > self._max_bytes:
+                self.begin_block()
+
+    def add_frame(self, body: bytes, layout: NumberedLayout, stamp: Stamp) -> None:
+        """Keep a frame whose messages get the next numbers of their components."""
+        if self._max_bytes:
+            if self._host.steps != self._steps:
+                self._append_block(self._monotonic())
+            block, run = self._newest, self._run
+            if (
+                run is None
+                or run.layout is not layout
+                or run.session != stamp.session
+                or run.parameters_version != stamp.parameters_version
+            ):
+                self._run = run = FrameRun(layout, stamp)
+                block.frames.append(run)
+                block.num_bytes += RUN_BYTES
+            run.bodies.append(body)
+            run.utimes.append(stamp.utime)
+            run.capture_utimes.append(stamp.capture_utime)
+            block.num_bytes += len(body) + FRAME_OVERHEAD_BYTES
             if block.num_bytes * _BLOCKS > self._max_bytes:
                 self.begin_block()
 
@@ -143,8 +173,12 @@ class MessageHistory:
             num_bytes -= blocks.popleft().num_bytes
         newest = blocks[-1] if blocks else None
         if newest is None or newest.num_bytes * _BLOCKS > self._max_bytes or now_s >= newest.end_s:
-            blocks.append(self._new_block(now_s))
-        self._newest = blocks[-1]
+            self._append_block(now_s)
+
+    def _append_block(self, now_s: float) -> None:
+        self._newest = self._new_block(now_s)
+        self._blocks.append(self._newest)
+        self._run = None
 
     def _new_block(self, now_s: float) -> "_Block":
         """Return a block that begins now: between two steps of the wall clock, it tells ages."""
@@ -166,7 +200,7 @@ class MessageHistory:
         runs = self._runs(key)
         if not runs:
             return None
-        oldest, newest = sequence_of(runs[0][0]), sequence_of(runs[-1][-1])
+        oldest, newest = runs[0].sequence(0), runs[-1].sequence(len(runs[-1]) - 1)
         first = wanted.first
         if wanted.last_s is not None:
             first = self._first_of_last(key, wanted.last_s, newest + 1)
@@ -176,8 +210,8 @@ class MessageHistory:
         last = newest if wanted.last is None else min(wanted.last, newest)
         messages: list[bytes] = []
         num_bytes = 0
-        for message in _messages_from(runs, first):
-            if sequence_of(message) > last:
+        for sequence, message in _messages_from(runs, first):
+            if sequence > last:
                 break
             num_bytes += len(message)
             if messages and num_bytes > MAX_ANSWER_BYTES:
@@ -191,29 +225,62 @@ class MessageHistory:
 
         None if the key has no messages.
         """
-        for block, end_s in self._blocks_with(key):
-            oldest = block.messages[key][0]
-            older_s = block.time_s(oldest, end_s) - (self._monotonic() - last_s)
-            return utime_of(oldest) - round(1e6 * older_s)
+        for block, end_s, runs in self._blocks_with(key):
+            utime = runs[0].utime(0)
+            older_s = block.time_s(utime, end_s) - (self._monotonic() - last_s)
+            return utime - round(1e6 * older_s)
         return None
 
     def _first_of_last(self, key: str, last_s: float, otherwise: int) -> int:
         """Return the number of the first message of a key that is not older than ``last_s``."""
         since_s = self._monotonic() - last_s
-        for block, end_s in self._blocks_with(key):
-            messages = block.messages[key]
-            if block.time_s(messages[-1], end_s) >= since_s:
-                return next(sequence_of(each) for each in messages if block.time_s(each, end_s) >= since_s)
+        for block, end_s, runs in self._blocks_with(key):
+            for run in runs:
+                if block.time_s(run.utime(len(run) - 1), end_s) >= since_s:
+                    return next(
+                        run.sequence(position)
+                        for position in range(len(run))
+                        if block.time_s(run.utime(position), end_s) >= since_s
+                    )
         return otherwise
 
-    def _blocks_with(self, key: str) -> list[tuple["_Block", float]]:
-        """Return the blocks that have messages of a key, and when each ended, in order."""
+    def _blocks_with(self, key: str) -> list[tuple["_Block", float, "list[_Run]"]]:
+        """Return the blocks that have messages of a key, when each ended, and the messages, in order."""
         ends_s = [*(block.begin_s for block in self._blocks), self._monotonic()][1:]
-        return [pair for pair in zip(self._blocks, ends_s, strict=True) if pair[0].messages.get(key)]
+        return [
+            (block, end_s, runs)
+            for block, end_s in zip(self._blocks, ends_s, strict=True)
+            if (runs := block.runs(key))
+        ]
 
-    def _runs(self, key: str) -> list[list[bytes]]:
-        """Return the messages of a key in each block that has some, in order."""
-        return [messages for block in self._blocks if (messages := block.messages.get(key))]
+    def _runs(self, key: str) -> "list[_Run]":
+        """Return the messages of a key, in order."""
+        return [run for block in self._blocks for run in block.runs(key)]
+
+
+class _Messages:
+    """Messages of one key that are kept as they were published, the oldest at position 0."""
+
+    def __init__(self, messages: list[bytes]) -> None:
+        self._messages = messages
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def message(self, position: int) -> bytes:
+        """Return the message at a position."""
+        return self._messages[position]
+
+    def sequence(self, position: int) -> int:
+        """Return its sequence number."""
+        return sequence_of(self._messages[position])
+
+    def utime(self, position: int) -> int:
+        """Return when it was published, in µs since the Unix epoch."""
+        return utime_of(self._messages[position])
+
+
+_Run = _Messages | FrameMessages
 
 
 class _Block:
@@ -227,14 +294,26 @@ class _Block:
         self.end_s = begin_s + _BLOCK_S
         self._begin_utime = begin_utime
         self.messages: dict[str, list[bytes]] = {}
+        self.frames: list[FrameRun] = []
         self.num_bytes = 0
 
-    def time_s(self, message: bytes, end_s: float) -> float:
+    @property
+    def keys(self) -> set[str]:
+        """The keys that have messages."""
+        return {*self.messages, *(key for run in self.frames for key in run.keys)}
+
+    def runs(self, key: str) -> list[_Run]:
+        """Return the messages of a key, in order. A key has them all from frames, or none."""
+        if messages := self.messages.get(key):
+            return [_Messages(messages)]
+        return [found for run in self.frames if (found := run.messages(key)) is not None]
+
+    def time_s(self, utime: int, end_s: float) -> float:
         """Return when a message was published, on the monotonic clock; the block ended at ``end_s``.
 
         A message may have been dated just before the step of the wall clock that begins the block.
         """
-        time_s = self.begin_s + 1e-6 * (utime_of(message) - self._begin_utime)
+        time_s = self.begin_s + 1e-6 * (utime - self._begin_utime)
         return min(max(time_s, self.begin_s), end_s)
 
 
@@ -248,19 +327,21 @@ def utime_of(message: bytes) -> int:
     return int.from_bytes(message[FINGERPRINT_BYTES:_CAPTURE_OFFSET], "big", signed=True)
 
 
-def _first_since(runs: Sequence[list[bytes]], since_utime: int, otherwise: int) -> int:
+def _first_since(runs: "list[_Run]", since_utime: int, otherwise: int) -> int:
     """Return the number of the first message that was published at ``since_utime`` or later."""
-    for messages in runs:
-        if utime_of(messages[-1]) >= since_utime:
-            return next(sequence_of(each) for each in messages if utime_of(each) >= since_utime)
+    for run in runs:
+        if run.utime(len(run) - 1) >= since_utime:
+            positions = range(len(run))
+            return next(run.sequence(each) for each in positions if run.utime(each) >= since_utime)
     return otherwise
 
 
-def _messages_from(runs: Sequence[list[bytes]], first: int) -> Iterator[bytes]:
-    for messages in runs:
-        if sequence_of(messages[-1]) >= first:
-            for index in range(bisect_left(messages, first, key=sequence_of), len(messages)):
-                yield messages[index]
+def _messages_from(runs: "list[_Run]", first: int) -> Iterator[tuple[int, bytes]]:
+    """Yield the messages from number ``first`` on, with their numbers."""
+    for run in runs:
+        if run.sequence(len(run) - 1) >= first:
+            for position in range(bisect_left(range(len(run)), first, key=run.sequence), len(run)):
+                yield run.sequence(position), run.message(position)
 
 
 def pack_messages(messages: Sequence[bytes]) -> bytes:

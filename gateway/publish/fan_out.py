@@ -8,7 +8,15 @@ from functools import lru_cache
 from typing import Any, Final
 
 from gateway.errors import QueryError
-from gateway.messages.encode import MESSAGE_TYPES, Stamp, encode_content, has_lcm_form, lcm_content
+from gateway.messages.encode import (
+    MESSAGE_TYPES,
+    Stamp,
+    encode_content,
+    frame_message,
+    has_lcm_form,
+    lcm_content,
+)
+from gateway.messages.frame_run import MessageNumbers, NumberedLayout
 from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages
 from gateway.outputs.contract import Output, OutputStatus, ServerParameters
 from gateway.publish.routes import FrameRoute, OutputRoute, TopicRoute
@@ -81,46 +89,33 @@ _MAX_PLANS: Final = 64
 """How many plans are cached. The server determines the layouts: each number of events is another one."""
 
 
-class _Component:
-    """The numbering of one component's messages, and the newest message."""
+class _Component(MessageNumbers):
+    """The numbering of one component's messages, and how the newest frame that has it was published."""
 
     def __init__(self, component_type: ComponentType) -> None:
-        self.type = component_type
-        self.sequence = 0
-        self.newest: bytes | None = None
+        super().__init__(component_type)
+        self.plan: _Plan | None = None
 
 
 class _ComponentPlan:
     """How to publish one component of a layout: its index and place in the frame, and its routes."""
 
     def __init__(
-        self,
-        component: _Component,
-        layout: FrameLayout,
-        index: int,
-        routes: list[TopicRoute],
-        history: MessageHistory,
+        self, numbers: MessageNumbers, layout: FrameLayout, index: int, routes: list[TopicRoute]
     ) -> None:
         self.routes = routes
-        self._component = component
-        self._key = component.type.key
-        self._history = history
-        self._index = index
+        self.numbers = numbers
+        self.index = index
         self._start, self._end = layout.content_spans[index]
         self._has_lcm_form = has_lcm_form(layout.components[index], layout.byte_order)
 
-    def next_message(self, frame: RawFrame, stamp: Stamp) -> bytes:
-        """Return the component's message, which uses up a sequence number even if it is not published."""
-        component = self._component
+    def message(self, frame: RawFrame, stamp: Stamp, sequence: int) -> bytes:
+        """Return the component's message."""
         if self._has_lcm_form:
             content = frame.body[self._start : self._end]
         else:
-            content = lcm_content(frame.component(self._index))
-        message = encode_content(component.type, content, stamp, component.sequence)
-        component.sequence += 1
-        component.newest = message
-        self._history.add(self._key, message)
-        return message
+            content = lcm_content(frame.component(self.index))
+        return encode_content(self.numbers.type, content, stamp, sequence)
 
 
 @dataclass
@@ -136,6 +131,9 @@ class _Plan:
     """The indices of 6D components whose poses are published per tool."""
     num_items: dict[ComponentType, int]
     """The numbers of markers, tools, channels and plates."""
+    numbered: NumberedLayout
+    newest: tuple[RawFrame, Stamp] | None = None
+    """The newest frame that was published, or numbered, in this way."""
 
 
 class FanOut:
@@ -204,7 +202,7 @@ class FanOut:
     @property
     def frames(self) -> dict[ComponentType, int]:
         """The number of frames with each component that have arrived, published or not."""
-        return {component.type: component.sequence for component in self._components.values()}
+        return {component.type: component.next for component in self._components.values()}
 
     def newest(self, component: ComponentType, output: str) -> bytes | None:
         """Return the message of the newest frame with a component that has arrived, published or not.
@@ -212,9 +210,14 @@ class FanOut:
         It has the number under which it is published on the output named ``output``. If pacing leaves it out
         there, it has the number of the last message before it. None if no such frame has arrived.
         """
-        message = self._components[component].newest
+        numbers = self._components[component]
+        if numbers.plan is None or numbers.plan.newest is None:
+            return None
+        frame, stamp = numbers.plan.newest
+        index = numbers.plan.numbered.indices[numbers][-1]
+        message = frame_message(frame, index, stamp, numbers.next - 1)
         paced = self._paced_route(component, output)
-        return message if paced is None or message is None else paced.numbered(message)
+        return message if paced is None else paced.numbered(message)
 
     async def find(self, key: str, output: str, wanted: WantedMessages) -> FoundMessages | None:
         """Return messages of a key from the history, as they are numbered on the output of this name.
@@ -289,10 +292,15 @@ class FanOut:
             plan = self._change_plan(frame, stamp, wanted)
         for frame_route in plan.frame_routes:
             frame_route.publish(frame, stamp, wanted)
+        self._keep(plan, frame, stamp)
         for component in plan.components:
-            message = component.next_message(frame, stamp)
-            for route in component.routes:
-                route.send(message, stamp)
+            numbers = component.numbers
+            sequence = numbers.next
+            numbers.next = sequence + 1
+            if component.routes:  # otherwise, nobody needs the message now
+                message = component.message(frame, stamp, sequence)
+                for route in component.routes:
+                    route.send(message, stamp)
         if plan.tool_indices:
             self._tool_poses.publish(frame, plan.tool_indices, stamp)
 
@@ -302,15 +310,26 @@ class FanOut:
         Returns how many messages this loses. Messages that pacing leaves out on every output do not count.
         """
         plan = self._change_plan(frame, stamp, components)
+        self._keep(plan, frame, stamp)
         num_lost = self._tool_poses.skip(frame, plan.tool_indices)
         for component in plan.components:
-            message = component.next_message(frame, stamp)
+            numbers = component.numbers
+            message = component.message(frame, stamp, numbers.next)
+            numbers.next += 1
             is_lost = [route.skip(message, stamp) for route in component.routes]
             num_lost += any(is_lost) or bool(plan.frame_routes)
         return num_lost
 
+    def _keep(self, plan: _Plan, frame: RawFrame, stamp: Stamp) -> None:
+        """Keep a frame whose messages get the next numbers."""
+        plan.newest = frame, stamp
+        if plan.components:
+            self.history.add_frame(frame.body, plan.numbered, stamp)
+
     def _change_plan(self, frame: RawFrame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
         self._plan = plan = self._plan_for(frame.layout, wanted)
+        for component in plan.numbered.indices:
+            self._components[component.type].plan = plan
         if self._item_counts.update(plan.num_items, stamp.session):
             self.on_items_changed()
         return plan
@@ -328,7 +347,6 @@ class FanOut:
                     if (component_route := route.components.get(component.type)) is not None
                     and not component_route.is_idle
                 ],
-                self.history,
             )
             for index, component in indexed
         ]
@@ -338,6 +356,7 @@ class FanOut:
             [route for route in self._frame_routes if plans and route.publisher.prepare(layout, wanted)],
             [index for index, each in indexed if is_used and each.type is ComponentType.TOOLS],
             {each.type: each.num_items for _, each in indexed if each.type is not ComponentType.EVENT},
+            NumberedLayout(layout, [(plan.index, plan.numbers) for plan in plans]),
         )
 
     def forget_layouts(self) -> None:

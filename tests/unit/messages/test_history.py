@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
-from gateway.messages.encode import PREFIX
+from gateway.messages.encode import PREFIX, Stamp
+from gateway.messages.frame_run import MessageNumbers, NumberedLayout
 from gateway.messages.history import (
     MAX_ANSWER_BYTES,
     MESSAGE_OVERHEAD_BYTES,
@@ -16,7 +17,14 @@ from gateway.messages.history import (
     unpack_messages,
 )
 from gateway.messages.host_time import HostClock
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import split_frame
 from tests.support.clocks import Clock
+from tests.support.vectors import FULL_FRAME
+
+FULL = split_frame(FULL_FRAME["big"], "big")
+MARKERS = MessageNumbers(ComponentType.MARKERS)
+LAYOUT = NumberedLayout(FULL.layout, [(0, MARKERS)])
 
 
 def message(sequence: int, utime: int = 0, size: int = 48) -> bytes:
@@ -161,15 +169,19 @@ class SteppedHost(HostClock):
         max_size=60,
     ),
     st.sampled_from([0.05, 1.0, 10.0, 30.0, 1000.0]),
+    st.booleans(),
 )
 def test_the_last_seconds_are_those_of_a_clock_that_nobody_sets(
-    steps: list[tuple[float, str, int]], last_s: float
+    steps: list[tuple[float, str, int]],
+    last_s: float,
+    are_frames: bool,
 ) -> None:
     """After a step forward, ten seconds were one; after a step back, they were the whole minute."""
     clock = Clock()
     host = SteppedHost(clock)
     history = MessageHistory(clock, host)
     history.set_limits(60.0, 1 << 20)
+    MARKERS.next = 0
     times: list[float] = []
     for pause_s, work, by_s in steps:
         clock.now_s += pause_s
@@ -177,7 +189,11 @@ def test_the_last_seconds_are_those_of_a_clock_that_nobody_sets(
             host.step(by_s)
         elif work == "maintain":
             history.begin_block()
-        history.add("3d", message(len(times), host.utime))
+        if are_frames:
+            history.add_frame(FULL.body, LAYOUT, Stamp(host.utime, host.utime, 1, 1))
+            MARKERS.next += 1
+        else:
+            history.add("3d", message(len(times), host.utime))
         times.append(clock.now_s)
     kept = read_all(history, "3d", WantedMessages(0))
     found = read_all(history, "3d", WantedMessages(None, None, None, last_s))

@@ -1,0 +1,93 @@
+"""Frames that the history keeps as they arrived, and the messages that are made of them when somebody asks.
+
+A frame in memory costs one object for its bytes, however many components it has. Few messages are ever asked
+for again, and those are the same bytes as the outputs got.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from gateway.messages.encode import Stamp, frame_message
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import FrameLayout, RawFrame
+
+FRAME_OVERHEAD_BYTES: Final = 128
+"""What a frame needs in memory besides its bytes: the heads of three objects, and a reference to each."""
+
+RUN_BYTES: Final = 1000
+"""What a run needs in memory besides its frames."""
+
+
+class MessageNumbers:
+    """The sequence numbers of one component's messages; ``next`` is that of the next one."""
+
+    def __init__(self, component_type: ComponentType) -> None:
+        self.type = component_type
+        self.key = component_type.key
+        self.next = 0
+
+
+class NumberedLayout:
+    """A layout of frames, and the indices of those components whose messages are numbered."""
+
+    def __init__(self, layout: FrameLayout, components: Sequence[tuple[int, MessageNumbers]]) -> None:
+        self.layout = layout
+        self.indices: dict[MessageNumbers, list[int]] = {}
+        """Usually one of each component, but a frame may repeat it."""
+        for index, numbers in components:
+            self.indices.setdefault(numbers, []).append(index)
+
+
+class FrameRun:
+    """Frames of one layout and one session, which arrived one after the other."""
+
+    def __init__(self, layout: NumberedLayout, stamp: Stamp) -> None:
+        self.layout = layout
+        self.session = stamp.session
+        self.parameters_version = stamp.parameters_version
+        self.bodies: list[bytes] = []
+        self.utimes: list[int] = []
+        self.capture_utimes: list[int] = []
+        self._components = {
+            numbers.key: (numbers.next, indices) for numbers, indices in layout.indices.items()
+        }
+
+    def messages(self, key: str) -> "FrameMessages | None":
+        """Return the messages of the component with this key; None if the frames have none."""
+        component = self._components.get(key)
+        return None if component is None or not self.bodies else FrameMessages(self, *component)
+
+    @property
+    def keys(self) -> Sequence[str]:
+        """The keys of the components."""
+        return list(self._components) if self.bodies else []
+
+    def message(self, number: int, index: int, sequence: int) -> bytes:
+        """Return the message of the component at ``index`` of a frame, with a sequence number."""
+        stamp = Stamp(self.utimes[number], self.capture_utimes[number], self.session, self.parameters_version)
+        return frame_message(RawFrame(self.layout.layout, self.bodies[number]), index, stamp, sequence)
+
+
+class FrameMessages:
+    """The messages of one component of a run, the oldest at position 0."""
+
+    def __init__(self, run: FrameRun, first: int, indices: Sequence[int]) -> None:
+        self._run = run
+        self._first = first
+        self._indices = indices
+
+    def __len__(self) -> int:
+        return len(self._run.bodies) * len(self._indices)
+
+    def message(self, position: int) -> bytes:
+        """Return the message at a position."""
+        number, repeated = divmod(position, len(self._indices))
+        return self._run.message(number, self._indices[repeated], self._first + position)
+
+    def sequence(self, position: int) -> int:
+        """Return its sequence number."""
+        return self._first + position
+
+    def utime(self, position: int) -> int:
+        """Return when it was published, in µs since the Unix epoch."""
+        return self._run.utimes[position // len(self._indices)]
