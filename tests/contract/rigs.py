@@ -117,7 +117,9 @@ class LcmRig:
         self.output = LcmOutput(LcmSettings(url=self._url))
 
     def subscribe(self) -> None:
-        self._subscriber = LcmSubscriber(lcm.LCM(self._url), ".*", lambda *each: self.received.append(each))
+        self._subscriber = LcmSubscriber(
+            lcm.LCM(self._url), "MOCAP_.*", lambda *each: self.received.append(each)
+        )
 
     def cut(self) -> None:
         remove_multicast_route()
