@@ -23,8 +23,8 @@ RELEASE_PYTHON := build/release-venv/bin/python
 # What the compiled modules are built from.
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-slow test-install test-anywhere test-compiled check bytecode lint types contracts generated messages docs site lcm-types examples \
-    samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-sites bench-sites-quick zenohd release \
+.PHONY: demo lock test test-slow test-install test-anywhere test-compiled check beside-tests bytecode lint types contracts generated messages docs site lcm-types examples \
+    samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-tests bench-sites bench-sites-quick zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-program install-files uninstall \
     clone-url clean
 
@@ -41,7 +41,7 @@ test: .venv/installed
 
 # What is slow by nature: attacks, outages, browsers, installing from source, systemd, the examples in other languages,
 # and the commands in the documents.
-SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages benchmarks view bids)
+SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs languages view bids)
 
 test-slow: .venv/installed build/wheelhouse/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(AGAIN) --dist loadgroup \
@@ -52,7 +52,7 @@ test-slow: .venv/installed build/wheelhouse/complete
 # quarter of an hour, and is not part of the check.
 test-install: .venv/installed build/wheelhouse/complete build/compiled/complete $(RELEASE_TOOLS)
 	$(BIN)/python -B -m tests.support.bare_debian
-	MAKEFLAGS= exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),tests/systemd tests/release tests/site)
+	MAKEFLAGS= exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),tests/systemd tests/release tests/site tests/benchmarks)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -76,12 +76,15 @@ SLOW ?= --slow
 test-anywhere: .venv/installed
 	$(BIN)/python -B -m tests.anywhere $(SLOW) $(SURROUNDINGS)
 
-# What to run before each commit. mypy and downloads run beside tests that wait. After changes to compiled modules, run
+# What to run before each commit. What needs one core runs beside tests that wait. After changes to compiled modules, run
 # `make test-compiled`, too, as CI does.
 check: .venv/installed
-	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint workflows contracts generated docs bytecode
-	$(MAKE) --keep-going --no-print-directory --jobs=3 test types wheelhouse
+	$(MAKE) --keep-going --no-print-directory --jobs=2 lint bytecode
+	$(MAKE) --keep-going --no-print-directory --jobs=2 test beside-tests
 	$(MAKE) --no-print-directory test-slow
+
+# One after the other, beside tests that wait.
+beside-tests: types contracts generated docs workflows wheelhouse
 
 # Write the bytecode of the tests: workers that start together would each compile all of them, in 10 s.
 bytecode: .venv/installed
@@ -388,15 +391,19 @@ PACKAGES ?=
 mutants: .venv/installed
 	$(BIN)/python -m tests.mutants $(PACKAGES)
 
+# Check that the gateway and the relay do the same work in the benchmarks, and that those with two sites count exactly.
+bench-tests: .venv/installed
+	MAKEFLAGS= $(BIN)/python tests/run.py tests/benchmarks
+
 # Compare the gateway with a bare relay to Zenoh and LCM, and write benchmarks/results.json and docs/performance.md.
 # This takes half an hour and needs an idle machine. PARTS="ceiling loss" measures only these parts. bench-quick takes
 # two minutes, gives rough figures, and does not change the document.
 PARTS ?=
 
-bench: .venv/bench build/compiled/complete zenohd
+bench: .venv/bench build/compiled/complete zenohd bench-tests
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks $(PARTS)
 
-bench-quick: .venv/bench build/compiled/complete
+bench-quick: .venv/bench build/compiled/complete bench-tests
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
 
 # Measure two sites with a router each, and the link between them, and write benchmarks/sites/results.json and
@@ -404,7 +411,7 @@ bench-quick: .venv/bench build/compiled/complete
 # PARTS as above. bench-sites-quick takes three minutes and does not change the document.
 SITES := $(COMPILED) tests/with-netns $(BIN)/python -m benchmarks.sites
 
-bench-sites: .venv/bench build/compiled/complete zenohd build/sites/release/site-subscriber
+bench-sites: .venv/bench build/compiled/complete zenohd bench-tests build/sites/release/site-subscriber
 	$(SITES) $(PARTS)
 
 bench-sites-quick: .venv/installed build/compiled/complete build/sites/release/site-subscriber
