@@ -116,7 +116,7 @@ def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
         if wrong := _wrong_space(text, mark.line):
             raise reader.position(*wrong.place).error((), wrong.text) from None
         if error.problem in _INDENTATION:
-            raise reader.position_of(mark).error((), _INDENTATION_TEXT) from None
+            raise reader.position_of(mark).error((), INDENTATION_TEXT) from None
         problem = f"not YAML: {error.problem}"
         if error.context and error.context_mark:
             problem = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
@@ -145,7 +145,7 @@ _INDENTATION: Final = frozenset(
 )
 """What PyYAML says where a line begins in the wrong column, or lacks a colon."""
 
-_INDENTATION_TEXT: Final = (
+INDENTATION_TEXT: Final = (
     "this line does not fit those above it: keys that belong together begin in the same column, those below "
     "a key two columns further right, and each has a colon and a space; quote a text that contains ': '"
 )

@@ -12,6 +12,7 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.c3d_scene import C3dScene
 from tests.support.commands import run_in_process
+from tests.support.errors import names
 from tests.support.takes import description, details, frame, markers, record_scene, write_take
 from tests.unit.takes.export.exported import labelled
 from tests.unit.takes.export.test_rosbag import status
@@ -67,7 +68,7 @@ def test_the_official_validator_finds_no_error(tmp_path: Path) -> None:
     study = tmp_path / "study"
     stdout, stderr = export(WALK, study, "--subject", "01", "--task", "walking")
     assert f"{study}/sub-01/sub-01_scans.tsv (" in stdout
-    assert "positions converted from mm to m" in stderr
+    assert names(stderr, "positions", "mm to m")
     export(WALK, study, "--subject", "01", "--task", "walking", "--from", "2")
     export(odd, study, "--task", "odd")
     export(odd, study, "--task", "odd", "--session", "3", "--run", "5")

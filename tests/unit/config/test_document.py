@@ -7,6 +7,7 @@ from gateway.config.settings import SourceSettings
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.support.configurations import load, make_settings, read, read_server
+from tests.support.errors import names
 
 FILE = """\
 sources:
@@ -128,7 +129,8 @@ def test_a_mistake_is_told_with_the_variable(file: Path, name: str, value: str, 
 
 def test_what_zenoh_refuses_is_told_with_the_place_of_its_keys(file: Path) -> None:
     [line] = refused(file, ZENOH__CONFIG__MODES="x")
-    assert line.startswith("lab.yaml:7:17: zenoh.config: Zenoh refuses these keys: unknown field `modes`")
+    assert line.startswith("lab.yaml:7:17: zenoh.config: ")
+    assert names(line, "`modes`")
 
 
 def test_mistakes_of_the_file_come_first(file: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from gateway.config.document import INDENTATION_TEXT
 from gateway.config.files import MAX_FILE_BYTES, read_file
 from gateway.config.loading import read
 from gateway.config.section import Section
@@ -123,11 +124,11 @@ MISTAKES = [
     ("lcm:\n  enabled: true\n \u00a0url: memq://", "6:2: found the character U+00A0"),
     ("lcm: {\u00a0enabled: true}", "4:7: lcm: found the character U+00A0"),
     ("lcm:\u00a0\n  enabled: true", "4:5: found the character U+00A0"),
-    ("   lcm: {}", "4:4: this line does not fit"),
-    ("      port: 3030", "4:11: this line does not fit"),
-    ("lcm:\n    enabled: true\n   url: memq://", "6:4: this line does not fit"),
-    ("lcm: enabled: true", "4:13: this line does not fit"),
-    ("lcm\nmetrics: {}", "5:1: this line does not fit"),
+    ("   lcm: {}", f"4:4: {INDENTATION_TEXT}"),
+    ("      port: 3030", f"4:11: {INDENTATION_TEXT}"),
+    ("lcm:\n    enabled: true\n   url: memq://", f"6:4: {INDENTATION_TEXT}"),
+    ("lcm: enabled: true", f"4:13: {INDENTATION_TEXT}"),
+    ("lcm\nmetrics: {}", f"5:1: {INDENTATION_TEXT}"),
     ("\t# a comment\nlcm: {}", "4:1: found a tab"),
     ("---\n{}", "4:1: not YAML: expected a single document"),
     ("lcm: \x07", "4:6: found the character U+0007"),
@@ -137,7 +138,7 @@ MISTAKES = [
 def test_text_before_the_first_key_is_explained_where_the_keys_begin(file: Path) -> None:
     """It is a comment that has lost its #."""
     [found] = refused(file, f"a comment without its sign\n# and one with it\n{SERVER}")
-    assert found.startswith("3:1: this line does not fit")
+    assert found == f"3:1: {INDENTATION_TEXT}"
 
 
 def test_every_one_of_several_equal_ports_and_names_is_reported(file: Path) -> None:
@@ -337,10 +338,10 @@ def test_zenohs_file_is_looked_for_beside_this_one(file: Path, monkeypatch: pyte
     assert load(Path(file.name)).zenoh.config == zenoh_file
     zenoh_file.write_text("{mode: 'clint'}")
     [line] = refused(file)
-    assert line.startswith(f"4:17: zenoh.config: Zenoh refuses the file {zenoh_file}: ")
-    assert names(line, "`clint`")
+    assert line.startswith("4:17: zenoh.config: ")
+    assert names(line, zenoh_file, "`clint`")
     zenoh_file.unlink()
-    assert refused(file)[0].endswith(f"Zenoh refuses the file {zenoh_file}: No such file or directory")
+    assert names(refused(file)[0], zenoh_file, "No such file or directory")
 
 
 def test_a_drawing_of_zenoh_is_put_on_one_line(file: Path) -> None:
@@ -349,7 +350,7 @@ def test_a_drawing_of_zenoh_is_put_on_one_line(file: Path) -> None:
     assert names(refused(file, f"{SERVER}zenoh: {{config: pipe}}")[0], "pipe")
     (file.parent / "zenoh.json5").write_text("{mode: 'peer',,\n}")
     [line] = refused(file, f"{SERVER}zenoh: {{config: zenoh.json5}}\n")
-    assert line.endswith("/zenoh.json5: line 1, column 15: expected identifier or string")
+    assert names(line, file.parent / "zenoh.json5", "line 1, column 15")
 
 
 def _socket(path: Path) -> None:

@@ -243,7 +243,7 @@ def test_analog_with_a_rate_that_c3d_cannot_have_is_reported(
     found, notes = export_c3d(tmp_path, scene(60, odd))
     count = int(60 * analog_rate_hz / rate_hz)
     assert each_names(
-        notes, ["analog left out", "rate", ".sto"], ["rows of analog of lab", f"{count} of {count}"]
+        notes, ["analog left out", "rate", ".sto"], ["rows", "analog", "lab", f"{count} of {count}"]
     )
     assert found.points.shape == (4, 2, 60)
 
@@ -258,7 +258,7 @@ def test_forces_with_another_rate_than_the_channels_are_reported(tmp_path: Path)
         notes,
         ["force left out", "rate", ".mot"],
         *(["left out", f"force plate {number}", f"(Force plate {number})"] for number in (1, 2)),
-        ["rows of force of lab", "50 of 50"],
+        ["rows", "force", "lab", "50 of 50"],
     )
 
 

@@ -141,7 +141,7 @@ def test_labels_that_change_begin_another_file_and_return_to_the_first(tmp_path:
     messages += [markers(2, 2, version=1), markers(3, 3, version=2)]
     job = export_messages(tmp_path, messages, "walk.csv")
     assert [path.name for path in job.files.paths] == ["walk-3d.csv", "walk-3d-2.csv", "walk-3d-3.csv"]
-    assert each_names(notes_of(job), ["labels of 3d of lab", 3])
+    assert each_names(notes_of(job), ["labels", "3d", "lab", 3])
     sequences = [[row[3] for row in read_csv(path)[1]] for path in job.files.paths]
     assert sequences == [["0", "2"], ["1"], ["3"]]
     assert read_csv(tmp_path / "walk-3d-3.csv")[0][7::4] == ["c x (mm)", "b x (mm)", "marker 3 x (mm)"]
@@ -153,7 +153,7 @@ def test_damage_and_malformed_messages_are_reported(tmp_path: Path) -> None:
     messages += [(channel, message[:-4]), ("SPY", b"other program")]
     job = export_messages(tmp_path, messages, "walk.csv")
     assert len(read_csv(tmp_path / "walk-3d.csv")[1]) == 5
-    assert each_names(notes_of(job), ["left out", "SPY", 1], ["malformed", "3d of lab", 1])
+    assert each_names(notes_of(job), ["left out", "SPY", 1], ["malformed", "3d", "lab", 1])
 
 
 def test_parts_of_a_long_take_follow_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

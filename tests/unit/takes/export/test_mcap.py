@@ -330,7 +330,7 @@ def test_frames_with_very_many_channels_are_left_out_and_reported(tmp_path: Path
     messages = [frame(ComponentType.ANALOG, values[1:]), frame(ComponentType.ANALOG, values, 1)]
     job = export_messages(tmp_path, messages, "walk.mcap")
     assert each_names(
-        notes_of(job)[1:], ["10000 numbers", "analog of lab", 1], ["rows of analog of lab", "1 of 2"]
+        notes_of(job)[1:], ["10000 numbers", "analog", "lab", 1], ["rows", "analog", "lab", "1 of 2"]
     )
     [log] = read_mcap(tmp_path / "walk.mcap").topics["/lab/analog"]
     assert list(floats_of(log.content).values()) == values[1:]
@@ -370,11 +370,11 @@ def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
     job = export_messages(tmp_path, [unit("mm"), markers(2), *damaged, other], "walk.mcap")
     assert each_names(
         sorted(notes_of(job)),
-        ["malformed", "3d of lab", 3],
-        ["malformed", "parameters of lab", 1],
-        ["1970", "2106", "3d of lab", 2],
+        ["malformed", "3d", "lab", 3],
+        ["malformed", "parameters", "lab", 1],
+        ["1970", "2106", "3d", "lab", 2],
         ["MOCAP_LAB_OTHER", 1],
-        ["rows of 3d of lab", "2 of 3"],
+        ["rows", "3d", "lab", "2 of 3"],
     )
     assert len(read_mcap(tmp_path / "walk.mcap").topics["/lab/markers"]) == 1
 

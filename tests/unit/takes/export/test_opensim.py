@@ -312,9 +312,9 @@ def test_samples_outside_the_frames_and_other_components_are_reported(tmp_path: 
     shown = SyntheticScene(markers=5, tools=1, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000)
     job = export_messages(tmp_path, scene(20, shown, keep=keep), "out", format="opensim")
     notes = notes_of(job, usual=True)
-    assert one_names(notes, "rows of force of lab", "50 of 200")
-    assert one_names(notes, "rows of analog of lab", "50 of 200")
-    assert "left out of lab: tools (6D), reliabilities of markers" in notes
+    assert one_names(notes, "rows", "force", "lab", "50 of 200")
+    assert one_names(notes, "rows", "analog", "lab", "50 of 200")
+    assert one_names(notes, "left out", "lab", "tools (6D)", "markers")
     assert one_names(notes, "mm to m")
 
 

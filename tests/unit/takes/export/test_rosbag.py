@@ -111,10 +111,10 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     assert each_names(
         notes_of(job),
         ["NaN of lab", 1],
-        ["1970", "2106", "analog of lab", 1],
-        ["rows of 6d of lab", "1 of 2"],
-        ["rows of force of lab", "1 of 1"],
-        ["rows of analog of lab", "1 of 1"],
+        ["1970", "2106", "analog", "lab", 1],
+        ["rows", "6d", "lab", "1 of 2"],
+        ["rows", "force", "lab", "1 of 1"],
+        ["rows", "analog", "lab", "1 of 1"],
     )
 
 

@@ -54,7 +54,7 @@ def test_the_table_of_changes_says_that_the_transform_is_not_applied(
 @pytest.mark.parametrize("name", WITH_COORDINATES)
 def test_the_table_of_changes_names_a_frame_that_somebody_has_chosen(tmp_path: Path, name: str) -> None:
     job = export(tmp_path, name, status("world", 1e-3))
-    assert one_names(notes_of(job), "lab", "in the frame world")
+    assert one_names(notes_of(job), "lab", "frame world")
 
 
 @pytest.mark.parametrize("name", [*FORMATS, *CHOSEN_FORMATS])

@@ -11,6 +11,7 @@ import pytest
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
 from gateway.takes.export.job import ExportJob, TakePart, export_take
+from tests.support.errors import one_names
 from tests.support.takes import Message, description, parameters, scene_messages, write_take
 from tests.unit.takes.export.exported import notes_of
 from tests.unit.takes.export.test_every_format import NAMES, job_for
@@ -62,7 +63,7 @@ def test_the_order_of_takes_in_a_file_and_their_number_change_nothing(
     found, job = export_of(tmp_path, form, order)
     expected, _ = export_of(tmp_path, form, same)
     assert found == expected
-    assert [note for note in notes_of(job) if "several takes in one file" in note and str(len(order)) in note]
+    assert one_names(notes_of(job), "several takes", len(order))
 
 
 @pytest.mark.parametrize("form", [".c3d", ".csv", ".mcap", "ros2"])

@@ -11,7 +11,7 @@ import rtc3d
 from gateway.client.transport import QueryReply
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.decode import decode
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import (
     AnalogChannel,
     EventDefinition,
@@ -396,10 +396,14 @@ def test_summaries_are_short(tmp_path: Path) -> None:
     assert len(repr(take)) < 200
 
 
-@pytest.mark.parametrize("chosen", [{"sources": "lob"}, {"components": "3D"}])
-def test_a_misspelt_choice_names_the_similar_one(tmp_path: Path, chosen: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    ("chosen", "similar"), [({"sources": "lob"}, "'lab'"), ({"components": "3D"}, "'3d'")]
+)
+def test_a_misspelt_choice_names_the_similar_one(
+    tmp_path: Path, chosen: dict[str, str], similar: str
+) -> None:
     """A source or a component that does not exist is mostly a slip of the finger."""
-    with pytest.raises(SelectionError, match=r"did you mean '(lab|3d)'"):
+    with raises(SelectionError, similar):
         open_take(recorded(tmp_path, "a", 0), **chosen)  # type: ignore[arg-type]
 
 
@@ -407,5 +411,5 @@ def test_a_misspelt_component_has_no_runs(tmp_path: Path) -> None:
     """An empty list would say that the take lacks it."""
     source = open_take(recorded(tmp_path, "a", 0)).sources["lab"]
     assert source.runs("6d") == []
-    with pytest.raises(SelectionError, match="choose from 3d"):
+    with raises(SelectionError, *COMPONENTS_BY_KEY):
         source.runs("markers")
