@@ -13,6 +13,7 @@ from gateway.daemon.gateway import Gateway
 from gateway.outputs.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.runtime.losses import counts_text
 from gateway.session.state import StreamState
 from gateway.tools.doctor.all_checks import run_checks
 from tests.support import servers
@@ -86,7 +87,7 @@ async def test_what_the_running_gateway_lost_is_reported_by_cause() -> None:
     loss = findings.of("loss", GATEWAY)
     assert loss.result is Result.WARNING
     assert loss.found.startswith(f"{STREAM}: ")
-    assert loss.found.count("2 messages of 2 frames (frame rejected)") == 2  # of a minute, and in all
+    assert loss.found.count(counts_text([("frame rejected", 2, 2)])) == 2  # of a minute, and in all
     assert names(loss.remedy, "component 1 of 1")
     assert findings.failing(GATEWAY) == []
 

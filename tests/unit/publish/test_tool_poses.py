@@ -11,6 +11,7 @@ from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.frames import RawFrame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
+from gateway.runtime.losses import counts_text
 from tests.support.errors import names
 from tests.support.parameters import in_metres
 from tests.support.records import kinds
@@ -192,7 +193,7 @@ def test_too_many_tools_get_no_topics_and_are_logged_and_counted(caplog: pytest.
     assert kinds(caplog) == [("WARNING", "too many tools")]
     began, ended = caplog.messages
     assert names(began, "lab to toy", 257, 256)
-    assert names(ended, "lab to toy", "514 messages of 2 frames (too many tools)")
+    assert names(ended, "lab to toy", counts_text([("too many tools", 514, 2)]))
 
 
 def test_with_an_unknown_unit_no_pose_is_published_which_is_logged_and_counted(
@@ -210,7 +211,7 @@ def test_with_an_unknown_unit_no_pose_is_published_which_is_logged_and_counted(
     assert kinds(caplog) == [("WARNING", "unknown unit")]
     began, ended = caplog.messages
     assert names(began, "lab to toy", f"'{'x' * 40}'", "transform.units")
-    assert names(ended, "lab to toy", "2 messages of 1 frame (unknown unit)")
+    assert names(ended, "lab to toy", counts_text([("unknown unit", 2, 1)]))
 
 
 def test_poses_that_are_lost_leave_a_gap_and_too_many_tools_do_not() -> None:

@@ -51,7 +51,7 @@ def test_without_a_terminal_there_is_one_line_for_each_take(capsys: pytest.Captu
 
 def test_no_takes_are_no_table_and_a_list_with_a_limit_says_so() -> None:
     assert written(takes=[], num_takes=0, kept_s=0.0) == "lab: no takes\n"
-    assert "lab: the newest 1 of 1500 takes" in written(takes=[TAKE], num_takes=1500)
+    assert names(written(takes=[TAKE], num_takes=1500), "lab", "1 of 1500")
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,8 @@ def test_the_filter_is_typed_and_cleared() -> None:
     shown.press("/", *"xyz", "ctrl-u", "a", "escape")
     assert len(shown.body()) == 16
     shown.press("/", *"nowhere")
-    assert shown.body() == ["nothing here contains 'nowhere'"]
+    [nothing] = shown.body()
+    assert "'nowhere'" in nothing
 
 
 def test_q_ends() -> None:
