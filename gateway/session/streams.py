@@ -33,9 +33,10 @@ the others. Seconds are counted by calls of ``check``, so that a stop of this pr
 
 _RUNNING: Final = (StreamState.STREAMING, StreamState.NO_MEASUREMENT)
 
-_ENDS_FIRST: Final = "the server ends the first connection when there is a second one"
-_NO_FRAMES: Final = "the server sends no frames on a connection for them"
-_NO_NAMES: Final = "the server does not accept the names of components"
+ENDS_FIRST: Final = "the server ends the first connection when there is a second one"
+NO_FRAMES: Final = "the server sends no frames on a connection for them"
+NO_NAMES: Final = "the server does not accept the names of components"
+"""Why all components have one connection."""
 
 NewStream = Callable[[StreamSettings, Listener], Supervisor]
 """Creates a stream; the listener follows its connections."""
@@ -200,7 +201,7 @@ class AutomaticStreams(Listener):
     def connected(self, stream: Supervisor, request: StreamFrames) -> None:
         """Start the further streams after the first one; check that the server knows component names."""
         if len(self._plan.groups) > 1 and not request.components:
-            self._use_one_connection(_NO_NAMES, is_final=True)
+            self._use_one_connection(NO_NAMES, is_final=True)
         if stream is self._first:
             self._waiting = 0
             self._start_further()
@@ -222,7 +223,7 @@ class AutomaticStreams(Listener):
         if any(further.age_s - silent_s < _SUSPICIOUS_S for further in running):
             self._failures += 1
             if self._failures >= _MAX_FIRST_FAILURES:
-                self._use_one_connection(_ENDS_FIRST, is_final=True)
+                self._use_one_connection(ENDS_FIRST, is_final=True)
         for further in running:
             further.stop("waiting for the first connection to the server")
 
@@ -289,7 +290,7 @@ class AutomaticStreams(Listener):
             for each in further:
                 each.check()
             if any(each.is_overdue for each in further):
-                self._use_one_connection(_NO_FRAMES)
+                self._use_one_connection(NO_FRAMES)
         elif any(each.stream.status.state is StreamState.STREAMING for each in further):
             self._waiting += 1
             if self._waiting >= _MAX_QUIET_CHECKS:

@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 
 import pytest
 
+from gateway.outputs.zenoh.output import TEXTS
 from tests.support.browser import NewPage, chromium, new_page
 from tests.support.configurations import write_config
 from tests.support.documents import blocks
@@ -158,7 +159,7 @@ def servers(tmp_path_factory: pytest.TempPathFactory, healthy_server: int) -> It
     with ExitStack() as stack:
         stderr = stack.enter_context(log.open("wb"))
         stack.enter_context(program("run", "--config", str(config), stderr=stderr))
-        ready = ("the session is open", "viewers can connect", "→ streaming")
+        ready = (TEXTS.opened, "viewers can connect", "→ streaming")
         wait_until(lambda: all(text in log.read_text() for text in ready))
         view = stack.enter_context(view_process("--connect", endpoint))
         yield Servers(int(view.address.rpartition(":")[2]), foxglove, metrics)

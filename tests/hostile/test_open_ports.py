@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import pytest
 
+from gateway.outputs.zenoh.output import TEXTS
 from tests.support.commands import run_command
 from tests.support.configurations import write_config
 from tests.support.gateway_process import program
@@ -91,7 +92,7 @@ def test_a_gateway_with_every_output_opens_the_listed_ports_and_no_other(
             """Whether it is open, or is that of the group to which LCM only sends, which nobody opens."""
             return port["is_open"] is not False or (port["output"], port["access"]) == ("lcm", "publish")
 
-        wait_until(lambda: all(text in log.read_text() for text in ("→ streaming", "the session is open")))
+        wait_until(lambda: all(text in log.read_text() for text in ("→ streaming", TEXTS.opened)))
         wait_until(lambda: all(map(is_open, listed_ports(config))))
         listed = listed_ports(config)
         places = {

@@ -16,6 +16,7 @@ import zenoh
 from gateway.client.client import GatewayAddress, GatewayClient
 from gateway.client.reception import Messages
 from gateway.messages.decode import decode, prefix_of
+from gateway.outputs.zenoh.output import TEXTS
 from tests.support.errors import names
 from tests.support.gateway_process import gaps, program, simulator
 from tests.support.networks import free_port, open_zenoh
@@ -87,7 +88,7 @@ def gateway(folder: Path, name: str, **variables: object) -> Iterator[None]:
     log = folder / f"{name}.log"
     arguments = ("run", "--config", str(CONFIG / "sites" / name))
     with log.open("wb") as output, program(*arguments, environ=values, stdout=output, stderr=output):
-        wait_until(lambda: "→ streaming" in log.read_text() and "session is open" in log.read_text())
+        wait_until(lambda: "→ streaming" in log.read_text() and TEXTS.opened in log.read_text())
         yield
 
 

@@ -16,6 +16,7 @@ from typing import Any, Final
 import pytest
 import yaml
 
+from gateway.outputs.zenoh.output import TEXTS
 from tests.hostile.gateway_under_attack import MAX_STOP_S, printed, python
 from tests.stops import report, run_stops
 from tests.support.gateway_process import PROGRAM
@@ -301,7 +302,7 @@ async def test_with_peers_that_do_not_answer(site: Site) -> None:
             metrics={"port": port},
         )
         async with site.running():
-            await site.until_logged("zenoh: the Zenoh session does not open")
+            await site.until_logged(f"zenoh: {TEXTS.cannot_open}")
             await site.until_logged("metrics: /metrics and /healthz are served")
             for _ in range(24):
                 held.enter_context(socket.create_connection(("127.0.0.1", port)))

@@ -14,11 +14,12 @@ from gateway.rtc3d.packets import Packet, decode_text
 from gateway.session.server.client_connection import ClientConnection, ConnectionFilter
 from gateway.session.server.server import RtServer
 from gateway.session.state import StreamState
+from gateway.session.streams import NO_NAMES
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from tests.support.errors import one_names
 from tests.support.gateways import MemoryGateway, run_gateway
 
-ONE_CONNECTION = "analog and force arrive at 200 Hz instead of 2000 Hz: "
 EVERYTHING = "3d 6d analog force event"
 TWO = ["3d 6d event", "analog force"]
 SCENE = SyntheticScene(markers=3, tools=1, analog=2, plates=1, rate_hz=200, analog_rate_hz=2000)
@@ -121,5 +122,5 @@ async def test_a_server_that_knows_no_component_names_sends_everything_on_one_co
         analog = await lab.wait_for("analog", 100)
         assert step(analog) == 10
         assert components(lab) == [EVERYTHING]
-        assert f"{ONE_CONNECTION}the server does not accept the names of components" in lab.status.limitations
+        assert one_names(lab.status.limitations, "analog and force", "200 Hz", "2000 Hz", NO_NAMES)
         assert server.num_opened == 1

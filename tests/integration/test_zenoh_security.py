@@ -9,6 +9,7 @@ import zenoh
 import zenoh.ext
 
 from gateway.config.document import variable_name
+from gateway.outputs.zenoh.output import TEXTS
 from tests.support.networks import free_port
 from tests.support.secure_zenoh import (
     GUIDE,
@@ -238,6 +239,6 @@ def test_a_password_from_the_environment_is_used_and_never_shown(tmp_path: Path)
             with open_session(client % "geheim7") as viewer:
                 received = Samples(viewer, "mocap/lab/status")
                 received.wait_for_more(1)
-            assert "the session is open" in log.read_text()
+            assert TEXTS.opened in log.read_text()
             assert "geheim7" not in log.read_text()
             assert b"geheim7" not in b"".join(received.payloads)

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import yaml
 import zenoh
 
+from gateway.outputs.zenoh.output import TEXTS
 from tests.support.configurations import write_config
 from tests.support.gateway_process import program, simulator
 from tests.support.networks import free_port
@@ -99,5 +100,5 @@ def run_secure_router(folder: Path, certificates: Path) -> Iterator[SecureRouter
     )
     (folder / "zenoh-mtls.json5").write_text(client_file(port, certificates, "gateway"), encoding="utf-8")
     with open_session(router_file), run_gateway_with_simulator(folder, "zenoh-mtls.json5") as log:
-        wait_until(lambda: "the session is open" in log.read_text())
+        wait_until(lambda: TEXTS.opened in log.read_text())
         yield SecureRouter(port, certificates)

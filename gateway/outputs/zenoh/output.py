@@ -43,7 +43,7 @@ _AGAIN_S: Final = 0.5
 """How long to wait at least before the parameters are published for a new subscriber again."""
 
 _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
-_TEXTS: Final = SessionTexts(
+TEXTS: Final = SessionTexts(
     "zenoh",
     not_open=f"the Zenoh session is not open yet; {_REMEDY}",
     cannot_open="the Zenoh session does not open",
@@ -51,6 +51,7 @@ _TEXTS: Final = SessionTexts(
     no_router="no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints",
     opened="the session is open",
 )
+"""What the log and the status say about the session."""
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ class ZenohOutput(Output):
         self.has_tool_poses = settings.tool_poses
         self.config = zenoh_config(settings.config) if config is None else config
         self._holder = SessionHolder(
-            *(_TEXTS, self.config, self._declare_all, self._update_link), on_link_lost=self._lose_link
+            *(TEXTS, self.config, self._declare_all, self._update_link), on_link_lost=self._lose_link
         )
         self._confirmation = RouterConfirmation(self._holder)
         self._link = ZenohLink(lambda: self._holder.refusal)

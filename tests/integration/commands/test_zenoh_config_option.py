@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway.outputs.zenoh.output import TEXTS
 from tests.support.commands import run_command
 from tests.support.configurations import write_config
 from tests.support.errors import names
@@ -109,7 +110,7 @@ def test_the_commands_show_the_certificate_of_a_gateway_that_listens(
         encoding="utf-8",
     )
     with run_gateway_with_simulator(tmp_path, "zenoh.json5") as log:
-        wait_until(lambda: "the session is open" in log.read_text())
+        wait_until(lambda: TEXTS.opened in log.read_text())
         findings = doctor(tmp_path / "gateway.yaml")
         assert names(findings["link"]["found"], "0 routers and 1 peer")
         assert names(findings["gateway"]["found"], "lab")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from gateway.outputs.zenoh.output import TEXTS
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate
 from gateway.runtime.quantities import size_text
@@ -194,7 +195,7 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
             wait_until(lambda: text in (tmp_path / f"{command}.log").read_text())
 
         start("run", "--config", config)
-        wait_for("run", "zenoh: the session is open")
+        wait_for("run", f"zenoh: {TEXTS.opened}")
         record = start("record", take, "--connect", endpoint)
         wait_for("record", "gets no frames")  # it receives the gateway's status
         start("simulate", "--c3d", original, "--once", "--port", str(port))
