@@ -65,7 +65,7 @@ async def test_odd_configurations_at_a_reload_are_refused(gateway_under_attack: 
                 gateway.config.unlink(missing_ok=True)
             gateway.config.write_text(good)
         gateway.process.send_signal(signal.SIGHUP)
-        await wait_until_async(lambda: "configuration reloaded: nothing changed" in gateway.log)
+        await wait_until_async(lambda: "nothing changed" in gateway.log)
     gateway.report.check()
 
 
@@ -160,9 +160,7 @@ async def test_eight_dead_names_and_a_dead_name_server(
             configuration["sources"][1]["port"] = 3030
             gateway.config.write_text(yaml.safe_dump(configuration))
             gateway.process.send_signal(signal.SIGHUP)
-            await wait_until_async(
-                lambda: "configuration reloaded: source dead-0 changed" in gateway.log, AT_ONCE_S
-            )
+            await wait_until_async(lambda: "source dead-0 changed" in gateway.log, AT_ONCE_S)
             await asyncio.sleep(2)  # several attempts of each source
             assert num_threads(gateway) < threads_before + len(_DEAD)  # not one more for each attempt
     gateway.report.check()

@@ -16,6 +16,7 @@ from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import ComponentType
+from tests.support.errors import names
 from tests.support.networks import lcm_url
 from tests.support.queried_gateway import (
     ParameterServer,
@@ -101,7 +102,7 @@ async def test_on_lcm_messages_are_sent_again_on_a_channel_of_their_own() -> Non
         found = await gateway.sources[0].fan_out.find("3d", "lcm", WantedMessages(3, None, 5))
         assert found is not None
         assert again == found.messages
-        assert "key= needs one of from=" in replies[1].error
+        assert names(replies[1].error, "key=", "from=")
         assert json.loads(replies[2].content)["keys"]["3d"]["newest"] == 9
         assert json.loads(replies[2].content)["num_found"] == {"lcm": 3}
 

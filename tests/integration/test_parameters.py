@@ -20,6 +20,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.simulator.faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from tests.support.errors import names
 from tests.support.networks import lcm_url, open_zenoh
 from tests.support.queried_gateway import (
     ParameterServer,
@@ -174,4 +175,4 @@ async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(
         for record in caplog.records
         if record.levelno == logging.WARNING and "were renamed" in record.message
     ]
-    assert "3d 'Marker 1' to 'Left Marker 1', 'Marker 2' to 'Left Marker 2'; 6d 'Tool 1' to" in warning
+    assert names(warning, "3d 'Marker 1'", "'Left Marker 1'", "'Marker 2'", "'Left Marker 2'", "6d 'Tool 1'")

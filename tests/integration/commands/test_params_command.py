@@ -158,7 +158,7 @@ async def test_fresh_parameters_that_do_not_come(
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["4d"], "unknown section '4d'; known sections: general, 3d, 6d, analog, force, events"),
+        (["4d"], "general, 3d, 6d, analog, force, events"),
         (["--json", "--xml"], "--json or --xml"),
         (["--timeout", "0"], "--timeout"),
     ],

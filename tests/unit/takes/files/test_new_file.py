@@ -70,7 +70,7 @@ def test_what_exists_is_not_replaced(tmp_path: Path, target: str) -> None:
 
 
 def test_a_file_that_appears_meanwhile_is_not_replaced_and_none_of_the_others_remains(tmp_path: Path) -> None:
-    with pytest.raises(TakeError, match=r"walk-2\.c3d exists already"):
+    with raises(TakeError, "walk-2.c3d"):
         create(tmp_path, appears=True)
     assert names(tmp_path) == {"walk-2.c3d"}
     assert (tmp_path / "walk-2.c3d").read_bytes() == b"mine"
@@ -89,7 +89,7 @@ def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "other").mkdir()
     create(tmp_path / "other")
     assert names(tmp_path / "other") == {"walk-1.c3d", "walk-2.c3d", "walk-3.c3d"}
-    with pytest.raises(TakeError, match=r"walk-2\.c3d exists already"):
+    with raises(TakeError, "walk-2.c3d"):
         create(tmp_path, appears=True)
     assert names(tmp_path) == {"other", "walk-2.c3d"}
 

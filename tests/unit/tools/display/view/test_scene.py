@@ -14,6 +14,7 @@ from gateway.tools.display.live import LiveComponent
 from gateway.tools.display.view.scene import Sphere, ViewScene
 from gateway.tools.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
 from gateway.tools.display.view.viewer import ViewServer
+from tests.support.errors import names
 from tests.support.takes import parameters
 from tests.unit.tools.display.live_lab import MISSING, NAN, Lab
 
@@ -126,7 +127,7 @@ def test_all_data_have_stopped_though_of_a_component_nothing_has_come(picture: P
     lab.source.components["6d"] = LiveComponent(ComponentType.TOOLS)
     picture.show()
     picture.show(3.0)
-    assert picture.node("stopped").text == "lab: no data for 3 s"
+    assert names(picture.node("stopped").text, "lab", "data", "3 s")
 
 
 def test_data_that_stop_are_grey_and_the_picture_says_so(picture: Picture) -> None:
@@ -143,7 +144,7 @@ def test_data_that_stop_are_grey_and_the_picture_says_so(picture: Picture) -> No
     assert picture.node("tools").batched_scales.tolist() < [1.0]
     lab.send(TOOLS, [(1, 0, 0, 0, 0, 0, 500, 0)])
     picture.show()
-    assert picture.node("stopped").text == "lab: no markers for 3 s"
+    assert names(picture.node("stopped").text, "lab", "markers", "3 s")
     lab.send(MARKERS, [(500, 0, 0, 0)])
     picture.show()
     assert picture.node("markers").colors.tolist() == live

