@@ -18,6 +18,7 @@ import pytest
 
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.receiver import joined_socket, split_datagram
+from gateway.session.status import NOT_SENT, SKIPPED
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.support.errors import names
@@ -133,10 +134,10 @@ def assert_nothing_is_lost(gateway: GatewayProcess, simulator_log: Path) -> None
     for component, headers in gateway.headers.items():
         if component != "event" and gaps([header.frame_number for header in headers]):
             # On a busy computer, the simulator leaves out frames for which it is a second too late itself.
-            wait_until(lambda: lost_causes(gateway) == {"not sent by the server"})
+            wait_until(lambda: lost_causes(gateway) == {NOT_SENT})
         assert gaps([header.sequence for header in headers]) == [], component
         assert {header.session for header in headers} == {1}, component
-    assert lost_causes(gateway) <= {"not sent by the server"}
+    assert lost_causes(gateway) <= {NOT_SENT}
     assert "does not read" not in simulator_log.read_text()
     assert "connecting again" not in gateway.log
     assert gateway.statuses[-1].streams[0].reconnects == 0
@@ -205,7 +206,7 @@ async def test_skipped_frames_are_the_gaps_and_the_count_in_the_status(tmp_path:
             server.start_measurement()
             await asyncio.to_thread(gateway.wait_for_clock)
             await asyncio.to_thread(gateway.stop_for, 1.0)
-            await wait_until_async(lambda: "skipped while behind" in lost_causes(gateway))
+            await wait_until_async(lambda: SKIPPED in lost_causes(gateway))
             server.stop_measurement()  # from here on, nothing is skipped on a busy machine either
             for statuses in (gateway.statuses, on_lcm.statuses):
                 await wait_until_async(partial(has_state, statuses, "no measurement"))
@@ -213,7 +214,7 @@ async def test_skipped_frames_are_the_gaps_and_the_count_in_the_status(tmp_path:
             on_zenoh = {key: [each.sequence for each in headers] for key, headers in gateway.headers.items()}
             drops = {drop.cause: drop for drop in gateway.statuses[-1].streams[0].drops}
             assert names(gateway.log, "backlog: latest")
-    skipped = drops["skipped while behind"]
+    skipped = drops[SKIPPED]
     assert skipped.messages == 4 * skipped.frames > 200
     for numbers in (on_zenoh, on_lcm.numbers):
         for component, sequences in numbers.items():

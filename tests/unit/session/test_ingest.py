@@ -8,7 +8,7 @@ from gateway.messages.encode import Stamp
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, encode_component
 from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.session.ingest import Ingest
-from gateway.session.status import StreamStatus
+from gateway.session.status import SKIPPED, StreamStatus
 from tests.support.errors import names
 from tests.support.statuses import amounts
 
@@ -130,7 +130,7 @@ def test_while_late_the_newest_is_published_and_no_event_is_skipped(lab: Lab) ->
     lab.receive(*late, late_us=200_000)
     if lab.backlog == "latest":
         assert lab.published == [(602, ["event"]), (604, ["3d"])]
-        assert amounts(lab.status.losses.report()) == {"skipped while behind": (4, 4)}
+        assert amounts(lab.status.losses.report()) == {SKIPPED: (4, 4)}
     else:
         assert [number for number, _ in lab.published] == list(range(600, 605))
         assert not lab.status.losses.report()
@@ -146,7 +146,7 @@ def test_while_late_the_newest_frame_that_is_not_empty_is_published(last: tuple[
     late = [frame(600), frame(601, event=True), frame(602)]
     lab.receive_at(BOOT_UTIME + 605 * PERIOD_US + 200_000, *late, *last)
     assert lab.published == [(601, ["event"]), (602, ["3d"])]
-    assert amounts(lab.status.losses.report()) == {"skipped while behind": (2, 2)}
+    assert amounts(lab.status.losses.report()) == {SKIPPED: (2, 2)}
 
 
 def test_while_late_the_newest_of_each_component_is_published() -> None:
@@ -160,7 +160,7 @@ def test_while_late_the_newest_of_each_component_is_published() -> None:
     ]
     lab.receive(*late, late_us=200_000)
     assert lab.published == [(601, ["6d"]), (602, ["force"]), (603, ["3d"])]
-    assert amounts(lab.status.losses.report()) == {"skipped while behind": (3, 2)}
+    assert amounts(lab.status.losses.report()) == {SKIPPED: (3, 2)}
 
 
 def test_without_a_clock_a_long_batch_is_late() -> None:
@@ -172,7 +172,7 @@ def test_without_a_clock_a_long_batch_is_late() -> None:
     assert [number for number, _ in lab.published] == list(range(104))
     lab.receive_at(BOOT_UTIME + 6_000_000, *(without_time(number) for number in range(104, 504)))
     assert [number for number, _ in lab.published] == [*range(104), 503]
-    assert amounts(lab.status.losses.report()) == {"skipped while behind": (399, 399)}
+    assert amounts(lab.status.losses.report()) == {SKIPPED: (399, 399)}
 
 
 def without_time(number: int) -> RawFrame:

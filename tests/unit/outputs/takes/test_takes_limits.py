@@ -12,6 +12,7 @@ from gateway.outputs.takes.folder import ROLLING, TakesFolder
 from gateway.outputs.takes.output import TakesOutput
 from gateway.takes.files.reader import log_paths
 from tests.support.clocks import Clock
+from tests.support.errors import names
 from tests.support.recording_output import NoThread, RecordingLab, frames, settings_in, still_host, still_lab
 from tests.support.takes import markers, write_take
 
@@ -53,7 +54,7 @@ async def test_a_take_ends_when_the_folder_is_full_and_nothing_can_be_deleted(tm
     assert not lab.is_recording()
     [loss] = lab.takes.losses.report()
     assert (loss.cause, loss.messages, loss.frames) == ("folder full", 1, 0)
-    assert "walk ends, because the folder" in loss.text
+    assert names(loss.text, "walk", "takes.max_bytes")
     await lab.takes.start("run")
     lab.output.maintain()  # what was too much is known from before
     assert lab.is_recording()

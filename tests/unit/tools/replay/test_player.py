@@ -18,6 +18,7 @@ from gateway.tools.replay.play_list import Selection
 from gateway.tools.replay.player import Player
 from gateway.tools.replay.publication import MAX_TOPICS, Publication, PublicationRefusal
 from gateway.tools.replay.replay import playing
+from tests.support.errors import raises
 from tests.support.takes import (
     START_UTIME,
     Message,
@@ -138,7 +139,7 @@ async def test_sources_and_components_are_selected_and_parameters_stay(replayed:
     assert await replayed.play(sources=frozenset({"lab"})) == keyed(messages)
     assert replayed.publication.sources.keys() == {"lab"}
     for selection in ({"sources": frozenset({"x"})}, {"start_us": 10**9}):
-        with pytest.raises(TakeError, match=r"no messages .* --source \(stage, lab\)"):
+        with raises(TakeError, "--source (stage, lab)"):
             await replayed.play(**selection)
 
 

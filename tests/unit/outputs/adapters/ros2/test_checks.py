@@ -78,7 +78,7 @@ def test_nodes_of_another_distribution_get_nothing(
     [*_, types] = check_ros2(settings, ["lab"], [], 1.0)
     assert types.result is (Result.WARNING if remedy else Result.PASSING)
     assert remedy in types.remedy
-    assert ("/arm/hand subscribes to /mocap/lab/wand/pose" in types.found) == bool(remedy)
+    assert names(types.found, "/arm/hand", "/mocap/lab/wand/pose") == bool(remedy)
     for token in declared:
         token.undeclare()
 
