@@ -119,18 +119,27 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling |
     return _Scheduler(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Shuffle the modules, and the tests in each, if RTC3D_TEST_ORDER is set to a seed.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mix the modules: many in a row that wait leave the cores idle, and many that compute crowd them.
 
-    Those of an installation stay in their order: the last one removes it.
+    If RTC3D_TEST_ORDER is set to a seed, shuffle the modules, and the tests in each. Those of an installation
+    stay in their order: the last one removes it.
     """
     if seed := os.environ.get("RTC3D_TEST_ORDER"):
         order = random.Random(seed)
         in_order = [item for item in items if item.nodeid.startswith("tests/systemd/")]
         fixed = {item: number for number, item in enumerate(in_order)}
-        modules = sorted({item.path for item in items})
-        rank = dict(zip(modules, order.sample(range(len(modules)), len(modules)), strict=True))
+        rank = _shuffled(items, order)
         items.sort(key=lambda item: (-1, fixed[item]) if item in fixed else (rank[item.path], order.random()))
+    elif hasattr(config, "workerinput") and not config.getvalue("loadgroup"):  # the workers of `make test`
+        rank = _shuffled(items, random.Random(0))
+        items.sort(key=lambda item: rank[item.path])
+
+
+def _shuffled(items: list[pytest.Item], order: random.Random) -> dict[Path, int]:
+    """Return the place of each module in a random order."""
+    modules = sorted({item.path for item in items})
+    return dict(zip(modules, order.sample(range(len(modules)), len(modules)), strict=True))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -133,21 +133,19 @@ class MessageHistory:
         if self._max_bytes:
             if self._host.steps != self._steps:
                 self._append_block(self._monotonic())
-            block = self._newest
-            messages = block.messages.get(key)
+            by_key = self._newest.messages
+            messages = by_key.get(key)
             if messages is None:
-                messages = block.messages[key] = []
+                messages = by_key[key] = []
             messages.append(message)
-            block.num_bytes += len(message) + MESSAGE_OVERHEAD_BYTES
-            if block.num_bytes * _BLOCKS > self._max_bytes:
-                self.begin_block()
+            self._add_bytes(len(message) + MESSAGE_OVERHEAD_BYTES)
 
     def add_frame(self, body: bytes, layout: NumberedLayout, stamp: Stamp) -> None:
         """Keep a frame whose messages get the next numbers of their components."""
         if self._max_bytes:
             if self._host.steps != self._steps:
                 self._append_block(self._monotonic())
-            block, run = self._newest, self._run
+            run = self._run
             if (
                 run is None
                 or run.layout is not layout
@@ -155,14 +153,18 @@ class MessageHistory:
                 or run.parameters_version != stamp.parameters_version
             ):
                 self._run = run = FrameRun(layout, stamp)
-                block.frames.append(run)
-                block.num_bytes += RUN_BYTES
+                self._newest.frames.append(run)
+                self._newest.num_bytes += RUN_BYTES
             run.bodies.append(body)
             run.utimes.append(stamp.utime)
             run.capture_utimes.append(stamp.capture_utime)
-            block.num_bytes += len(body) + FRAME_OVERHEAD_BYTES
-            if block.num_bytes * _BLOCKS > self._max_bytes:
-                self.begin_block()
+            self._add_bytes(len(body) + FRAME_OVERHEAD_BYTES)
+
+    def _add_bytes(self, num_bytes: int) -> None:
+        block = self._newest
+        block.num_bytes += num_bytes
+        if block.num_bytes * _BLOCKS > self._max_bytes:
+            self.begin_block()
 
     def begin_block(self) -> None:
         """Drop the blocks that are too old or too much, and begin a new one if it is time."""
