@@ -45,7 +45,7 @@ SLOW_TESTS := $(addprefix tests/,systemd packaging hostile outages docs language
 
 test-slow: .venv/installed build/wheelhouse/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(AGAIN) --dist loadgroup \
-	    $(or $(ARGS),$(SLOW_TESTS))
+	    --workers $$((2 * $$(nproc))) $(or $(ARGS),$(SLOW_TESTS))
 
 # What is released: the package of `make deb`, an upgrade from that of the previous commit, lintian, and a second build;
 # the wheels and the sdist on a Debian without a compiler; the container image; bills, licences; the site. It takes a
